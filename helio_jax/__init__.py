@@ -1,0 +1,83 @@
+"""helio_jax: simulate scanning helium micrographs and turn three or more of them into a height map.
+
+```
+Scene -- trace --> MicrographStack -- prepare --> MicrographStack -- reconstruct --> Reconstruction -- evaluate --> report
+```
+
+Reading order: `arrays` (conventions), the nouns `instrument`, `micrograph`, `heightmap`, `reconstruction`, then one
+folder per verb. Which file does what:
+
+* `scene/` what is imaged: `sample` (kinds of samples), `surfaces` (their geometry), `scan` (raster), `scene`.
+* `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
+  `direct` (form factor and next-event step), `transport` (paths), `masks` (masked fraction, shadow), `run` (blocks, threads).
+* `prepare/` `noise`: counting noise, background and gain.
+* `reconstruct/` JAX: `formfactor`, `linear` (photometric solution), `integrate*` (slopes -> heights), `render` (the
+  differentiable model), `refine` (the fit of the heights), `nearfield`.
+* `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
+* `formats/` `hdf5` (NeXus), `matlab` (import), `safe` (untrusted files).
+* `config` (scene files), `pipeline` (the only place that joins the stages), `__main__` (command line).
+
+Public names are loaded on first use, so that `import helio_jax` is instant.
+"""
+
+import importlib
+import sys
+from types import ModuleType
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Instrument": "instrument",
+    "MicrographStack": "micrograph",
+    "MicrographSet": "micrograph",
+    "HeightMap": "heightmap",
+    "Reconstruction": "reconstruction",
+    "HelioError": "errors",
+    "load_scene": "config",
+    "load_instrument": "config",
+    "simulate": "pipeline",
+    "reconstruct": "pipeline",
+    "true_height": "pipeline",
+    "evaluate": "pipeline",
+    "run": "pipeline",
+    "read": "formats.hdf5",
+    "write": "formats.hdf5",
+    "import_micrographs": "formats.matlab",
+}
+
+__all__ = [*sorted(_HOME), "__version__"]
+
+
+class _VerbFolder(ModuleType):
+    """A folder that shares its name with its verb: `hx.reconstruct(stack)` calls `pipeline.reconstruct`."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        verb = self.__name__.rpartition(".")[2]
+        return getattr(importlib.import_module("helio_jax.pipeline"), verb)(*args, **kwargs)
+
+
+class _Package(ModuleType):
+    """This package; makes the verb folders callable when the import system attaches them."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in ("reconstruct", "evaluate") and isinstance(value, ModuleType):
+            value.__class__ = _VerbFolder
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("reconstruct", "evaluate"):
+        return importlib.import_module(f"helio_jax.{name}")
+    if name in _HOME:
+        value = getattr(importlib.import_module(f"helio_jax.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'helio_jax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,54 @@
+"""Conventions of every array in the package, and the checks that keep them.
+
+* Lengths are micrometres, angles radians, numbers float64. User units appear only in names that say so.
+* Images are `[detector, y, x]`; x grows with the column, y with the row; pictures are drawn origin lower.
+* Pixel (i, j) has beam position (x[j], y[i]): where the beam axis meets the sample's plane z = 0. Its surface
+  point of height h lies at (x - h tan t, y, h) in the sample frame: height goes up, towards the plate.
+* Slopes in the beam frame: a = dh/dX, b = dh/dY (per um of raster), for a beam azimuth of zero
+  a = p / (1 + p tan t), b = q / (1 + p tan t) with the surface's own p = dz/dx, q = dz/dy.
+* Surface normals point up: n ~ (-p, -q, 1).
+* Masks say what True means: `is_observed`, `is_valid`.
+* Scattering orders: index 0 is single scattering (order 1); the last index holds that order and above.
+
+tests/unit/test_conventions.py pins each sentence.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from helio_jax.errors import HelioError
+
+
+def as_float_array(name: str, value: Any, shape: tuple[int | None, ...], error: type[HelioError]) -> np.ndarray:
+    """Return `value` as a float64 array of `shape` (None: any length).
+
+    Raises:
+        error: not numeric, or another shape; the message names the quantity, its shape and the expected one.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as e:
+        raise error(f"{name} must be numbers, got {type(value).__name__}: {e}") from None
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        raise error(f"{name} must have the shape {wanted}, got {' x '.join(map(str, array.shape)) or 'a scalar'}")
+    return array
+
+
+def check_axis(name: str, values: np.ndarray, error: type[HelioError]) -> None:
+    """Check that a raster axis is finite, increasing and equally spaced (to 1e-6 of its pitch)."""
+    if not np.all(np.isfinite(values)):
+        raise error(f"{name} must be finite, got {int(np.sum(~np.isfinite(values)))} non-finite beam positions")
+    if values.size > 1:
+        step = np.diff(values)
+        if step.min() <= 0 or np.ptp(step) > 1e-6 * step.mean():
+            raise error(
+                f"{name} must increase in equal steps, got steps of {step.min():g} to {step.max():g} um: "
+                "resample the scan onto a regular raster"
+            )
+
+
+def pitch(axis: np.ndarray) -> float:
+    """Return the step of a regular axis [um]; 1 um for a single position."""
+    return float((axis[-1] - axis[0]) / (axis.size - 1)) if axis.size > 1 else 1.0

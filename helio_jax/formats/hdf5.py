@@ -1,0 +1,279 @@
+"""Write and read helio files: HDF5 laid out as NeXus (see `nexus`). The only door to h5py.
+
+Reading: the HDF5 library can crash on a corrupt file, and a file that claims to be ours can be corrupt too. So every
+file, ours included, is opened in a limited child process only, which hands back plain arrays; this process never
+touches its bytes. That costs a Python start (0.7 s on a slow core). The nouns are imported late for that child's sake.
+Refused: external and soft links, external storage, virtual datasets, unknown filters, objects, oversized data.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from helio_jax.errors import InputFileError
+from helio_jax.formats import safe
+
+if TYPE_CHECKING:
+    from helio_jax.formats.nexus import Node, Noun
+
+FORMAT = "1.0"
+MAX_BYTES = 4 * safe.GIB
+_MAX_OBJECTS = 20_000
+_MAX_DEPTH = 8
+_FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
+_SCAN = re.compile(r"scan_[1-9][0-9]{0,5}")
+
+
+def write(obj: "Noun", path: str | os.PathLike) -> None:
+    """Write micrographs, a set of them or a reconstruction, replacing the file in one step.
+
+    Args:
+        obj: `MicrographStack`, `MicrographSet` or `Reconstruction`.
+        path: the target, usually `.h5`; it stays as it was when writing fails.
+
+    Raises:
+        SceneError: the target cannot be written.
+        HelioError: the object is of another kind, or its provenance is not JSON-compatible.
+    """
+    import helio_jax
+    from helio_jax.formats import nexus
+
+    nodes = nexus.lay_out(obj)
+    root = {
+        "NX_class": "NXroot",
+        "default": "entry",
+        "creator": "helio_jax",
+        "creator_version": helio_jax.__version__,
+        "helio_format": FORMAT,
+        "filetype": nexus.KINDS[type(obj)],
+        "file_time": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    # v110: the library then keeps checksums of its own structures, so that damage is noticed
+    with safe.atomic_path(path) as temporary, h5py.File(temporary, "w", libver=("v110", "v110")) as file:
+        _put_attributes(file, root)
+        for node in nodes:
+            _put_node(file, node)
+
+
+def _put_node(file: h5py.File, node: "Node") -> None:
+    """Write one group, dataset or second name."""
+    if node.same_as is not None:
+        file[node.path] = file[node.same_as]
+        return
+    if node.value is None:
+        _put_attributes(file.create_group(node.path), node.attributes)
+        return
+    value = _fixed_text(node.value) if isinstance(node.value, str) else np.asarray(node.value)
+    if value.dtype != np.uint8 and value.dtype.kind != "S":
+        value = value.astype("<f8")
+    packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if value.ndim and value.size else {}
+    dataset = file.create_dataset(node.path, data=value, **packing)
+    # gzip and the library's own structures carry checksums, single values do not
+    checksum = {} if value.ndim else {"sha256": hashlib.sha256(value.tobytes()).hexdigest()}
+    _put_attributes(dataset, {**node.attributes, **checksum})
+
+
+def _put_attributes(target: Any, attributes: Mapping[str, str | list[str]]) -> None:
+    """Write attributes as texts of fixed length."""
+    for name, value in attributes.items():
+        target.attrs.create(name, _fixed_text(value))
+
+
+def _fixed_text(value: str | list[str]) -> np.ndarray:
+    """Return UTF-8 text of fixed length: other programs handle it better than variable length."""
+    texts = [v.encode() for v in ([value] if isinstance(value, str) else value)]
+    length = max(1, *map(len, texts))
+    array = np.array(texts, dtype=h5py.string_dtype("utf-8", length))
+    return array[0].reshape(()) if isinstance(value, str) else array
+
+
+def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
+    """Read a helio file.
+
+    Args:
+        path: written by `write`, by this or another version with the same major format.
+        max_bytes: largest file, and largest sum of all arrays once unpacked.
+
+    Returns:
+        `MicrographStack`, `MicrographSet` or `Reconstruction`, equal bit for bit to what was written.
+
+    Raises:
+        InputFileError: missing, not HDF5, not ours, damaged, too large, or with links to other files; the message
+            names the file and, where it applies, the place in it.
+    """
+    from helio_jax.formats import nexus
+
+    found = _load_in_child(path, nexus.READ_PLACES, max_bytes)
+    return nexus.rebuild(found["filetype"], found["entries"], str(path))
+
+
+def describe(path: str | os.PathLike) -> dict[str, Any]:
+    """Summarise a helio file without reading its arrays; the result is JSON-compatible.
+
+    Returns:
+        file, bytes, kind, format, creator, created; and per entry ("" or "scan_1", ...): fields (shape, unit and
+        meaning by place), instrument and provenance.
+
+    Raises:
+        InputFileError: as `read`.
+    """
+    from helio_jax.formats import nexus
+
+    found = _load_in_child(path, nexus.COMMON_PLACES, MAX_BYTES)
+    entries = {}
+    for name, values in found["entries"].items():
+        texts = {place: json.loads(values.get(place, "null")) for place in nexus.COMMON_PLACES}
+        entries[name] = {"fields": found["fields"][name]}
+        entries[name] |= {place.partition("/")[0]: value for place, value in texts.items()}
+    about = {key: found[key] for key in ("filetype", "helio_format", "creator", "creator_version", "file_time")}
+    names = {"filetype": "kind", "helio_format": "format", "file_time": "created"}
+    about = {names.get(key, key): value for key, value in about.items()}
+    return {"file": str(path), "bytes": Path(path).stat().st_size, **about, "entries": entries}
+
+
+def _load_in_child(path: str | os.PathLike, places: tuple[str, ...], max_bytes: int) -> dict[str, Any]:
+    """Check the file's size, then have a child process read it."""
+    safe.check_size(path, max_bytes)
+    memory = 2 * max_bytes + safe.GIB
+    return safe.call_in_child(
+        "helio_jax.formats.hdf5:load_fields", path, places, max_bytes, memory_bytes=memory, seconds=300
+    )
+
+
+def load_fields(path: Path, places: list[str], max_bytes: int) -> dict[str, Any]:
+    """Read root attributes, the values at `places` and a summary of all fields; runs in a child process.
+
+    Raises:
+        InputFileError: see `read`.
+    """
+    with _open(path) as file:
+        about = _read_about(path, file)
+        entries: dict[str, dict[str, Any]] = {}
+        fields: dict[str, dict[str, Any]] = {}
+        n_bytes = 0
+        for place, item in _walk(path, file):
+            n_bytes += _check_item(path, place, item)
+            if n_bytes > max_bytes:
+                raise InputFileError(
+                    f"{path}: the arrays up to {place} must take at most {max_bytes / safe.MIB:.0f} MiB, they declare "
+                    f"{n_bytes / safe.MIB:.0f} MiB: the file is corrupt, or read it with a larger max_bytes"
+                )
+            scan, _, rest = place.removeprefix("/entry/").partition("/")
+            name, inner = (scan, rest) if _SCAN.fullmatch(scan) else ("", place.removeprefix("/entry/"))
+            if not isinstance(item, h5py.Dataset):
+                continue
+            fields.setdefault(name, {})[inner] = _summary(path, place, item)
+            target = entries.setdefault(name, {})
+            if inner in places:
+                target[inner] = _value(path, place, item)
+    return {**about, "entries": entries, "fields": fields}
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """Open a file for reading; what the library says on closing an invalid one is put into words."""
+    try:
+        file = h5py.File(path, "r", locking=False)
+    except OSError as e:
+        raise InputFileError(f"{path} is not a readable HDF5 file, it is damaged or of another kind: {e}") from None
+    with file:
+        yield file
+
+
+def _read_about(path: Path, file: h5py.File) -> dict[str, str]:
+    """Read the root attributes and refuse what is not ours."""
+    names = ("helio_format", "filetype", "creator", "creator_version", "file_time")
+    about = {name: _text_attribute(path, "/", file, name) for name in names}
+    if not about["helio_format"]:
+        raise InputFileError(f"{path}: / has no attribute helio_format: not a helio file; see `helio import --help`")
+    major = about["helio_format"].partition(".")[0]
+    if major != FORMAT.partition(".")[0]:
+        raise InputFileError(
+            f"{path}: helio_format must be {FORMAT.partition('.')[0]}.x, got {about['helio_format']!r}: "
+            "update helio_jax (pip install -U helio-jax)"
+        )
+    return about
+
+
+def _walk(path: Path, group: h5py.Group, depth: int = 1, count: list[int] | None = None) -> Iterator[tuple[str, Any]]:
+    """Yield every object below `group` with its place, following hard links only."""
+    count = [0] if count is None else count
+    for name in group:
+        place = f"{group.name.rstrip('/')}/{name}"
+        count[0] += 1
+        if count[0] > _MAX_OBJECTS or depth > _MAX_DEPTH:
+            limit = f"{_MAX_OBJECTS} objects, {_MAX_DEPTH} deep"
+            raise InputFileError(f"{path}: at {place} there are more than {limit}: not a helio file, or corrupt")
+        link = group.get(name, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            kind = {h5py.SoftLink: "a soft", h5py.ExternalLink: "an external"}.get(type(link), "an unknown kind of")
+            raise InputFileError(f"{path}: {place} is {kind} link, which is refused: copy the data into the file")
+        item = group[name]
+        yield place, item
+        if isinstance(item, h5py.Group):
+            yield from _walk(path, item, depth + 1, count)
+
+
+def _check_item(path: Path, place: str, item: Any) -> int:
+    """Refuse storage that reaches outside the file or needs plugins; return the bytes the item declares."""
+    if isinstance(item, h5py.Group):
+        return 0
+    if not isinstance(item, h5py.Dataset):
+        raise InputFileError(f"{path}: {place} is a {type(item).__name__}, which is refused: not a helio file")
+    plan = item.id.get_create_plist()
+    if plan.get_external_count():
+        raise InputFileError(f"{path}: {place} keeps its data in another file, which is refused: copy it in")
+    if item.is_virtual:
+        raise InputFileError(f"{path}: {place} is a virtual dataset, which is refused: copy the data in")
+    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+    if any(f not in _FILTERS for f in filters):
+        raise InputFileError(f"{path}: {place} must be compressed with gzip only, got HDF5 filters {filters}")
+    if item.dtype.kind not in "fiubS":
+        raise InputFileError(f"{path}: {place} must hold numbers or fixed-length text, got {item.dtype}")
+    if item.shape is None:
+        raise InputFileError(f"{path}: {place} is a dataset without data: the file is incomplete")
+    return int(item.dtype.itemsize) * int(np.prod([float(n) for n in item.shape]))
+
+
+def _value(path: Path, place: str, item: h5py.Dataset) -> Any:
+    """Read a dataset: text or array."""
+    try:
+        value = item[()]
+    except OSError as e:
+        raise InputFileError(f"{path}: {place} cannot be read, the file is damaged: {e}") from None
+    value = np.asarray(value)
+    digest = _text_attribute(path, place, item, "sha256")
+    if digest and hashlib.sha256(value.tobytes()).hexdigest() != digest:
+        raise InputFileError(f"{path}: {place} does not match its checksum: the file is damaged")
+    if item.dtype.kind != "S":
+        return value
+    if item.shape != ():
+        raise InputFileError(f"{path}: {place} must be one text, got an array of {item.shape}")
+    try:
+        return bytes(value[()]).decode("utf-8")
+    except UnicodeDecodeError as e:
+        raise InputFileError(f"{path}: {place} is not UTF-8 text: {e}") from None
+
+
+def _summary(path: Path, place: str, item: h5py.Dataset) -> dict[str, Any]:
+    """Return shape, unit and meaning of a dataset."""
+    unit, long_name = (_text_attribute(path, place, item, name) for name in ("units", "long_name"))
+    return {"shape": list(item.shape), "unit": unit, "long_name": long_name}
+
+
+def _text_attribute(path: Path, place: str, item: Any, name: str) -> str:
+    """Read a text attribute, "" where it is missing."""
+    try:
+        value = item.attrs.get(name, "")
+    except (OSError, RuntimeError, TypeError, ValueError) as e:
+        raise InputFileError(f"{path}: {place}@{name} cannot be read, the file is damaged: {e}") from None
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,281 @@
+"""Import micrographs from MATLAB files: the reference simulator, B-SHeM and A-SHeM. The only door to pymatreader.
+
+The file is parsed in a limited child process, for SciPy's reader crashes on corrupt files. Three layouts are told
+apart by their variables and brought to our frame (arrays.py): `im.single` and `im.multiple` (reference simulator),
+`meas_list.image` as a list of channels (B-SHeM) or as one array (A-SHeM). What the file does not say, such as the
+apertures, comes from the instrument. All scalar metadata go to `provenance["metadata"]`. Does no calibration.
+"""
+
+import hashlib
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from helio_jax.errors import InputFileError
+from helio_jax.formats import safe
+from helio_jax.formats.matlab_reference import complete_instrument, read_counts
+from helio_jax.formats.tables import get_array, get_number, get_table
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographStack
+
+MAX_FILE_BYTES = 256 * safe.MIB
+_IMAGES = ("image", "single", "multiple")
+_SUMMARISED = ("labtemp", "beam_pressure", "return_state")
+_SMALL = 64
+_WANTED_INSTRUMENT = {
+    "reference simulator": "scenes/instruments/bshem_wd4.toml",
+    "B-SHeM": "scenes/instruments/bshem_wd3.toml",
+    "A-SHeM": "scenes/instruments/ashem_normal.toml",
+}
+
+
+def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = None) -> MicrographStack:
+    """Import the micrographs of one MATLAB file (level 5 format, at most 256 MiB).
+
+    Args:
+        path: file of the reference simulator, a B-SHeM or an A-SHeM scan.
+        instrument: beam, plate and apertures. For the reference simulator the file's own values are used and only
+            what it lacks (aperture rotations) is taken from here; a contradiction is an error.
+
+    Returns:
+        The stack, detectors in the instrument's order; `provenance` tells the file, its SHA-256, the kind, how the
+        raw array was turned, where the variance comes from, and the file's metadata.
+
+    Raises:
+        InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument does not fit.
+    """
+    safe.check_size(path, MAX_FILE_BYTES)
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    tree = safe.call_in_child("helio_jax.formats.matlab:load_tree", path, memory_bytes=3 * safe.GIB, seconds=120)
+    kind = _find_kind(str(path), tree)
+    if instrument is None:
+        raise InputFileError(
+            f"{path}: a {kind} file does not say how its apertures are shaped and turned: name the instrument, "
+            f"for example --instrument {_WANTED_INSTRUMENT[kind]}"
+        )
+    build = {"reference simulator": _reference_stack, "B-SHeM": _bshem_stack, "A-SHeM": _ashem_stack}[kind]
+    fields, notes = build(str(path), tree, instrument)
+    metadata = {k: _to_json(v) for k, v in tree.items()}
+    provenance = {"source": {"file": Path(path).name, "sha256": digest, "kind": kind}, **notes, "metadata": metadata}
+    try:
+        return MicrographStack(**{"instrument": instrument, "name": Path(path).stem, **fields}, provenance=provenance)
+    except InputFileError as e:
+        raise InputFileError(f"{path}: {e}") from None
+
+
+def load_tree(path: Path) -> dict[str, Any]:
+    """Parse a level 5 MATLAB file and drop what is large and no image; runs in a child process.
+
+    Raises:
+        InputFileError: not a level 5 MATLAB file.
+    """
+    with path.open("rb") as file:
+        head = file.read(128)
+    if head.startswith(b"MATLAB 7.3"):
+        raise InputFileError(f"{path} is a MATLAB 7.3 (HDF5) file: save it again with save(..., '-v7')")
+    if not head.startswith(b"MATLAB 5.0 MAT-file"):
+        raise InputFileError(f"{path} is not a MATLAB file (level 5): its header starts with {head[:19]!r}")
+    from pymatreader import read_mat  # here, so that this process alone loads it
+
+    tree = read_mat(str(path))
+    return {k: _reduce(k, v) for k, v in tree.items() if not k.startswith("__")}
+
+
+def _reduce(name: str, value: Any) -> Any:
+    """Keep images and small values; replace series by their statistics and other large arrays by None."""
+    if isinstance(value, dict):
+        kept = {k: _reduce(k, v) for k, v in value.items() if isinstance(k, str) and not k.startswith("_")}
+        return {k: v for k, v in kept.items() if v is not None}
+    if isinstance(value, list):
+        return [_reduce(name, v) for v in value] if len(value) <= _SMALL else None
+    if isinstance(value, (np.ndarray, np.generic)):
+        if value.dtype.kind not in "fiubUS":
+            return None
+        is_number = value.dtype.kind in "fiub"
+        if np.size(value) <= _SMALL or (name in _IMAGES and is_number):
+            return value
+        if name not in _SUMMARISED or not is_number or not np.isfinite(value).any():
+            return None
+        good = value[np.isfinite(value)]
+        return {"mean": float(good.mean()), "min": float(good.min()), "max": float(good.max())}
+    return value if isinstance(value, (bool, int, float, str)) else None
+
+
+def _to_json(value: Any) -> Any:
+    """Return metadata as JSON values: images left out, non-finite numbers None."""
+    if isinstance(value, dict):
+        return {k: _to_json(v) for k, v in value.items() if k not in _IMAGES}
+    if isinstance(value, np.ndarray):
+        return _to_json(value.tolist()) if value.size <= _SMALL else {"shape": list(value.shape)}
+    if isinstance(value, list):
+        return [_to_json(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _find_kind(path: str, tree: dict[str, Any]) -> str:
+    """Tell the three layouts apart."""
+    im, scan = tree.get("im"), tree.get("meas_list")
+    if isinstance(im, dict) and "single" in im and "multiple" in im:
+        return "reference simulator"
+    if isinstance(scan, dict) and isinstance(scan.get("image"), list):
+        return "B-SHeM"
+    if isinstance(scan, dict) and isinstance(scan.get("image"), np.ndarray):
+        return "A-SHeM"
+    found = ", ".join(list(tree)[:10]) or "none"
+    raise InputFileError(
+        f"{path} holds no micrographs that are known: neither im.single and im.multiple (reference simulator) nor "
+        f"meas_list.image (B-SHeM, A-SHeM); its variables: {found}"
+    )
+
+
+def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:
+    """Read the reference simulator's counts: columns reversed, x pitch divided by cos t."""
+    full, order = complete_instrument(path, tree, instrument)
+    by_order = read_counts(path, tree, order)
+    im = get_table(path, tree, "im")
+    step_x = get_number(path, im, "raster_movement_x", low=0.0) * 1000 / math.cos(math.radians(full.beam.incidence_deg))
+    step_y = get_number(path, im, "raster_movement_y", low=0.0) * 1000
+    counts = by_order.sum(0)
+    fields = {
+        "counts": counts,
+        "by_order": by_order,
+        "variance": np.maximum(counts, 1.0),
+        "x": _centred(counts.shape[2], step_x),
+        "y": _centred(counts.shape[1], step_y),
+        "n_rays": get_number(path, get_table(path, tree, "param"), "rays_per_pixel", low=0.0),
+        "noise": "poisson",
+        "instrument": full,
+    }
+    notes = {
+        "orientation": "columns reversed, rows kept, x pitch divided by cos(incidence)",
+        "variance_from": "Poisson: the count itself, at least 1",
+    }
+    return fields, notes
+
+
+def _bshem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:
+    """Read a B-SHeM scan: per channel raw[::-1, ::-1].T, so that the beam travels towards +x."""
+    scan = get_table(path, tree, "meas_list")
+    channels = scan["image"]
+    images = []
+    for detector in instrument.detector:
+        where = f"detector {detector.name!r}"
+        if detector.channel is None or detector.channel > len(channels):
+            raise InputFileError(
+                f"{path}: {where} must name its channel, 1 to {len(channels)}, got {detector.channel}: "
+                "set `channel` in the instrument file"
+            )
+        image = get_array(path, channels[detector.channel - 1], f"meas_list.image{{{detector.channel}}}", 2)
+        if not np.any(image):
+            raise InputFileError(f"{path}: channel {detector.channel} of {where} holds only zeros: it is not connected")
+        images.append(image)
+    used = [d.channel for d in instrument.detector]
+    if len(set(used)) != len(used) or len({i.shape for i in images}) != 1:
+        raise InputFileError(
+            f"{path}: channels must differ and be of one size, got {used}, {[i.shape for i in images]}"
+        )
+    n_rows, n_columns = images[0].shape
+    pm = 1e-6
+    fast = _fast_direction(path, scan)
+    variance = [_noise_variance(image, fast) for image in images]
+    fields = {
+        "counts": np.stack([image[::-1, ::-1].T for image in images]),
+        "variance": _per_detector(variance, (n_columns, n_rows)),
+        "x": _centred(n_rows, _raw_pitch(path, scan, "vert", n_rows) * pm),
+        "y": _centred(n_columns, _raw_pitch(path, scan, "hori", n_columns) * pm),
+        "dwell": get_number(path, scan, "dwell_time", low=0.0) * 1e-3,
+        "fast_axis": "y" if fast == "horizontal" else "x",
+        "noise": "measured",
+    }
+    return fields, _measured_notes("raw[::-1, ::-1].T, the scan runs from +x, +y to -x, -y", fast, variance)
+
+
+def _ashem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:
+    """Read an A-SHeM scan: one detector, rows reversed so that y goes up in the picture."""
+    scan = get_table(path, tree, "meas_list")
+    if len(instrument.detector) != 1:
+        raise InputFileError(
+            f"{path}: an A-SHeM scan has 1 detector, the instrument has {len(instrument.detector)}: "
+            f"give the instrument of this microscope, for example {_WANTED_INSTRUMENT['A-SHeM']}"
+        )
+    image = get_array(path, scan["image"], "meas_list.image", 2)
+    n_rows, n_columns = image.shape
+    nm = 1e-3
+    fast = _fast_direction(path, scan)
+    variance = [_noise_variance(image, fast)]
+    orientation = get_array(path, scan.get("sample_orientation"), "meas_list.sample_orientation", 1)
+    if orientation.size < 2:
+        raise InputFileError(f"{path}: meas_list.sample_orientation must have 3 entries, got {orientation.size}")
+    period = get_number(path, scan, "sampling_period", low=0.0) if "sampling_period" in scan else 15.0
+    fields = {
+        "counts": image[None, ::-1, :],
+        "variance": _per_detector(variance, image.shape),
+        "x": _centred(n_columns, _raw_pitch(path, scan, "hori", n_columns) * nm),
+        "y": _centred(n_rows, _raw_pitch(path, scan, "vert", n_rows) * nm),
+        "dwell": get_number(path, scan, "N_dwell", low=0.0) * period * 1e-3,
+        "fast_axis": "x" if fast == "horizontal" else "y",
+        "sample_rotation": math.radians(orientation[1] * 1e-6),
+        "noise": "measured",
+        "unit": "A",
+    }
+    return fields, _measured_notes("raw[::-1, :], the scan runs from -x, +y to +x, -y", fast, variance)
+
+
+def _measured_notes(orientation: str, fast: str, variance: list[float]) -> dict[str, Any]:
+    """Return what provenance says about a measured scan."""
+    how = (
+        "one value per detector: median of squared second differences along the fast axis, drift between lines excluded"
+    )
+    return {"orientation": orientation, "raw_fast_axis": fast, "variance_from": how, "noise_variance": variance}
+
+
+def _fast_direction(path: str, scan: dict[str, Any]) -> str:
+    """Return the raw array's fast axis, horizontal unless the scan's inputs say otherwise."""
+    inputs = scan.get("inputs", [])
+    for key, value in zip(inputs[::2], inputs[1::2], strict=False) if isinstance(inputs, list) else ():
+        if isinstance(key, str) and key == "fast_axis":
+            if value not in ("horizontal", "vertical"):
+                raise InputFileError(
+                    f"{path}: meas_list.inputs: fast_axis must be horizontal or vertical, got {value!r}"
+                )
+            return value
+    return "horizontal"
+
+
+def _raw_pitch(path: str, scan: dict[str, Any], direction: str, n: int) -> float:
+    """Return the scan step in the file's unit, after checking that it spans the range in n - 1 steps."""
+    step = get_number(path, scan, f"{direction}_res", low=0.0)
+    span = float(np.ptp(get_array(path, scan.get(f"{direction}_range"), f"meas_list.{direction}_range", 1)))
+    if abs(span - (n - 1) * step) > 0.5 * step:
+        raise InputFileError(
+            f"{path}: the {direction} range must be {n} pixels of {step:g}, got a range of {span:g}: "
+            "the scan is incomplete or the file is corrupt"
+        )
+    return step
+
+
+def _centred(n: int, step: float) -> np.ndarray:
+    """Return n beam positions about zero [um]."""
+    return (np.arange(n) - (n - 1) / 2) * step
+
+
+def _per_detector(values: list[float], shape: tuple[int, ...]) -> np.ndarray:
+    """Spread one value per detector over images of `shape`."""
+    return np.broadcast_to(np.asarray(values)[:, None, None], (len(values), *shape)).copy()
+
+
+def _noise_variance(image: np.ndarray, fast: str) -> float:
+    """Estimate the noise variance of a pixel from second differences along the raw fast axis.
+
+    Valid for white noise on an image that is smooth over 3 pixels in more than half of its area; slow drift and
+    the offset of lines are not in it.
+
+    Source: own derivation: the second difference of white noise has 6 times its variance, and the median of its
+        absolute value is 0.6745 standard deviations; tests/formats/test_matlab.py.
+    """
+    d = np.diff(image, 2, axis=1 if fast == "horizontal" else 0)
+    d = d[np.isfinite(d)]
+    return float((np.median(np.abs(d)) / 0.67449) ** 2 / 6) if d.size else math.nan

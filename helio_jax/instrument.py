@@ -1,0 +1,217 @@
+"""The microscope: beam, pinhole plate and detector apertures, and the geometry that follows from them.
+
+Flows with the micrographs (`MicrographStack.instrument`), so that a stack can be reconstructed without its
+scene. Frames (DESIGN.md section 1): the lab frame has z up from sample to plate and its origin where the beam
+axis is at the design working distance W below the plate; the sample frame has the same axes and z = 0 on
+the sample's reference plane, which stands the sample distance D below the plate.
+Does not know any sample, ray or image.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from helio_jax.settings import Settings
+
+
+class Beam(Settings):
+    """The incident helium beam."""
+
+    incidence_deg: float = Field(0.0, ge=0.0, le=80.0)
+    """Angle t between the beam and the plate normal [deg]."""
+    azimuth_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    """Direction in which the beam travels across the sample, counter-clockwise from +x seen from above [deg]."""
+    pinhole_radius_um: float = Field(1.0, ge=0.0, le=1000.0)
+    """Radius of the pinhole disc, which lies in the plate plane [um]."""
+    source: Literal["uniform", "gaussian", "pencil"] = "uniform"
+    """Angular distribution about the beam axis; `pencil` is parallel."""
+    source_size_mrad: float = Field(0.5, ge=0.0, le=500.0)
+    """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; `pencil`: ignored [mrad]."""
+
+
+class Plate(Settings):
+    """The pinhole plate: the plane that holds the pinhole and the detector apertures."""
+
+    kind: Literal["transparent"] = "transparent"
+    """`transparent`: atoms that miss every aperture pass through and are gone."""
+    working_distance_um: float = Field(gt=0.0, le=1e6)
+    """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
+    sample_distance_um: float | None = Field(None, gt=0.0, le=1e6)
+    """Distance D from the plate to the sample's reference plane (its substrate); default W [um]."""
+
+
+class Detector(Settings):
+    """One detector aperture: either an ellipse on the plate, or the cone it fills seen from the nominal spot."""
+
+    name: str = Field(min_length=1, max_length=64)
+    """Name shown in figures and files."""
+    center_um: tuple[float, float] | None = None
+    """Centre (x, y) of the ellipse on the plate, lab frame [um]."""
+    axes_um: tuple[float, float] | None = None
+    """FULL axes of the ellipse; the first one along x before rotation [um]."""
+    rotation_deg: float | None = Field(None, ge=-360.0, le=360.0)
+    """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
+    polar_deg: float | None = Field(None, ge=0.0, lt=90.0)
+    """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
+    azimuth_deg: float | None = Field(None, ge=-360.0, le=360.0)
+    """Azimuth of the cone's axis, counter-clockwise from +x (default 0) [deg]."""
+    half_angle_deg: float | None = Field(None, gt=0.0, lt=90.0)
+    """Half-angle of the cone [deg]."""
+    channel: int | None = Field(None, ge=1, le=1000)
+    """Channel of a measured file that this aperture feeds (1-based); only used on import."""
+
+    @model_validator(mode="after")
+    def _is_ellipse_or_cone(self) -> "Detector":
+        ellipse = [self.center_um, self.axes_um]
+        cone = [self.polar_deg, self.half_angle_deg]
+        is_ellipse = all(v is not None for v in ellipse)
+        is_cone = all(v is not None for v in cone)
+        stray = (
+            any(v is not None for v in (*cone, self.azimuth_deg))
+            if is_ellipse
+            else any(v is not None for v in (*ellipse, self.rotation_deg))
+        )
+        if is_ellipse == is_cone or stray:
+            raise ValueError(
+                f"detector {self.name!r} must be given either by center_um and axes_um (and rotation_deg) or by "
+                "polar_deg and half_angle_deg (and azimuth_deg), not by a mixture: remove the other keys"
+            )
+        if self.axes_um is not None and min(self.axes_um) <= 0:
+            raise ValueError(f"detector {self.name!r}: axes_um must be > 0 um, got {list(self.axes_um)}")
+        if is_cone and self.polar_deg + self.half_angle_deg >= 89.0:  # type: ignore[operator]
+            raise ValueError(
+                f"detector {self.name!r}: polar_deg + half_angle_deg must be < 89 deg so that the cone meets the "
+                f"plate in an ellipse, got {self.polar_deg} + {self.half_angle_deg}"  # type: ignore[operator]
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A detector aperture resolved to its ellipse on the plate (lab frame, um, radians, SEMI-axes)."""
+
+    center: tuple[float, float]
+    semi_axes: tuple[float, float]
+    rotation: float
+
+    def rim(self, n_points: int) -> np.ndarray:
+        """Return `n_points` rim points and tangents, equally spaced in the ellipse's parameter.
+
+        Returns:
+            Array [2, n_points, 2]: positions (x, y) on the plate [um] and derivatives with respect to the
+            parameter [um/rad], counter-clockwise seen from above.
+        """
+        s = 2 * np.pi * np.arange(n_points) / n_points
+        (a, b), c, d = self.semi_axes, math.cos(self.rotation), math.sin(self.rotation)
+        turn = np.array([[c, -d], [d, c]])
+        points = np.stack([a * np.cos(s), b * np.sin(s)], -1) @ turn.T + np.asarray(self.center)
+        tangents = np.stack([-a * np.sin(s), b * np.cos(s)], -1) @ turn.T
+        return np.stack([points, tangents])
+
+
+def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: float) -> Aperture:
+    """Cut a circular cone with the plate: the exact ellipse seen under `half_angle` from the nominal spot.
+
+    Valid for polar + half_angle < pi/2.
+
+    Args:
+        polar: angle of the cone's axis to the plate normal [rad].
+        azimuth: azimuth of the axis [rad].
+        half_angle: half-angle of the cone [rad].
+        distance: from the nominal spot to the plate [um].
+
+    Returns:
+        The ellipse, major axis along the azimuth.
+
+    Source: own derivation (plane section of a cone), tests/unit/test_instrument.py.
+    """
+    near, far = distance * math.tan(polar - half_angle), distance * math.tan(polar + half_angle)
+    minor = distance * math.sin(half_angle) / math.sqrt(math.cos(polar) ** 2 - math.sin(half_angle) ** 2)
+    r = 0.5 * (near + far)
+    return Aperture((r * math.cos(azimuth), r * math.sin(azimuth)), (0.5 * (far - near), minor), azimuth)
+
+
+class Instrument(Settings):
+    """Beam, plate and detectors of one scan, with the geometry derived from them (um, radians)."""
+
+    beam: Beam = Beam()
+    plate: Plate
+    detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
+
+    @model_validator(mode="after")
+    def _has_distinct_names(self) -> "Instrument":
+        names = [d.name for d in self.detector]
+        if len(set(names)) != len(names):
+            raise ValueError(f"detector names must differ, got {names}: rename one of them")
+        return self
+
+    @property
+    def working_distance(self) -> float:
+        """Design working distance W [um]."""
+        return self.plate.working_distance_um
+
+    @property
+    def sample_distance(self) -> float:
+        """Distance D from the plate to the sample's plane z = 0 [um]."""
+        d = self.plate.sample_distance_um
+        return self.plate.working_distance_um if d is None else d
+
+    @property
+    def detector_names(self) -> tuple[str, ...]:
+        """Names in array order."""
+        return tuple(d.name for d in self.detector)
+
+    @property
+    def beam_shift(self) -> tuple[float, float]:
+        """tan t (cos phi, sin phi): how far the beam axis moves in (x, y) per um of depth."""
+        t, phi = math.radians(self.beam.incidence_deg), math.radians(self.beam.azimuth_deg)
+        return math.tan(t) * math.cos(phi), math.tan(t) * math.sin(phi)
+
+    @property
+    def beam_direction(self) -> np.ndarray:
+        """Unit vector u of the beam axis, lab frame [3]."""
+        t, phi = math.radians(self.beam.incidence_deg), math.radians(self.beam.azimuth_deg)
+        return np.array([math.sin(t) * math.cos(phi), math.sin(t) * math.sin(phi), -math.cos(t)])
+
+    @property
+    def pinhole_center(self) -> np.ndarray:
+        """Centre of the pinhole, lab frame [3, um]."""
+        tx, ty = self.beam_shift
+        w = self.working_distance
+        return np.array([-w * tx, -w * ty, w])
+
+    def apertures(self) -> tuple[Aperture, ...]:
+        """Return the ellipse of every detector, in array order; where two overlap, the earlier one wins."""
+        out = []
+        for d in self.detector:
+            if d.center_um is not None and d.axes_um is not None:
+                semi = (0.5 * d.axes_um[0], 0.5 * d.axes_um[1])
+                out.append(Aperture(d.center_um, semi, math.radians(d.rotation_deg or 0.0)))
+            else:
+                assert d.polar_deg is not None and d.half_angle_deg is not None  # by the validator above
+                cone = (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg)
+                out.append(cone_ellipse(*map(math.radians, cone), self.working_distance))
+        return tuple(out)
+
+    def spot_position(self, height: Any) -> tuple[Any, Any, Any]:
+        """Return the lab position (x, y, z) [um] of the point at `height` above the reference plane.
+
+        In a raster scan it depends on the height alone (DESIGN.md section 1). Works on NumPy and JAX arrays.
+        """
+        tx, ty = self.beam_shift
+        drop = self.sample_distance - self.working_distance - height
+        return drop * tx, drop * ty, -drop
+
+    def surface_position(self, x: Any, y: Any, height: Any) -> tuple[Any, Any]:
+        """Return where, in the sample frame, a point of `height` seen at beam position (x, y) lies [um]."""
+        tx, ty = self.beam_shift
+        return x - height * tx, y - height * ty
+
+    def sample_origin(self, x: Any, y: Any) -> tuple[Any, Any, float]:
+        """Return what to add to lab coordinates to get sample coordinates, for beam position (x, y) [um]."""
+        tx, ty = self.beam_shift
+        drop = self.sample_distance - self.working_distance
+        return x - drop * tx, y - drop * ty, drop

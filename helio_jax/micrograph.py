@@ -1,0 +1,132 @@
+"""Micrographs: what a scan produces, simulated or measured. A noun that flows between the stages.
+
+`MicrographStack` holds the images of one scan, all detectors on one raster; `MicrographSet` several scans of
+one sample, each with its own raster, azimuth and instrument. Conventions: arrays.py. Does no computation.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from helio_jax.arrays import as_float_array, check_axis
+from helio_jax.errors import HelioError, InputFileError
+from helio_jax.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class MicrographStack:
+    """Images of one scan, all detectors on one raster (frozen, checked when made).
+
+    Attributes:
+        counts: expected or measured counts per pixel [detector, y, x].
+        x, y: beam positions [um], increasing, equally spaced.
+        instrument: beam, plate and detectors, in the order of the detector axis.
+        variance: variance of `counts` as data (counting noise included where the counts are noisy), or of the
+            Monte Carlo mean where they are expectations; same shape, or None when unknown.
+        is_observed: True where a count was recorded; None: everywhere.
+        background: counts per pixel that do not come from the sample [detector] or [detector, y, x], if known.
+        by_order: counts by scattering order [order, detector, y, x], the last order being "and above".
+        effuse, plate: components from the effusive beam and from plate bounces, same shape as counts.
+        masked: fraction of the aperture's solid angle hidden from the pixel's point by the sample, own horizon
+            included [detector, y, x].
+        shadowed: 1 where the topmost surface point above the raster position cannot be seen by the beam [y, x].
+        n_rays: beam atoms per pixel that the counts stand for (simulated), or None.
+        dwell: dwell time per pixel [s] (measured), or None.
+        fast_axis: axis along which the scan moves fastest.
+        sample_rotation: rotation of the sample about the plate normal during this scan [rad].
+        noise: "expected" (noise-free expectation), "poisson" (counts) or "measured".
+        unit: unit of the counts ("counts", "A").
+        name: short name of the scan.
+        provenance: where it came from: scene, files, versions, seed, ray counters (JSON-compatible).
+    """
+
+    counts: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    instrument: Instrument
+    variance: np.ndarray | None = None
+    is_observed: np.ndarray | None = None
+    background: np.ndarray | None = None
+    by_order: np.ndarray | None = None
+    effuse: np.ndarray | None = None
+    plate: np.ndarray | None = None
+    masked: np.ndarray | None = None
+    shadowed: np.ndarray | None = None
+    n_rays: float | None = None
+    dwell: float | None = None
+    fast_axis: Literal["x", "y"] = "x"
+    sample_rotation: float = 0.0
+    noise: Literal["expected", "poisson", "measured"] = "expected"
+    unit: str = "counts"
+    name: str = "scan"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        error = InputFileError
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
+        put("x", as_float_array("x", self.x, (None,), error))
+        put("y", as_float_array("y", self.y, (None,), error))
+        check_axis("x", self.x, error)
+        check_axis("y", self.y, error)
+        shape = (len(self.instrument.detector), self.y.size, self.x.size)
+        put("counts", as_float_array("counts", self.counts, shape, error))
+        for name in ("variance", "effuse", "plate", "masked"):
+            if getattr(self, name) is not None:
+                put(name, as_float_array(name, getattr(self, name), shape, error))
+        if self.shadowed is not None:
+            put("shadowed", as_float_array("shadowed", self.shadowed, shape[1:], error))
+        if self.by_order is not None:
+            put("by_order", as_float_array("by_order", self.by_order, (None, *shape), error))
+        if self.background is not None:
+            ndim = np.ndim(self.background)
+            put("background", as_float_array("background", self.background, shape if ndim == 3 else shape[:1], error))
+        observed = np.isfinite(self.counts)
+        if self.is_observed is not None:
+            if np.shape(self.is_observed) != shape:
+                raise error(f"is_observed must have the shape of counts {shape}, got {np.shape(self.is_observed)}")
+            observed &= np.asarray(self.is_observed, bool)
+        put("is_observed", observed)
+        if self.variance is not None and np.any(self.variance[observed] < 0):
+            raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(detectors, rows, columns)."""
+        return self.counts.shape  # type: ignore[return-value]
+
+    @property
+    def std_error(self) -> np.ndarray | None:
+        """Square root of `variance`."""
+        return None if self.variance is None else np.sqrt(self.variance)
+
+    @property
+    def multiple(self) -> np.ndarray | None:
+        """Counts of order 2 and above [detector, y, x], where the orders are known."""
+        return None if self.by_order is None else self.by_order[1:].sum(0)
+
+    def replace(self, **changes: Any) -> "MicrographStack":
+        """Return a copy with some fields changed (and checked again)."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class MicrographSet:
+    """Several scans of one sample, each with its own raster, azimuth, rotation and instrument."""
+
+    stacks: tuple[MicrographStack, ...]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.stacks:
+            raise InputFileError("a micrograph set must hold at least one stack, got none")
+
+    def only(self, error: type[HelioError] = InputFileError) -> MicrographStack:
+        """Return the single stack of a set of one; several scans must be aligned first."""
+        if len(self.stacks) != 1:
+            raise error(
+                f"this step needs one stack on one raster, got a set of {len(self.stacks)} scans "
+                f"({', '.join(s.name for s in self.stacks)}): align them first (helio align)"
+            )
+        return self.stacks[0]

@@ -1,0 +1,188 @@
+"""From one micrograph stack to a `Reconstruction`: the stage's single entry, which runs the chosen method.
+
+linear: normals with constant directions, then integration. nearfield: the same, directions re-evaluated at
+the current height. refine: the fit of the heights, started from nearfield. Takes the substrate's distance and the
+instrument from the stack, and, if the settings say so, that the border of the image is flat; no truth.
+"""
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.errors import GuardError
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.beamframe import border_mask, slopes_of_normal
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.integrate import integrate_slopes
+from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
+from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruction import REASONS, Reconstruction
+
+MASK_LIMIT = 0.1
+"""A datum darker than this share of the detector's flat signal counts as masked in the validity map."""
+JUMP_PITCHES = 3.0
+"""Height differences between neighbouring pixels above this many pitches are taken as jumps at the start."""
+_FEW, _MASKED, _JUMP = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3]))
+
+
+def _level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:
+    """Subtract the plane (flat border) or the median (free border) fitted to the border's known pixels."""
+    rows, columns = np.nonzero(border_mask(height.shape, settings.border_fraction) & (weight > 0))
+    if rows.size < 3:
+        return height - np.median(height)
+    if settings.border == "free":
+        return height - np.median(height[rows, columns])
+    basis = np.stack([np.ones(rows.size), rows / height.shape[0], columns / height.shape[1]], -1)
+    keep = np.ones(rows.size, bool)
+    for _ in range(3):
+        plane = np.linalg.lstsq(basis[keep], height[rows, columns][keep], rcond=None)[0]
+        misfit = np.abs(height[rows, columns] - basis @ plane)
+        keep = misfit <= 3.0 * max(1.4826 * np.median(misfit), 1e-9)
+    i, j = np.mgrid[: height.shape[0], : height.shape[1]]
+    return height - (plane[0] + plane[1] * i / height.shape[0] + plane[2] * j / height.shape[1])
+
+
+def _integrate(solution: PhotometricSolution, stack: MicrographStack, settings: ReconstructSettings) -> np.ndarray:
+    a, b, is_facing = slopes_of_normal(solution.normals, stack.instrument.beam_shift)
+    weight = solution.weight * np.where(is_facing, 1.0, 0.1)
+    if settings.integrator in ("dct_poisson", "harker_oleary"):
+        weight = (weight > 0).astype(float)
+    height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), settings.integrator, weight)
+    return _level(height, settings, weight)
+
+
+def solve_nearfield(
+    stack: MicrographStack, settings: ReconstructSettings, geometry: SpotGeometry, rounds: int
+) -> tuple[np.ndarray, PhotometricSolution]:
+    """Alternate between the photometric solution at the current height and its integration.
+
+    One round is the linear method: directions of the flat reference plane everywhere.
+    """
+    signal, variance = signal_of(stack)
+    height = np.zeros(stack.shape[1:])
+    for number in range(rounds):
+        phi = geometry.form_factor(_limited(height, stack))
+        solution = solve_linear(signal, variance, phi)
+        new = _integrate(solution, stack, settings)
+        height = new if number == 0 else height + settings.damping * (new - height)
+    return height, solution
+
+
+def _limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
+    """Return heights kept between one and a half plate distances below and 90 % of it above the plane.
+
+    Only the directions are taken there, so that a wild intermediate height cannot pass through the plate.
+    """
+    d = stack.instrument.sample_distance
+    return np.clip(height, -0.5 * d, 0.9 * d)
+
+
+def reconstruct_stack(
+    stack: MicrographStack,
+    settings: ReconstructSettings,
+    predict=None,
+    report=None,
+) -> Reconstruction:
+    """Turn three or more micrographs into heights.
+
+    Args:
+        stack: images of one scan; background known or zero.
+        settings: method and options.
+        predict: for `refine`, what a surface does beyond single scattering (`refine.Predict`).
+        report: called before each round of `refine`.
+
+    Raises:
+        GuardError: fewer than 3 images, no pixel recorded in 3 of them, or a height that is not finite.
+    """
+    n_usable = stack.is_observed.sum(0)
+    if stack.shape[0] < MIN_IMAGES or not (n_usable >= MIN_IMAGES).any():
+        raise GuardError(
+            f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
+            f"{stack.shape[0]} detectors: add detector directions, or align rotated scans into one set"
+        )
+    geometry = SpotGeometry(stack.instrument)
+    rounds = 1 if settings.method == "linear" else settings.rounds
+    height, solution = solve_nearfield(stack, settings, geometry, rounds)
+    if settings.method != "refine":
+        result = _from_solution(stack, settings, height, solution)
+    else:
+        result = _refined(stack, settings, geometry, height, solution, predict, report)
+    if not np.all(np.isfinite(result.height)):
+        raise GuardError("the reconstructed heights are not finite: please report it with the stack")
+    return result
+
+
+def _validity(stack: MicrographStack, solution: PhotometricSolution) -> np.ndarray:
+    """Return why a pixel is not valid, from the data alone (index into REASONS)."""
+    reason = np.zeros(stack.shape[1:], np.uint8)
+    signal, _ = signal_of(stack)
+    flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
+    n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
+    reason[solution.n_images - n_dark < MIN_IMAGES - 1] = _MASKED
+    reason[solution.n_images < MIN_IMAGES] = _FEW
+    return reason
+
+
+def _from_solution(stack, settings, height, solution) -> Reconstruction:
+    reason = _validity(stack, solution)
+    n_few = int(np.sum(reason == _FEW))
+    rounds = 1 if settings.method == "linear" else settings.rounds
+    return Reconstruction(
+        height=height,
+        raster_x=stack.x,
+        raster_y=stack.y,
+        instrument=stack.instrument,
+        method=settings.method,
+        normals=solution.normals,
+        albedo=np.where(np.isfinite(solution.albedo), solution.albedo, 0.0),
+        is_valid=reason == 0,
+        reason=reason,
+        residuals=solution.residuals,
+        status=f"solved in {rounds} round(s); {n_few} pixels seen in fewer than {MIN_IMAGES} images got the flat normal",
+        provenance={"stack": dict(stack.provenance), "reconstruct": settings.model_dump(mode="json")},
+    )
+
+
+def _refined(stack, settings, geometry, start, solution, predict, report) -> Reconstruction:
+    from helio_jax.reconstruct.refine import fit_heights
+    from helio_jax.reconstruct.render import corners_of_pixels
+
+    if predict is None:
+        raise GuardError(
+            "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
+        )
+    dx, dy = pitch(stack.x), pitch(stack.y)
+    signal, variance = signal_of(stack)
+    start = _limited(start, stack)
+    fit = fit_heights(
+        signal,
+        variance,
+        geometry,
+        dx,
+        dy,
+        corners_of_pixels(start, JUMP_PITCHES * max(dx, dy)),
+        settings,
+        predict,
+        report,
+    )
+    reason = _validity(stack, solution)
+    reason[(reason == 0) & (fit.weight.min(0) < 0.25)] = _JUMP
+    return Reconstruction(
+        height=fit.height,
+        raster_x=stack.x,
+        raster_y=stack.y,
+        instrument=stack.instrument,
+        method="refine",
+        normals=fit.normals,
+        albedo=fit.albedo,
+        is_valid=reason == 0,
+        reason=reason,
+        residuals=fit.residuals,
+        gain=fit.gain,
+        offset=fit.offset,
+        status=fit.status,
+        provenance={
+            "stack": dict(stack.provenance),
+            "reconstruct": settings.model_dump(mode="json"),
+            "height_changes_um": list(fit.changes),
+        },
+    )

@@ -1,0 +1,215 @@
+"""Sample models: what is imaged. Settings table `[sample]`, chosen by `kind`; the only door to trimesh.
+
+The samples given by numbers are in shapes.py, those that read files here. Each turns itself into a `Body`
+(surfaces.py) with `build(base_dir)`: sample frame, z up, z = 0 on the reference plane, um. trimesh is imported where
+it is needed, so loading a scene stays cheap. Files are untrusted: size and number of faces are limited, contents
+are checked, every failure is an `InputFileError` that names the file.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, PrivateAttr
+
+from helio_jax.errors import InputFileError
+from helio_jax.heightmap import HeightMap
+from helio_jax.scene import surfaces
+from helio_jax.scene.files import read_bytes, read_height_map
+from helio_jax.scene.shapes import FlatSample, Length, PyramidSample, SpheresSample, StepSample, TrenchSample
+from helio_jax.scene.surfaces import Body
+from helio_jax.settings import Settings
+
+UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
+MAX_FACES = 5_000_000
+MESH_EXTENT_UM = (1e-2, 1e6)
+"""Smallest and largest sensible extent of a mesh [um]."""
+
+
+class HeightMapSample(Settings):
+    """A height map from a file (.npz with x, y, height; .csv, .txt, .tsv: a grid), or from Python: `of`."""
+
+    kind: Literal["height_map"] = "height_map"
+    file: str = Field(min_length=1, max_length=4096)
+    """File name, relative to the scene file."""
+    pixel_size_um: Length | None = None
+    """Grid pitch of a text file, whose rows start at the lowest y; the grid is then centred [um]."""
+    unit: Literal["nm", "um", "mm", "cm", "m", "inch"] = "um"
+    """Unit of the lengths in the file (of the heights alone for a text file)."""
+    size_um: Length | None = None
+    """Side of a flat around the map; default: none [um]."""
+    level_um: float | None = None
+    """Height of that flat; default: the median height of the map's border [um]."""
+    _map: HeightMap | None = PrivateAttr(None)
+
+    @classmethod
+    def of(cls, height_map: HeightMap, size_um: float | None = None) -> "HeightMapSample":
+        """Make a sample of a height map in memory; `file` then holds the fingerprint of its data."""
+        import hashlib
+
+        digest = hashlib.sha256(b"".join(a.tobytes() for a in (height_map.x, height_map.y, height_map.height)))
+        sample = cls(file=f"memory:{digest.hexdigest()[:32]}", size_um=size_um)
+        sample._map = height_map
+        return sample
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point, None before the file is read [um]."""
+        return None if self._map is None else float(np.max(self._map.height))
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Read the file, if any, and triangulate it.
+
+        Raises:
+            InputFileError: the file is missing, of an unknown kind or holds no complete height map.
+        """
+        height_map = self._map
+        if height_map is None and self.file.startswith("memory:"):
+            raise InputFileError(
+                f"sample.file = {self.file!r}: this height map was given from Python and is stored in no file: save it "
+                "as .npz and name that file"
+            )
+        if height_map is None:
+            height_map = read_height_map(base_dir / self.file, UNITS_UM[self.unit], self.pixel_size_um)
+        if not np.all(np.isfinite(height_map.height)):
+            raise InputFileError(
+                f"{self.file}: a sample's heights must be finite, got {int(np.sum(~np.isfinite(height_map.height)))} "
+                "gaps: fill them first"
+            )
+        x, y = np.meshgrid(height_map.x, height_map.y)
+        reach = None if self.size_um is None else 0.5 * self.size_um
+        return surfaces.surface_body(x, y, height_map.height, reach, level=self.level_um)
+
+
+class MeshSample(Settings):
+    """A triangle mesh from a file, scaled, then turned about x, y, z (in this order), then moved."""
+
+    kind: Literal["mesh"] = "mesh"
+    file: str = Field(min_length=1, max_length=4096)
+    """STL, OBJ, PLY or GLB file, relative to the scene file. (GLB has its y axis up: rotate_deg = [90, 0, 0].)"""
+    unit: Literal["nm", "um", "mm", "cm", "m", "inch"]
+    """Unit of the file's coordinates (STL and OBJ do not say; GLB is in m)."""
+    scale: float = Field(default=1.0, gt=0.0, le=1e9)
+    """Further factor on all lengths."""
+    rotate_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotations about the fixed x, then y, then z axis [deg]."""
+    translate_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift after scaling and turning [um]."""
+    flat_size_um: Length | None = None
+    """Side of a flat added at z = 0 under the mesh; the mesh's faces in that plane are left out [um]."""
+    max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
+    """Larger files are refused [MB]."""
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point: known only to the file."""
+        return None
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Read, check and place the mesh.
+
+        Raises:
+            InputFileError: the file is missing, too large, unreadable, empty, non-finite or of absurd size.
+        """
+        path = base_dir / self.file
+        vertices, faces = _load_mesh(path, self.max_file_mb)
+        vertices = _rotation(self.rotate_deg).dot((vertices * (UNITS_UM[self.unit] * self.scale)).T).T
+        vertices = vertices + np.asarray(self.translate_um)
+        extent, (low, high) = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
+        if not low <= extent <= high:
+            raise InputFileError(
+                f"{path}: the mesh is {extent:g} um across, sensible are {low:g} to {high:g} um: check sample.unit "
+                f"(now {self.unit!r}) and sample.scale (now {self.scale:g})"
+            )
+        if self.flat_size_um is None:
+            return Body(vertices, faces)
+        in_plane = np.all(np.abs(vertices[faces][..., 2]) <= 1e-6 * extent, axis=1)
+        flat = surfaces.flat_body(self.flat_size_um)
+        faces = np.concatenate([faces[~in_plane], flat.faces + len(vertices)])
+        return Body(np.concatenate([vertices, flat.vertices]), faces)
+
+
+Sample = Annotated[
+    FlatSample | SpheresSample | StepSample | TrenchSample | PyramidSample | HeightMapSample | MeshSample,
+    Field(discriminator="kind"),
+]
+"""Any sample; `kind` tells which."""
+
+
+def check_body(body: Body) -> dict[str, Any]:
+    """Report on a body's triangles, for `helio validate` (JSON-compatible).
+
+    An open sheet is fine: a flat with structure is open along its outer border. `is_watertight` is asked of closed
+    meshes; `n_inner_open_edges` counts open edges away from the bounding box's sides, where rays would leak.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(body.vertices, body.faces, process=False)
+    edges = np.sort(mesh.edges, axis=1)
+    unique, n_uses = np.unique(edges, axis=0, return_counts=True)
+    open_edges = body.vertices[unique[n_uses == 1]]
+    low, high = body.triangles.reshape(-1, 3).min(0), body.triangles.reshape(-1, 3).max(0)
+    near = 1e-6 * float(np.ptp([low, high], axis=0).max())
+    on_side = np.zeros(len(open_edges), bool)
+    for axis in (0, 1):
+        for side in (low, high):
+            on_side |= np.all(np.abs(open_edges[..., axis] - side[axis]) <= near, axis=1)
+    sorted_faces = np.unique(np.sort(body.faces, axis=1), axis=0)
+    return {
+        "n_faces": len(body.faces),
+        "n_vertices": len(body.vertices),
+        "n_spheres": len(body.spheres),
+        "bounds_um": body.bounds.tolist(),
+        "is_watertight": bool(mesh.is_watertight),
+        "is_winding_consistent": bool(mesh.is_winding_consistent),
+        "is_inside_out": bool(mesh.is_watertight and mesh.volume < 0),
+        "n_open_edges": len(open_edges),
+        "n_inner_open_edges": int(np.sum(~on_side)),
+        "n_edges_of_three_faces": int(np.sum(n_uses > 2)),
+        "n_faces_without_area": int(np.sum(~np.any(body.normals, axis=1))),
+        "n_duplicate_faces": len(body.faces) - len(sorted_faces),
+    }
+
+
+def _load_mesh(path: Path, max_mb: float) -> tuple[np.ndarray, np.ndarray]:
+    """Read vertices and faces in file units; equal vertices are merged, a closed mesh must not be inside out."""
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("stl", "obj", "ply", "glb"):
+        raise InputFileError(f"{path}: a mesh must be .stl, .obj, .ply or .glb, got {path.suffix or 'no suffix'!r}")
+    data = read_bytes(path, max_mb)
+    import io
+
+    import trimesh
+
+    options = {"skip_materials": True} if kind == "obj" else {}
+    try:
+        mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options).to_mesh()
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as e:  # trimesh's readers raise anything on corrupt files
+        raise InputFileError(f"{path}: cannot be read as a {kind.upper()} mesh ({type(e).__name__}: {e})") from e
+    if faces.ndim != 2 or not len(faces):
+        raise InputFileError(f"{path}: the mesh has no triangles: export a surface, not points or lines")
+    if len(faces) > MAX_FACES:
+        raise InputFileError(f"{path}: the mesh has {len(faces)} triangles, the limit is {MAX_FACES}: decimate it")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputFileError(f"{path}: faces point to vertices that do not exist: the file is corrupt")
+    if not np.all(np.isfinite(vertices[faces])):
+        raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
+    clean = trimesh.Trimesh(vertices, faces, process=False)
+    clean.merge_vertices(merge_tex=True, merge_norm=True)
+    clean.update_faces(clean.nondegenerate_faces(height=0.0))
+    if not len(clean.faces):
+        raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit absurd")
+    if clean.is_watertight and clean.volume < 0:
+        raise InputFileError(
+            f"{path}: the mesh is inside out (volume < 0): flip its normals in the program that made it"
+        )
+    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64)
+
+
+def _rotation(angles_deg: tuple[float, float, float]) -> np.ndarray:
+    """Return the matrix of rotations about the fixed x, then y, then z axis [3, 3]."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(angles_deg)), np.sin(np.radians(angles_deg))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ about_y @ about_x

@@ -1,0 +1,243 @@
+"""Samples given by numbers: flat, spheres, step, trench, pyramid. Models of the `[sample]` table.
+
+`sample.py` joins them with those that read files. Each turns itself into a `Body` with `build`: sample frame, z up,
+z = 0 on the reference plane, um. The geometry itself is in surfaces.py.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from helio_jax.scene import surfaces
+from helio_jax.scene.surfaces import Body
+from helio_jax.settings import Settings
+
+Length = Annotated[float, Field(gt=0.0, le=1e6)]
+"""A length of a sample [um]."""
+
+
+class SampleModel(Settings):
+    """What all samples share: a flat of side `size_um` about the z axis, and a way to become a `Body`."""
+
+    size_um: Length = 8000.0
+    """Side of the square flat around the structure [um]."""
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point [um]; None where only the file tells."""
+        return 0.0
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry; relative file names start at `base_dir`."""
+        raise NotImplementedError
+
+
+class FlatSample(SampleModel):
+    """A flat at z = 0."""
+
+    kind: Literal["flat"] = "flat"
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry."""
+        return surfaces.flat_body(self.size_um)
+
+
+class Moat(Settings):
+    """An annular groove in the flat around a sphere; the sphere itself is its inner wall."""
+
+    width_um: Length
+    """From the sphere's rim at z = 0 to the vertical outer wall [um]."""
+    depth_um: Length
+    """Of the flat floor below the flat [um]."""
+
+
+class Sphere(Settings):
+    """A sphere that stands `cap_height_um` out of the flat; the rest (2 R - H) is buried."""
+
+    radius_um: Length
+    """Radius R [um]."""
+    cap_height_um: Length | None = None
+    """Height H of the top above the flat, at most 2 R; default 2 R: the sphere rests on the flat [um]."""
+    center_um: tuple[float, float] = (0.0, 0.0)
+    """Position (x, y) of the axis [um]."""
+    moat: Moat | None = None
+    """Groove around the rim, or none."""
+
+    @model_validator(mode="after")
+    def _is_on_flat(self) -> "Sphere":
+        if self.cap_height > 2 * self.radius_um:
+            raise ValueError(
+                f"cap_height_um must be <= 2 * radius_um = {2 * self.radius_um:g} um, got {self.cap_height:g}: "
+                "the sphere would float above the flat"
+            )
+        return self
+
+    @property
+    def cap_height(self) -> float:
+        """Height of the top above the flat [um]."""
+        return 2 * self.radius_um if self.cap_height_um is None else self.cap_height_um
+
+    @property
+    def rim_radius(self) -> float:
+        """Radius of the circle in which the sphere meets the flat z = 0 [um]."""
+        return math.sqrt(max(0.0, self.cap_height * (2 * self.radius_um - self.cap_height)))
+
+    @property
+    def row(self) -> tuple[float, float, float, float]:
+        """x, y, z of the centre and radius [um]."""
+        return (*self.center_um, self.cap_height - self.radius_um, self.radius_um)
+
+
+class SpheresSample(SampleModel):
+    """Spheres partly buried in a flat; exact, not tessellated."""
+
+    kind: Literal["spheres"] = "spheres"
+    spheres: tuple[Sphere, ...] = Field(min_length=1, max_length=1000)
+    """The spheres; they may touch and overlap."""
+
+    @model_validator(mode="after")
+    def _has_room_for_moats(self) -> "SpheresSample":
+        moats = self._moats()
+        reach = np.abs(moats[:, :2]) + moats[:, 2:3]
+        if reach.size and reach.max() >= 0.5 * self.size_um:
+            raise ValueError(
+                f"a moat reaches {reach.max():g} um from the middle, the flat only {0.5 * self.size_um:g} um: "
+                "enlarge size_um"
+            )
+        gap = np.hypot(*(moats[:, None, :2] - moats[None, :, :2]).transpose(2, 0, 1))
+        touching = np.triu(gap <= moats[:, None, 2] + moats[None, :, 2], 1)
+        if touching.any():
+            i, j = np.argwhere(touching)[0]
+            raise ValueError(
+                f"moats must not overlap, got two {gap[i, j]:g} um apart with outer radii {moats[i, 2]:g} and "
+                f"{moats[j, 2]:g} um: move the spheres apart or make width_um smaller"
+            )
+        return self
+
+    def _moats(self) -> np.ndarray:
+        """Return x, y, outer radius and depth of every moat [m, 4]."""
+        rows = [(*s.center_um, s.rim_radius + s.moat.width_um, s.moat.depth_um) for s in self.spheres if s.moat]
+        return np.array(rows, np.float64).reshape(-1, 4)
+
+    @property
+    def sphere_array(self) -> np.ndarray:
+        """x, y, z of the centres and radii [s, 4], um: for `surfaces.first_hit_spheres`."""
+        return np.array([s.row for s in self.spheres])
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point [um]."""
+        return max(s.cap_height for s in self.spheres)
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry."""
+        return surfaces.moated_body(self.size_um, self._moats(), self.sphere_array)
+
+
+class StepSample(SampleModel):
+    """A straight step: the lower terrace is z = 0, the upper one z = height."""
+
+    kind: Literal["step"] = "step"
+    height_um: Length
+    """Height of the upper terrace above the lower one [um]."""
+    position_um: float = 0.0
+    """Distance of the upper edge from the middle, along `facing_deg` [um]."""
+    facing_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Azimuth towards which the lower side lies, counter-clockwise from +x; the flat turns with it [deg]."""
+    slope_deg: float = Field(default=90.0, ge=1.0, le=90.0)
+    """Angle of the facet to the horizontal; 90 is a vertical wall [deg]."""
+
+    @model_validator(mode="after")
+    def _is_on_flat(self) -> "StepSample":
+        run = 0.0 if self.slope_deg == 90 else self.height_um / math.tan(math.radians(self.slope_deg))
+        if self.position_um <= -0.5 * self.size_um or self.position_um + run >= 0.5 * self.size_um:
+            raise ValueError(
+                f"the facet from {self.position_um:g} to {self.position_um + run:g} um must lie on the flat, which "
+                f"ends at +-{0.5 * self.size_um:g} um: enlarge size_um or move position_um"
+            )
+        return self
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point [um]."""
+        return self.height_um
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry."""
+        angles = map(math.radians, (self.facing_deg, self.slope_deg))
+        return surfaces.step_body(self.size_um, self.height_um, self.position_um, *angles)
+
+
+class TrenchSample(SampleModel):
+    """A slot with vertical walls and closed ends in a flat at z = 0."""
+
+    kind: Literal["trench"] = "trench"
+    width_um: Length
+    """Across the slot [um]."""
+    length_um: Length
+    """Along the slot [um]."""
+    depth_um: Length
+    """Of the floor below the flat [um]."""
+    azimuth_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Direction of the length, counter-clockwise from +x; the flat turns with it [deg]."""
+    center_um: tuple[float, float] = (0.0, 0.0)
+    """Position (x, y) of the slot's middle [um]."""
+
+    @model_validator(mode="after")
+    def _is_on_flat(self) -> "TrenchSample":
+        _check_on_flat("trench", self.size_um, (self.length_um, self.width_um), self.center_um, self.azimuth_deg)
+        return self
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry."""
+        slot = (self.width_um, self.length_um, self.depth_um)
+        return surfaces.trench_body(self.size_um, *slot, math.radians(self.azimuth_deg), self.center_um)
+
+
+class PyramidSample(SampleModel):
+    """A square pyramid on a flat at z = 0, pointed or truncated."""
+
+    kind: Literal["pyramid"] = "pyramid"
+    base_um: Length
+    """Side of the base square [um]."""
+    height_um: Length
+    """Height of the top above the flat [um]."""
+    top_um: float = Field(default=0.0, ge=0.0, le=1e6)
+    """Side of the top square; 0: pointed [um]."""
+    azimuth_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+    """Azimuth in which one face looks, counter-clockwise from +x; the flat turns with it [deg]."""
+    center_um: tuple[float, float] = (0.0, 0.0)
+    """Position (x, y) of the axis [um]."""
+
+    @model_validator(mode="after")
+    def _is_on_flat(self) -> "PyramidSample":
+        if self.top_um >= self.base_um:
+            raise ValueError(f"top_um must be < base_um = {self.base_um:g} um, got {self.top_um:g}")
+        _check_on_flat("pyramid", self.size_um, (self.base_um, self.base_um), self.center_um, self.azimuth_deg)
+        return self
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point [um]."""
+        return self.height_um
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Return the geometry."""
+        shape = (self.base_um, self.height_um, self.top_um)
+        return surfaces.pyramid_body(self.size_um, *shape, math.radians(self.azimuth_deg), self.center_um)
+
+
+def _check_on_flat(
+    name: str, size: float, sides: tuple[float, float], center: tuple[float, float], azimuth_deg: float
+) -> None:
+    """Check that a rectangle lies strictly inside the flat, which turns with it."""
+    c, s = math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))
+    u, v = c * center[0] + s * center[1], -s * center[0] + c * center[1]
+    reach = max(abs(u) + 0.5 * sides[0], abs(v) + 0.5 * sides[1])
+    if reach >= 0.5 * size:
+        raise ValueError(
+            f"the {name} reaches {reach:g} um from the middle, the flat only {0.5 * size:g} um: enlarge size_um"
+        )

@@ -1,0 +1,349 @@
+"""Surfaces of samples as triangles and exact spheres, and closed-form first hits of the beam. Pure NumPy.
+
+Flow: `scene.sample` calls the builders, the tracer intersects the `Body` they return. Sample frame: z up, z = 0 on
+the reference plane, micrometres. Faces run counter-clockwise seen from the vacuum, so normals point out of the
+solid (up on a flat). A sample is an open sheet: neighbouring faces share their vertices, so no ray leaks
+between them, and only the outer border of the flat is open.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from helio_jax.arrays import as_float_array
+from helio_jax.errors import SceneError
+
+WALL_SEGMENTS = 1440
+"""Segments of a moat's outer wall: the polygon lies at most 2.4e-6 of its radius inside the circle."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Triangles and exact spheres of a sample, sample frame (frozen, checked when made).
+
+    Attributes:
+        vertices: positions [n, 3], um.
+        faces: vertex indices [m, 3], counter-clockwise seen from the vacuum.
+        spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically, beside the triangles.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    spheres: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
+        put("vertices", as_float_array("vertices", self.vertices, (None, 3), SceneError))
+        put("spheres", as_float_array("spheres", self.spheres, (None, 4), SceneError))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise SceneError(f"faces must be integers of the shape any x 3, got {faces.dtype} {faces.shape}")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(self.vertices)):
+            raise SceneError(
+                f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}: correct them"
+            )
+        put("faces", faces.astype(np.int64))
+        for name in ("vertices", "spheres"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise SceneError(f"{name} must be finite, got NaN or infinity: check the sample's file and settings")
+        if np.any(self.spheres[:, 3] <= 0):
+            raise SceneError(f"sphere radius must be > 0 um, got {self.spheres[:, 3].min():g}")
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Corner positions of every face [m, 3, 3], um."""
+        return self.vertices[self.faces]
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normal of every face, out of the solid [m, 3]; zero for a face without area."""
+        t = self.triangles
+        n = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+        length = np.linalg.norm(n, axis=1, keepdims=True)
+        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest x, y, z of triangles and spheres [2, 3], um."""
+        low = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] - self.spheres[:, 3:]])
+        high = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] + self.spheres[:, 3:]])
+        if not len(low):
+            raise SceneError("the sample is empty: it has neither faces nor spheres")
+        return np.stack([low.min(0), high.max(0)])
+
+    @property
+    def max_height(self) -> float:
+        """Height of the highest point above the reference plane [um]."""
+        return float(self.bounds[1, 2])
+
+
+def flat_body(size: float, height: float = 0.0) -> Body:
+    """Build a horizontal square of side `size` [um] about the z axis."""
+    s = 0.5 * size
+    return Body(np.array([[-s, -s, height], [s, -s, height], [s, s, height], [-s, s, height]]), _quads([[0, 1, 2, 3]]))
+
+
+def step_body(size: float, height: float, position: float, facing: float, slope: float) -> Body:
+    """Build an upper terrace at z = `height` above a lower one at z = 0, joined by a straight facet.
+
+    Valid for |position| and position + height / tan(slope) inside the flat.
+
+    Args:
+        size: side of the square flat, which turns with `facing` [um].
+        height: of the upper terrace [um].
+        position: of the upper edge along the facing direction, from the z axis [um].
+        facing: azimuth towards which the lower side lies, counter-clockwise from +x [rad].
+        slope: angle of the facet to the horizontal; pi/2 is vertical [rad].
+    """
+    s = 0.5 * size
+    foot = position + (0.0 if slope >= np.pi / 2 else height / np.tan(slope))
+    profile = [(-s, height), (position, height), (foot, 0.0), (s, 0.0)]
+    vertices = np.array([[u, v, z] for u, z in profile for v in (-s, s)])
+    faces = _quads([[2 * k, 2 * k + 2, 2 * k + 3, 2 * k + 1] for k in range(3)])
+    return Body(_turn(vertices, facing), faces)
+
+
+def trench_body(
+    size: float, width: float, length: float, depth: float, azimuth: float, center: tuple[float, float]
+) -> Body:
+    """Cut a slot with vertical walls and closed ends into a flat: 18 triangles that share all their edges.
+
+    Args:
+        size: side of the square flat, which turns with `azimuth` [um].
+        width, length, depth: of the slot [um].
+        azimuth: direction of the slot's length, counter-clockwise from +x [rad].
+        center: of the slot on the flat, sample frame [um].
+    """
+    top = _rectangle(length, width, 0.0) + _local(center, azimuth)
+    vertices = np.concatenate([_rectangle(size, size, 0.0), top, top - [0.0, 0.0, depth]])
+    ring = [[k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)]
+    walls = [[8 + k, 4 + k, 4 + (k + 1) % 4, 8 + (k + 1) % 4] for k in range(4)]
+    return Body(_turn(vertices, azimuth), _quads([*ring, *walls, [8, 9, 10, 11]]))
+
+
+def pyramid_body(
+    size: float, base: float, height: float, top: float, azimuth: float, center: tuple[float, float]
+) -> Body:
+    """Raise a square (truncated) pyramid out of a flat; no face lies under it.
+
+    Args:
+        size: side of the square flat, which turns with `azimuth` [um].
+        base, top: sides of the base and of the top square; 0 <= top < base [um].
+        height: of the top above the flat [um].
+        azimuth: in which one of the four faces looks, counter-clockwise from +x [rad].
+        center: of the base on the flat, sample frame [um].
+    """
+    shift = _local(center, azimuth)
+    parts = [_rectangle(size, size, 0.0), _rectangle(base, base, 0.0) + shift]
+    ring = _quads([[k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)])
+    if top > 0:
+        parts.append(_rectangle(top, top, height) + shift)
+        sides = _quads([[4 + k, 4 + (k + 1) % 4, 8 + (k + 1) % 4, 8 + k] for k in range(4)] + [[8, 9, 10, 11]])
+    else:
+        parts.append(np.array([[0.0, 0.0, height]]) + shift)
+        sides = np.array([[4 + k, 4 + (k + 1) % 4, 8] for k in range(4)])
+    return Body(_turn(np.concatenate(parts), azimuth), np.concatenate([ring, sides]))
+
+
+def moated_body(size: float, moats: np.ndarray, spheres: np.ndarray) -> Body:
+    """Build spheres on a flat into which round pits are cut: the gap between sphere and pit wall is the moat.
+
+    The pit has a vertical wall of `WALL_SEGMENTS` segments (vertices on the circle, so the wall stands at most
+    radius * 2.4e-6 inside of it: 0.003 um for 1 mm) and a flat floor; the sphere stands in it.
+
+    Args:
+        size: side of the square flat [um].
+        moats: x, y, outer radius and depth of each pit [m, 4]; pits are disjoint and inside the flat, um.
+        spheres: x, y, z and radius [s, 4], um.
+    """
+    flat = flat_body(size)
+    if not len(moats):
+        return Body(flat.vertices, flat.faces, spheres)
+    from scipy.spatial import Delaunay
+
+    n, s = WALL_SEGMENTS, 2 * np.pi * np.arange(WALL_SEGMENTS) / WALL_SEGMENTS
+    circles = moats[:, None, :2] + moats[:, None, 2:3] * np.stack([np.cos(s), np.sin(s)], -1)
+    # Each pit's centre is a vertex too: it makes the rim's edges strictly Delaunay, so the triangulation
+    # contains them all and the pit is exactly the fan of triangles about its centre.
+    plane = np.concatenate([flat.vertices[:, :2], circles.reshape(-1, 2), moats[:, :2]])
+    faces = Delaunay(plane).simplices.astype(np.int64)
+    first_center = 4 + n * len(moats)
+    faces = faces[faces.max(1) < first_center]
+    a, b, c = (plane[faces[:, k]] for k in range(3))
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    faces[area < 0] = faces[area < 0][:, ::-1]
+    _check_cut(size, moats, 0.5 * np.abs(area).sum())
+    vertices, all_faces, k = [_lift(plane[:first_center], 0.0)], [faces], np.arange(n)
+    for m, (x, y, _, depth) in enumerate(moats):
+        start = sum(map(len, vertices))
+        rim, below, center = 4 + m * n + k, start + k, np.full(n, start + n)
+        vertices += [_lift(circles[m], -depth), np.array([[x, y, -depth]])]
+        after, below_after = np.roll(rim, -1), np.roll(below, -1)
+        all_faces += [
+            np.stack([below, rim, after], 1),
+            np.stack([below, after, below_after], 1),
+            np.stack([center, below, below_after], 1),
+        ]
+    return Body(np.concatenate(vertices), np.concatenate(all_faces), spheres)
+
+
+def surface_body(
+    x: np.ndarray,
+    y: np.ndarray,
+    z: np.ndarray,
+    skirt_to_um: float | None = None,
+    *,
+    level: float | None = None,
+    beam_shift: tuple[float, float] = (0.0, 0.0),
+) -> Body:
+    """Triangulate points on a grid, with a flat skirt around them, for height maps and reconstructions.
+
+    Each cell is split along the diagonal with the smaller height difference. Points of a beam-frame grid may run
+    backwards in x or y (curtains along the beam at depth jumps): orientation follows the grid, so normals stay
+    on the vacuum's side. The border is joined to the skirt by a curtain along the beam, which the beam does
+    not see; the inner edge of the skirt is then the raster itself. Pass the scan's `beam_shift` for that;
+    without it the curtain is vertical.
+
+    Args:
+        x, y, z: sample-frame positions [y, x], um; finite; x grows with the column and y with the row.
+        skirt_to_um: half the side of the square skirt about the z axis, or None for no skirt [um].
+        level: height of the skirt; default: the median height of the border [um].
+        beam_shift: `Instrument.beam_shift` of a beam-frame grid.
+
+    Returns:
+        A sheet whose only open edges are the skirt's outer border (without skirt: the grid's border).
+
+    Raises:
+        SceneError: fewer than 2 x 2 points, or the skirt ends inside the grid.
+    """
+    if z.ndim != 2 or min(z.shape) < 2:
+        raise SceneError(f"a surface needs at least 2 x 2 points, got {z.shape}: enlarge the raster")
+    points = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float64)
+    index = np.arange(z.size).reshape(z.shape)
+    a, b, c, d = (v.ravel() for v in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    flat_z = points[:, 2]
+    along_ac = (np.abs(flat_z[a] - flat_z[c]) <= np.abs(flat_z[b] - flat_z[d]))[:, None]
+    first = np.where(along_ac, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    second = np.where(along_ac, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
+    faces = np.concatenate([first, second])
+    if skirt_to_um is None:
+        return Body(points, faces)
+    extra, extra_faces = _skirt(points, index, skirt_to_um, level, beam_shift)
+    return Body(np.concatenate([points, extra]), np.concatenate([faces, extra_faces]))
+
+
+def first_hit_spheres(
+    x: np.ndarray, y: np.ndarray, spheres: np.ndarray, beam_shift: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find where the beam axis first meets spheres on an infinite flat z = 0, exactly.
+
+    A point of height h seen at beam position (X, Y) is (X - h tx, Y - h ty, h): inserted into the sphere's
+    equation this is a quadratic in h, whose larger root is met first by a beam from above.
+
+    Args:
+        x, y: beam positions of any common (broadcast) shape [um].
+        spheres: x, y, z of the centres and radii [s, 4], um.
+        beam_shift: (tx, ty) = tan t (cos phi, sin phi), `Instrument.beam_shift`.
+
+    Returns:
+        Height above the flat [...], um, and unit normals [..., 3].
+
+    Source: own derivation, tests/unit/test_sample.py.
+    """
+    tx, ty = beam_shift
+    x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    height = np.zeros(x.shape)
+    normals = np.zeros((*x.shape, 3))
+    normals[..., 2] = 1.0
+    square = 1.0 + tx**2 + ty**2
+    for cx, cy, cz, radius in np.asarray(spheres, np.float64):
+        half = tx * (x - cx) + ty * (y - cy) + cz
+        rest = (x - cx) ** 2 + (y - cy) ** 2 + cz**2 - radius**2
+        inside = half**2 - square * rest
+        root = np.where(inside >= 0, (half + np.sqrt(np.maximum(inside, 0.0))) / square, -np.inf)
+        is_first = root > height
+        height = np.where(is_first, root, height)
+        h = np.where(is_first, root, 0.0)
+        n = np.stack([x - h * tx - cx, y - h * ty - cy, h - cz], -1) / radius
+        normals = np.where(is_first[..., None], n, normals)
+    return height, normals
+
+
+def _skirt(
+    points: np.ndarray, index: np.ndarray, reach: float, level: float | None, beam_shift: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return further vertices and faces: the curtain below the grid's border and the flat around it."""
+    sides = [index[0, :], index[:, -1], index[-1, ::-1], index[::-1, 0]]
+    loop = np.concatenate([side[:-1] for side in sides])
+    z_level = float(np.median(points[loop, 2])) if level is None else level
+    rise = points[loop, 2] - z_level
+    inner = _lift(points[loop, :2] + rise[:, None] * np.asarray(beam_shift), z_level)
+    if np.abs(inner[:, :2]).max() >= reach:
+        raise SceneError(
+            f"the flat around the surface must reach beyond it: half its side is {reach:g} um, the surface extends to "
+            f"{np.abs(inner[:, :2]).max():g} um: enlarge size_um"
+        )
+    at_level = np.abs(rise) <= 1e-6
+    ring = np.where(at_level, loop, len(points) + np.arange(len(loop)))
+    extra, faces = [inner], [_strip(loop, ring)]
+    start, first_corner = len(points) + len(loop), 0
+    outward = [(1, -reach), (0, reach), (1, reach), (0, -reach)]
+    ends = []
+    for side, (axis, value) in zip(sides, outward, strict=True):
+        members = np.arange(first_corner, first_corner + len(side)) % len(loop)
+        outer = inner[members].copy()
+        outer[:, axis] = value
+        outer_index = start + np.arange(len(side))
+        faces.append(_strip(ring[members], outer_index, is_closed=False))
+        extra.append(outer)
+        ends.append((ring[members[0]], outer_index[0], outer_index[-1]))
+        start, first_corner = start + len(side), first_corner + len(side) - 1
+    extra.append(_rectangle(2 * reach, 2 * reach, z_level)[[1, 2, 3, 0]])
+    corners = [[ends[(k + 1) % 4][0], ends[k][2], start + k, ends[(k + 1) % 4][1]] for k in range(4)]
+    return np.concatenate(extra), np.concatenate([*faces, _quads(corners)])
+
+
+def _strip(inner: np.ndarray, outer: np.ndarray, is_closed: bool = True) -> np.ndarray:
+    """Return the faces between two counter-clockwise polylines of equal length; faces without area are left out."""
+    i1, o1 = np.roll(inner, -1), np.roll(outer, -1)
+    faces = np.stack([np.stack([i1, inner, outer], 1), np.stack([i1, outer, o1], 1)], 1)
+    faces = (faces if is_closed else faces[:-1]).reshape(-1, 3)
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return faces[has_area]
+
+
+def _check_cut(size: float, moats: np.ndarray, area: float) -> None:
+    """Check that the flat minus the pits has the area it must have."""
+    pits = 0.5 * WALL_SEGMENTS * np.sin(2 * np.pi / WALL_SEGMENTS) * np.sum(moats[:, 2] ** 2)
+    if abs(area - (size**2 - pits)) > 1e-9 * size**2:
+        raise SceneError("the moats could not be cut out of the flat: they must be disjoint and lie inside it")
+
+
+def _rectangle(length: float, width: float, z: float) -> np.ndarray:
+    """Return the corners of a rectangle about the z axis, counter-clockwise from (-, -) [4, 3]."""
+    a, b = 0.5 * length, 0.5 * width
+    return np.array([[-a, -b, z], [a, -b, z], [a, b, z], [-a, b, z]])
+
+
+def _quads(quads: list) -> np.ndarray:
+    """Split quadrilaterals [m, 4] along their first diagonal into faces [2 m, 3]."""
+    q = np.asarray(quads, np.int64)
+    return np.stack([q[:, [0, 1, 2]], q[:, [0, 2, 3]]], 1).reshape(-1, 3)
+
+
+def _lift(points: np.ndarray, z: float) -> np.ndarray:
+    """Append the height z to points [n, 2]."""
+    return np.column_stack([points, np.full(len(points), z)])
+
+
+def _turn(vertices: np.ndarray, azimuth: float) -> np.ndarray:
+    """Rotate vertices about the z axis, counter-clockwise seen from above; quarter turns are exact."""
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    if abs(np.sin(2 * azimuth)) < 1e-12:
+        c, s = np.round(c), np.round(s)
+    return vertices @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+
+
+def _local(center: tuple[float, float], azimuth: float) -> np.ndarray:
+    """Return a position of the sample frame in the frame that `_turn` will turn [3]."""
+    return _turn(np.array([[center[0], center[1], 0.0]]), -azimuth)[0]

@@ -1,0 +1,248 @@
+"""Where rays meet the sample: the only door to embreex. Triangles by Embree, spheres exactly (float64).
+
+Embree works in float32, so the geometry is recentred and scaled to about unit size, and hit points are taken
+from the barycentric coordinates on the float64 triangle (about 7x more accurate than o + t d). Rays that start
+on a triangle are first moved off it by `RESTART` of the scene size; a convex sphere cannot be hit by a ray
+leaving it, so such rays skip their own sphere. A slow exhaustive float64 engine stands in where embreex has no
+wheel and is the independent check in the tests. Knows nothing of plates, detectors or counts.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+
+from helio_jax.errors import GuardError, SceneError
+from helio_jax.scene.surfaces import Body
+
+RESTART = 1e-6
+"""Distance off the surface at which a ray leaving a triangle starts, in scene half-sizes."""
+MISS = np.int32(-1)
+"""`Hits.surface` of a ray that meets nothing; >= 0: triangle; <= -2: sphere number -2 - surface."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First hits of a batch of rays.
+
+    Attributes:
+        point: hit points [n, 3], um (undefined for misses).
+        normal: unit normals, outward [n, 3].
+        surface: which surface was hit [n] (see `MISS`).
+        is_back: True where the surface was met from inside: a leak, or inverted normals [n].
+    """
+
+    point: np.ndarray
+    normal: np.ndarray
+    surface: np.ndarray
+    is_back: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _nearest_sphere(o, d, spheres, skip):
+    """Return (distance, index) of the nearest sphere ahead of one ray, or (inf, -1)."""
+    best, which = np.inf, -1
+    for s in range(spheres.shape[0]):
+        if s == skip:
+            continue
+        x, y, z = o[0] - spheres[s, 0], o[1] - spheres[s, 1], o[2] - spheres[s, 2]
+        along = x * d[0] + y * d[1] + z * d[2]
+        ax, ay, az = x - along * d[0], y - along * d[1], z - along * d[2]
+        disc = spheres[s, 3] ** 2 - (ax * ax + ay * ay + az * az)
+        if disc >= 0.0:
+            t = -along - np.sqrt(disc)
+            if 0.0 < t < best:
+                best, which = t, s
+    return best, which
+
+
+@njit(cache=True, nogil=True)
+def _scale_rays(origins, directions, center, inverse_size, o32, d32):
+    """Write float32 Embree rays; return the number of rays that are not finite or have no direction."""
+    n_bad = 0
+    for i in range(origins.shape[0]):
+        total = 0.0
+        length = 0.0
+        for a in range(3):
+            o32[i, a] = np.float32((origins[i, a] - center[a]) * inverse_size)
+            d32[i, a] = np.float32(directions[i, a])
+            total += abs(origins[i, a]) + abs(directions[i, a])
+            length += directions[i, a] ** 2
+        if not (total < np.inf and abs(length - 1.0) < 1e-6):
+            n_bad += 1
+    return n_bad
+
+
+@njit(cache=True, nogil=True)
+def _resolve_hits(origins, directions, skip, faces, u, v, vertices, triangles, normals, spheres):
+    n = origins.shape[0]
+    point = np.zeros((n, 3))
+    normal = np.zeros((n, 3))
+    surface = np.full(n, -1, np.int32)
+    is_back = np.zeros(n, np.bool_)
+    for i in range(n):
+        o, d = origins[i], directions[i]
+        t_face = np.inf
+        f = faces[i]
+        if f >= 0:
+            a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+            t_face = 0.0
+            for k in range(3):
+                point[i, k] = (1.0 - u[i] - v[i]) * vertices[a, k] + u[i] * vertices[b, k] + v[i] * vertices[c, k]
+                t_face += (point[i, k] - o[k]) * d[k]
+                normal[i, k] = normals[f, k]
+            surface[i] = f
+        t, s = _nearest_sphere(o, d, spheres, skip[i])
+        if s >= 0 and t < t_face:
+            surface[i] = -2 - s
+            for k in range(3):
+                point[i, k] = o[k] + t * d[k]
+                normal[i, k] = (point[i, k] - spheres[s, k]) / spheres[s, 3]
+        if surface[i] != -1:
+            is_back[i] = normal[i, 0] * d[0] + normal[i, 1] * d[1] + normal[i, 2] * d[2] > 0.0
+    return point, normal, surface, is_back
+
+
+@njit(cache=True, nogil=True)
+def _mark_sphere_occlusion(origins, directions, skip, spheres, is_occluded):
+    for i in range(origins.shape[0]):
+        if not is_occluded[i]:
+            _, s = _nearest_sphere(origins[i], directions[i], spheres, skip[i])
+            is_occluded[i] = s >= 0
+
+
+@njit(cache=True, nogil=True)
+def _exhaustive_faces(origins, directions, vertices, triangles):
+    """Test every ray against every triangle in float64 (Moeller and Trumbore, J. Graphics Tools 2 (1997) 21)."""
+    n = origins.shape[0]
+    face, u_out, v_out = np.full(n, -1, np.int32), np.zeros(n), np.zeros(n)
+    for i in range(n):
+        o, d, best = origins[i], directions[i], np.inf
+        for f in range(triangles.shape[0]):
+            p = vertices[triangles[f, 0]]
+            e1, e2 = vertices[triangles[f, 1]] - p, vertices[triangles[f, 2]] - p
+            cross = np.cross(d, e2)
+            det = np.dot(e1, cross)
+            if det == 0.0:
+                continue
+            s = o - p
+            u = np.dot(s, cross) / det
+            q = np.cross(s, e1)
+            v = np.dot(d, q) / det
+            t = np.dot(e2, q) / det
+            if u >= 0.0 and v >= 0.0 and u + v <= 1.0 and 0.0 < t < best:
+                best, face[i], u_out[i], v_out[i] = t, f, u, v
+    return face, u_out, v_out
+
+
+class Intersector:
+    """Ray queries against one body; safe to share between threads once made.
+
+    Args:
+        body: the sample's triangles and spheres, sample frame, um.
+        engine: "embree", or "exhaustive" (every triangle, float64: for checks and for platforms without embreex);
+            None takes Embree where it is installed, with a warning where it is not.
+
+    Raises:
+        SceneError: the body has no surface, or a coordinate is not finite.
+    """
+
+    def __init__(self, body: Body, engine: Literal["embree", "exhaustive"] | None = None) -> None:
+        self.vertices = np.ascontiguousarray(body.vertices, np.float64).reshape(-1, 3)
+        self.triangles = np.ascontiguousarray(body.faces, np.int32).reshape(-1, 3)
+        self.spheres = np.ascontiguousarray(body.spheres, np.float64).reshape(-1, 4)
+        if self.triangles.size == 0 and self.spheres.size == 0:
+            raise SceneError("the sample must have at least one surface, got 0 triangles and 0 spheres")
+        if not (np.all(np.isfinite(self.vertices)) and np.all(np.isfinite(self.spheres))):
+            raise SceneError("the sample has non-finite coordinates: repair the mesh")
+        corners = self.vertices[self.triangles]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(cross, axis=1)
+        is_flat = length > 0
+        self.triangles = np.ascontiguousarray(self.triangles[is_flat])
+        self.normals = cross[is_flat] / length[is_flat, None]
+        self.n_degenerate = int(np.sum(~is_flat))
+        self._set_scale()
+        self._embree = self._build_embree() if engine in (None, "embree") and self.triangles.size else None
+        if engine == "embree" and self._embree is None and self.triangles.size:
+            raise SceneError("engine = 'embree' needs the package embreex, which is not installed here")
+
+    def _set_scale(self) -> None:
+        low, high = [], []
+        if self.triangles.size:
+            used = self.vertices[np.unique(self.triangles)]
+            low, high = [used.min(0)], [used.max(0)]
+        for x, y, z, r in self.spheres:
+            low.append(np.array([x - r, y - r, z - r]))
+            high.append(np.array([x + r, y + r, z + r]))
+        self.low, self.high = np.min(low, 0), np.max(high, 0)
+        self.center = 0.5 * (self.low + self.high)
+        self.half_size = 0.5 * float((self.high - self.low).max())
+        self.restart = RESTART * self.half_size
+
+    def _build_embree(self):
+        try:
+            from embreex import mesh_construction, rtcore_scene
+        except ImportError:
+            warnings.warn(
+                "embreex has no wheel for this platform: rays are tested against every triangle", stacklevel=3
+            )
+            return None
+        scene = rtcore_scene.EmbreeScene(robust=True)
+        scaled = ((self.vertices - self.center) / self.half_size).astype(np.float32)
+        self._mesh = mesh_construction.TriangleMesh(scene, scaled, self.triangles)
+        one = np.array([[0.0, 0.0, 9.0]], np.float32)
+        scene.run(one, -one / 9)  # commits the scene before threads share it
+        return scene
+
+    def _rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
+            raise ValueError(f"origins and directions must both be [n, 3], got {origins.shape}, {directions.shape}")
+        o32, d32 = np.empty(origins.shape, np.float32), np.empty(origins.shape, np.float32)
+        n_bad = _scale_rays(origins, directions, self.center, 1.0 / self.half_size, o32, d32)
+        if n_bad:
+            raise GuardError(
+                f"{n_bad} of {len(origins)} rays are not finite or not of unit direction: please report it"
+            )
+        return o32, d32
+
+    def nearest(self, origins: np.ndarray, directions: np.ndarray, skip: np.ndarray) -> Hits:
+        """Find the first surface along each ray.
+
+        Args:
+            origins: ray origins [n, 3], um.
+            directions: unit vectors [n, 3].
+            skip: sphere that the ray starts from, or -1 [n].
+
+        Raises:
+            GuardError: a ray is not finite or has no unit direction.
+        """
+        o32, d32 = self._rays(origins, directions)
+        if self.triangles.size == 0:
+            n = len(origins)
+            face, u, v = np.full(n, -1, np.int32), np.zeros(n), np.zeros(n)
+        elif self._embree is not None:
+            found = self._embree.run(o32, d32, output=True)
+            face, u, v = found["primID"], found["u"].astype(np.float64), found["v"].astype(np.float64)
+        else:
+            face, u, v = _exhaustive_faces(origins, directions, self.vertices, self.triangles)
+        return Hits(
+            *_resolve_hits(
+                origins, directions, skip, face, u, v, self.vertices, self.triangles, self.normals, self.spheres
+            )
+        )
+
+    def is_occluded(self, origins: np.ndarray, directions: np.ndarray, skip: np.ndarray) -> np.ndarray:
+        """Return True where anything lies ahead on the ray [n] (arguments as in `nearest`)."""
+        o32, d32 = self._rays(origins, directions)
+        if self.triangles.size == 0:
+            occluded = np.zeros(len(origins), bool)
+        elif self._embree is not None:
+            occluded = self._embree.run(o32, d32, query="OCCLUDED") >= 0
+        else:
+            occluded = _exhaustive_faces(origins, directions, self.vertices, self.triangles)[0] >= 0
+        if self.spheres.size:
+            _mark_sphere_occlusion(origins, directions, skip, self.spheres, occluded)
+        return occluded

@@ -1,0 +1,116 @@
+"""Maps of cause: which part of each aperture the sample hides from a point, and what the beam cannot see.
+
+Deterministic: the aperture is sampled at fixed points (Vogel spiral, equal areas), no random numbers, so the
+maps are noise-free and can be differenced. Used for the micrographs' `masked` and `shadowed` maps and, as the
+vector of the hidden form factor, by the pipeline's refinement loop.
+"""
+
+import numpy as np
+from numba import njit
+
+from helio_jax.instrument import Instrument
+from helio_jax.trace.direct import ApertureTable, find_aperture
+from helio_jax.trace.intersect import MISS, Intersector
+from helio_jax.trace.transport import lift_off
+
+
+def aperture_samples(n_points: int) -> np.ndarray:
+    """Return equal-area points of the unit disc [n_points, 2] (Vogel, Math. Biosci. 44 (1979) 179)."""
+    i = np.arange(n_points) + 0.5
+    r, angle = np.sqrt(i / n_points), np.pi * (3.0 - np.sqrt(5.0)) * i
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+
+
+@njit(cache=True, nogil=True)
+def _sample_rays(k, sample, point, normal, offset, plate_z, center, semi_axes, cos_sin, area):
+    """Return directions to one aperture sample, vector weights cos(theta_d) r / (pi r^3) dA, and the horizon."""
+    n = point.shape[0]
+    direction, weight, is_up = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
+    p, q = sample[0] * semi_axes[k, 0], sample[1] * semi_axes[k, 1]
+    x = center[k, 0] + cos_sin[k, 0] * p - cos_sin[k, 1] * q
+    y = center[k, 1] + cos_sin[k, 1] * p + cos_sin[k, 0] * q
+    is_own = find_aperture(x, y, center, semi_axes, cos_sin) == k
+    for i in range(n):
+        dx, dy, dz = x + offset[i, 0] - point[i, 0], y + offset[i, 1] - point[i, 1], plate_z - point[i, 2]
+        r2 = dx * dx + dy * dy + dz * dz
+        r = np.sqrt(r2)
+        direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
+        w = area * (dz / r) / r2 / np.pi
+        for a in range(3):
+            weight[i, a] = w * direction[i, a]
+        is_up[i] = is_own and normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz > 0.0
+    return direction, weight, is_up
+
+
+def hidden_form_factor(
+    intersector: Intersector,
+    instrument: Instrument,
+    point: np.ndarray,
+    normal: np.ndarray,
+    surface: np.ndarray,
+    offset: np.ndarray,
+    n_samples: int = 48,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the part of each aperture's vector form factor that the sample hides from each point.
+
+    The detection probability of a point is n . (Phi - hidden). The error falls as 1/n_samples; a point with a
+    free view of the whole aperture gets exactly 0.
+
+    Args:
+        intersector: the sample.
+        instrument: its apertures.
+        point: points on the sample [n, 3], sample frame, um.
+        normal: unit normals, outward [n, 3].
+        surface: which surface each point lies on (`Hits.surface`) [n].
+        offset: lab-to-sample shift (x, y) of each point's pixel [n, 2], um.
+        n_samples: points per aperture.
+
+    Returns:
+        Hidden form factor [detector, n, 3] and the hidden fraction of the aperture's solid angle [detector, n].
+    """
+    table = ApertureTable(instrument)
+    origin, skip = lift_off(point, normal, surface, intersector.restart)
+    n_detectors, n = len(table.center), len(point)
+    hidden, fraction = np.zeros((n_detectors, n, 3)), np.zeros((n_detectors, n))
+    samples = aperture_samples(n_samples)
+    for k in range(n_detectors):
+        solid_angle = np.zeros(n)
+        for sample in samples:
+            direction, weight, is_open = _sample_rays(
+                k, sample, point, normal, offset, instrument.sample_distance, table.center, table.semi_axes,
+                table.cos_sin, table.area[k] / n_samples,
+            )  # fmt: skip
+            todo = np.flatnonzero(is_open)
+            is_open[todo] = ~intersector.is_occluded(origin[todo], direction[todo], skip[todo])
+            size = np.linalg.norm(weight, axis=1)
+            solid_angle += size
+            hidden[k, ~is_open] += weight[~is_open]
+            fraction[k, ~is_open] += size[~is_open]
+        fraction[k] /= solid_angle
+    return hidden, fraction
+
+
+def axis_rays(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the beam axis of each pixel as rays from the pinhole: origins and directions [n, 3], sample frame."""
+    dx, dy, dz = instrument.sample_origin(x, y)
+    origin = instrument.pinhole_center + np.stack([dx, dy, np.full_like(dx, dz)], -1)
+    return origin, np.broadcast_to(instrument.beam_direction, origin.shape).copy()
+
+
+def is_shadowed(intersector: Intersector, instrument: Instrument, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return True where the topmost surface point above (x, y) cannot be seen by the beam [n].
+
+    Unlike the micrographs this map lives on the sample plane: the beam itself never sees a shadowed point.
+    Positions with no surface below them are False.
+    """
+    top = intersector.high[2] + intersector.half_size
+    down = np.stack([x, y, np.full_like(x, top)], -1)
+    none = np.full(len(x), -1, np.int32)
+    hits = intersector.nearest(down, np.broadcast_to([0.0, 0.0, -1.0], down.shape).copy(), none)
+    origin, skip = lift_off(hits.point, hits.normal, hits.surface, intersector.restart)
+    found = np.flatnonzero(hits.surface != MISS)
+    toward = np.broadcast_to(-instrument.beam_direction, origin.shape).copy()
+    faces_away = hits.normal @ instrument.beam_direction >= 0
+    shadow = np.zeros(len(x), bool)
+    shadow[found] = faces_away[found] | intersector.is_occluded(origin[found], toward[found], skip[found])
+    return shadow

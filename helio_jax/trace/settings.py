@@ -1,0 +1,28 @@
+"""Settings of the Monte Carlo tracer: table `[trace]`. Read by the command line without importing the tracer."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from helio_jax.settings import Settings
+
+
+class TraceSettings(Settings):
+    """How a scene is traced."""
+
+    rays: int = Field(default=256, ge=8, le=10_000_000)
+    """Beam rays per pixel; the counts do not depend on it (see scan.atoms_per_pixel), only their error does."""
+    branches: int = Field(8, ge=1, le=1024)
+    """`expected`: paths followed from the first hit of every beam ray, for the multiple scattering."""
+    estimator: Literal["expected", "analog"] = "expected"
+    """`expected`: closed-form direct term and next-event estimation; `analog`: whole counts of detected rays."""
+    seed: int = Field(default=1, ge=0, lt=2**63)
+    """Seed; the same seed gives the same counts, whatever ran them."""
+    max_events: int = Field(default=50, ge=1, le=10_000)
+    """A ray is stopped, and counted as stopped, after this many hits of the sample or the plate."""
+    n_orders: int = Field(default=4, ge=1, le=64)
+    """Scattering orders kept apart; the last one holds "and above"."""
+    workers: int | None = Field(default=None, ge=1, le=4096)
+    """Threads; default: one per CPU."""
+    maps: bool = True
+    """Also make the masking and shadowing maps."""
