@@ -1,7 +1,7 @@
 """helio_jax: simulate scanning helium micrographs and turn three or more of them into a height map.
 
 ```
-Scene -- trace --> MicrographStack -- prepare --> MicrographStack -- reconstruct --> Reconstruction -- evaluate --> report
+Scene - trace -> MicrographStack - prepare -> MicrographStack - reconstruct -> Reconstruction - evaluate -> report
 ```
 
 Reading order: `arrays` (conventions), the nouns `instrument`, `micrograph`, `heightmap`, `reconstruction`, then one
@@ -9,10 +9,10 @@ folder per verb. Which file does what:
 
 * `scene/` what is imaged: `sample` (kinds of samples), `surfaces` (their geometry), `scan` (raster), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
-  `direct` (form factor and next-event step), `transport` (paths), `masks` (masked fraction, shadow), `run` (blocks, threads).
-* `prepare/` `noise`: counting noise, background and gain.
-* `reconstruct/` JAX: `formfactor`, `linear` (photometric solution), `integrate*` (slopes -> heights), `render` (the
-  differentiable model), `refine` (the fit of the heights), `nearfield`.
+  `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `run` (threads).
+* `prepare/` `noise` (counting noise), `calibrate` (first background and gain of a measured scan).
+* `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
+  -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
 * `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
 * `formats/` `hdf5` (NeXus), `matlab` (import), `safe` (untrusted files).
 * `config` (scene files), `pipeline` (the only place that joins the stages), `__main__` (command line).

@@ -20,15 +20,15 @@ from helio_jax.settings import Settings
 class Beam(Settings):
     """The incident helium beam."""
 
-    incidence_deg: float = Field(0.0, ge=0.0, le=80.0)
+    incidence_deg: float = Field(default=0.0, ge=0.0, le=80.0)
     """Angle t between the beam and the plate normal [deg]."""
-    azimuth_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    azimuth_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
     """Direction in which the beam travels across the sample, counter-clockwise from +x seen from above [deg]."""
-    pinhole_radius_um: float = Field(1.0, ge=0.0, le=1000.0)
+    pinhole_radius_um: float = Field(default=1.0, ge=0.0, le=1000.0)
     """Radius of the pinhole disc, which lies in the plate plane [um]."""
     source: Literal["uniform", "gaussian", "pencil"] = "uniform"
     """Angular distribution about the beam axis; `pencil` is parallel."""
-    source_size_mrad: float = Field(0.5, ge=0.0, le=500.0)
+    source_size_mrad: float = Field(default=0.5, ge=0.0, le=500.0)
     """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; `pencil`: ignored [mrad]."""
 
 
@@ -39,7 +39,7 @@ class Plate(Settings):
     """`transparent`: atoms that miss every aperture pass through and are gone."""
     working_distance_um: float = Field(gt=0.0, le=1e6)
     """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
-    sample_distance_um: float | None = Field(None, gt=0.0, le=1e6)
+    sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e6)
     """Distance D from the plate to the sample's reference plane (its substrate); default W [um]."""
 
 
@@ -52,15 +52,15 @@ class Detector(Settings):
     """Centre (x, y) of the ellipse on the plate, lab frame [um]."""
     axes_um: tuple[float, float] | None = None
     """FULL axes of the ellipse; the first one along x before rotation [um]."""
-    rotation_deg: float | None = Field(None, ge=-360.0, le=360.0)
+    rotation_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
     """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
-    polar_deg: float | None = Field(None, ge=0.0, lt=90.0)
+    polar_deg: float | None = Field(default=None, ge=0.0, lt=90.0)
     """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
-    azimuth_deg: float | None = Field(None, ge=-360.0, le=360.0)
+    azimuth_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
     """Azimuth of the cone's axis, counter-clockwise from +x (default 0) [deg]."""
-    half_angle_deg: float | None = Field(None, gt=0.0, lt=90.0)
+    half_angle_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
     """Half-angle of the cone [deg]."""
-    channel: int | None = Field(None, ge=1, le=1000)
+    channel: int | None = Field(default=None, ge=1, le=1000)
     """Channel of a measured file that this aperture feeds (1-based); only used on import."""
 
     @model_validator(mode="after")

@@ -1,28 +1,49 @@
 """The main job: the only module that joins the stages. Everything here is also public as `helio_jax.NAME`."""
 
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
 from helio_jax.arrays import pitch
-from helio_jax.config import SceneFile
+from helio_jax.config import SceneFile, load_scene, resolved
 from helio_jax.errors import SceneError
+from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Region, Scores, Truth, evaluate_height
-from helio_jax.instrument import Instrument
+from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
+from helio_jax.evaluate.report import write_report
+from helio_jax.formats.hdf5 import read, write
+from helio_jax.formats.safe import atomic_path
+from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
+from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.refine import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
-from helio_jax.scene.surfaces import surface_body
+from helio_jax.scene.shapes import SpheresSample
+from helio_jax.scene.surfaces import first_hit_spheres, flat_body, surface_body
 from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.masks import hidden_form_factor
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
 from helio_jax.trace.settings import TraceSettings
 
+SUBSTRATE_RATIO = 1.35
+"""Where a scene does not say: the substrate begins at this many radii of the scored region."""
 SMOOTH_PIXELS = 1.5
 """Gaussian width over which the traced multiple scattering is averaged before it is subtracted [pixels]."""
 LIFT_PIXELS = 0.1
@@ -46,8 +67,6 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
 
 def _changed(settings, changes: dict[str, Any]):
     """Return settings with some values replaced, checked again."""
-    from pydantic import ValidationError
-
     try:
         return type(settings).model_validate(settings.model_dump() | changes)
     except ValidationError as e:
@@ -94,6 +113,12 @@ def make_predictor(
     return predict
 
 
+def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None) -> MicrographStack:
+    """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`)."""
+    flat = SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return calibrate_on_border(stack, flat, settings or CalibrateSettings())
+
+
 def reconstruct(
     stack: MicrographStack | MicrographSet,
     method: str | None = None,
@@ -116,6 +141,8 @@ def reconstruct(
         InputFileError: a set of several scans, which must be aligned first.
     """
     one = stack.only() if isinstance(stack, MicrographSet) else stack
+    if one.noise == "measured" and one.n_rays is None:
+        one = calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
     predict = make_predictor(one, chosen.refine.rays) if chosen.method == "refine" else None
@@ -128,25 +155,203 @@ def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
     Raises:
         SceneError: the beam misses the sample in some pixel.
     """
-    instrument: Instrument = scene.instrument
     grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
-    hits = first_hits(Intersector(scene.build_body()), instrument, grid_x.ravel(), grid_y.ravel())
+    hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     n_missed = int(np.sum(hits.surface == MISS))
     if n_missed:
         raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or shrink the scan")
-    t = scene.truth
-    region = None
     height = hits.point[:, 2].reshape(grid_x.shape)
-    if t.region_radius_um is not None:
-        region = Region(
-            center=t.region_center_um,
-            radius=t.region_radius_um,
-            substrate_radius=t.substrate_radius_um or 1.35 * t.region_radius_um,
-            height=t.height_um or float(height.max()),
-        )
-    return Truth(height=height, normals=hits.normal.reshape(*grid_x.shape, 3), region=region)
+    return Truth(height, hits.normal.reshape(*grid_x.shape, 3), _region(scene, float(height.max())))
+
+
+def _region(scene: SceneFile, top: float) -> Region | None:
+    """Return the scored region of a scene's table [truth], or None where it names none."""
+    t = scene.truth
+    if t.region_radius_um is None:
+        return None
+    return Region(
+        center=t.region_center_um,
+        radius=t.region_radius_um,
+        substrate_radius=t.substrate_radius_um or SUBSTRATE_RATIO * t.region_radius_um,
+        height=t.height_um or top,
+    )
+
+
+def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = False) -> Truth:
+    """Return the truth of a scene file, or of another reconstruction on the same raster.
+
+    Args:
+        path: scene (.toml) or height map (.h5).
+        rec: what will be scored.
+        fit_center: for a scene of one sphere: fit its position first, as for measured data (DATA.md).
+
+    Raises:
+        SceneError: `fit_center` without a scene of one sphere and a scored region.
+    """
+    if Path(path).suffix == ".h5":
+        other = read(path)
+        if not isinstance(other, Reconstruction):
+            raise SceneError(f"{path}: the truth must be a scene or a height map, got {type(other).__name__}")
+        return Truth(other.height, other.normals)
+    scene = load_scene(path)
+    return _fitted_truth(path, scene, rec) if fit_center else true_height(scene, rec)
+
+
+def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
+    """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
+    sample, region = scene.sample, _region(scene, 0.0)
+    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or region is None:
+        raise SceneError(f"{path}: fitting a centre needs a scene with one sphere and truth.region_radius_um")
+    grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
+    (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift
+
+    def sphere_at(x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return first_hit_spheres(grid_x, grid_y, np.array([[x, y, z, radius]]), shift)
+
+    found = fit_sphere_center(rec, lambda x, y: sphere_at(x, y)[0], region)
+    return Truth(*sphere_at(*found.center), found)
 
 
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
     """Score a reconstruction against the true heights of the same rays (DATA.md, "How we score spheres")."""
     return evaluate_height(rec, truth)
+
+
+def write_report_files(
+    path: str | Path,
+    stack: MicrographStack | None,
+    rec: Reconstruction,
+    truth: Truth | None,
+    scores: Scores | None,
+    *,
+    title: str,
+) -> Path:
+    """Write the HTML report and the PNG panel beside it; return the panel's path."""
+    path = Path(path)
+    panel_path = path.with_suffix(".png")
+    save_figure(panel(stack, rec, truth, scores), panel_path)
+    write_report(path, stack, rec, truth, scores, panel_png=panel_path, title=title)
+    return panel_path
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What `run` made: scores, and where the files are."""
+
+    name: str
+    method: str
+    status: str
+    scores: Scores
+    files: dict[str, Path]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-compatible summary."""
+        files = {key: str(path) for key, path in self.files.items()}
+        return {
+            "name": self.name,
+            "method": self.method,
+            "status": self.status,
+            **self.scores.as_dict(),
+            "files": files,
+        }
+
+
+def with_provenance(stack: MicrographStack, scene_path: str | Path) -> MicrographStack:
+    """Return the stack with what is needed to make it again: scene text, versions, commit, command line, time."""
+    path = Path(scene_path)
+    names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
+    about = {
+        "scene_file": path.name,
+        "scene_text": path.read_text(encoding="utf-8"),
+        "scene": resolved(load_scene(path)),
+        "versions": {name: _version(name) for name in names},
+        "git": _git_commit(),
+        "machine": {"processor": platform.machine(), "system": platform.system(), "cpus": os.cpu_count()},
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    return stack.replace(provenance={**stack.provenance, **about})
+
+
+def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _git_commit() -> str:
+    """Return the commit of the checkout that this package runs from, or "" outside one."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=False).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+
+
+def run(
+    scene_path: str | Path,
+    folder: str | Path | None = None,
+    *,
+    overrides: dict[str, Any] | None = None,
+    stage: Callable[[str], Any] = lambda label: nullcontext(),
+) -> RunResult:
+    """Do the main job: simulate, reconstruct, score, report.
+
+    Each file is written as soon as it is known, so that an interrupted run keeps what was finished.
+
+    Args:
+        scene_path: of the scene file.
+        folder: where the files go; default helio-out/NAME.
+        overrides: settings that win over the scene, dotted keys.
+        stage: called with the name of each stage; a context manager that yields its progress callback.
+    """
+    scene = load_scene(scene_path, overrides)
+    out = Path(folder) if folder else Path("helio-out") / scene.name
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise SceneError(f"output folder {out} cannot be made: {e.strerror}; choose another with -o") from None
+    names = {
+        "micrographs": "micrographs.h5",
+        "height map": "height.h5",
+        "report": "report.html",
+        "scores": "scores.json",
+    }
+    files = {label: out / name for label, name in names.items()}
+    with stage("simulating micrographs") as progress:
+        stack = with_provenance(record(scene, simulate(scene, progress=progress)), scene_path)
+    write(stack, files["micrographs"])
+    with stage("reconstructing heights") as progress:
+        rec = reconstruct(stack, settings=scene.reconstruct, report=progress)
+    write(rec, files["height map"])
+    with stage("scoring and reporting"):
+        truth = true_height(scene, rec)
+        scores = evaluate(rec, truth)
+        with atomic_path(files["scores"]) as part:
+            part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")
+        title = f"{scene.name}: simulated, reconstructed, scored"
+        files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
+    return RunResult(scene.name, rec.method, rec.status, scores, files)
+
+
+def diagnose() -> dict[str, Any]:
+    """Return versions and the outcome of a small trace, for `helio doctor`; `ok` says whether all is well."""
+    import jax
+
+    names = ("helio-jax", "numpy", "scipy", "numba", "embreex", "jax", "optimistix", "trimesh", "h5py", "plotly")
+    found: dict[str, Any] = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    found |= {name: _version(name) for name in names}
+    found |= {"cpus": os.cpu_count(), "jax devices": ", ".join(str(d) for d in jax.devices())}
+    intersector = Intersector(flat_body(2000.0))
+    found["ray engine"] = "embree" if intersector.has_embree else "exhaustive (slow: embreex is not installed)"
+    detector = Detector(name="test", polar_deg=45.0, half_angle_deg=10.0)
+    instrument = Instrument(plate=Plate(working_distance_um=4000.0), detector=(detector,))
+    experiment = make_experiment(flat_body(2000.0), instrument, TraceSettings(rays=8, n_orders=1))
+    traced = float(trace_pixels(experiment, np.zeros(1), np.zeros(1)).total()[0][0, 0])
+    exact = math.sin(math.radians(10.0)) ** 2 * math.cos(math.radians(45.0))
+    found["small trace"] = f"P = {traced:.9f}, closed form {exact:.9f}"
+    found["ok"] = bool(abs(traced / exact - 1.0) < 1e-4)
+    return found

@@ -25,7 +25,7 @@ from helio_jax.reconstruction import Reconstruction
 CITATION = (
     "S. Lambrick, A. Radic, C. Zhao et al., Heliometric stereo: a new frontier in surface profilometry, "
     "arXiv:2501.14833 (the method).",
-    "helio_jax, version as given under provenance (this software); `helio cite` prints BibTeX.",
+    "helio_jax, version as given under provenance (this software).",
 )
 
 

@@ -42,6 +42,11 @@ class Prediction:
 _FIRST_STEP_SIZE = 1e4
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables."""
 
+_EDGE_BENDS = 4.0
+"""Changes of slope above this many prior deviations are edges: their smoothness weight falls off."""
+_MAX_STEEPNESS = 20.0
+"""Largest 1 + slope^2 by which the smoothness prior is relaxed."""
+
 Predict = Callable[[np.ndarray, np.ndarray], Prediction]
 """(pixel heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
 Report = Callable[[int, int, str], None]
@@ -173,10 +178,22 @@ def _solve(model: _Model, start: _Unknowns, lagged: _Lagged, max_steps: int, cg_
     return solution.value, model.counts(solution.value, lagged), solution.stats["num_steps"]
 
 
-def _curvature_weight(corners: np.ndarray, axis: int, pitch: float, scale: float) -> np.ndarray:
+def _curvature_weight(corners: np.ndarray, axis: int, pitch: float, scale: np.ndarray) -> np.ndarray:
     """Return edge-preserving weights of the second differences: Geman-McClure, deviation `scale` per pixel."""
     bend = np.diff(corners, n=2, axis=axis) / pitch
-    return 1.0 / (pitch * scale) / (1.0 + (bend / (4.0 * scale)) ** 2)
+    middle = (slice(None), slice(1, -1)) if axis == 1 else (slice(1, -1), slice(None))
+    local = scale[middle]
+    return 1.0 / (pitch * local) / (1.0 + (bend / (_EDGE_BENDS * local)) ** 2)
+
+
+def _bend_scale(quads: Quads, scale: float) -> np.ndarray:
+    """Return the prior deviation of slope changes at every corner, for equal changes of the surface's angle.
+
+    A change of angle d theta changes a slope by (1 + slope^2) d theta: steep parts may bend more, as do round ones.
+    """
+    steepness = 1.0 + np.asarray(quads.slope_x) ** 2 + np.asarray(quads.slope_y) ** 2
+    padded = np.pad(np.minimum(steepness, _MAX_STEEPNESS), 1, mode="edge")
+    return scale * 0.25 * (padded[1:, 1:] + padded[:-1, 1:] + padded[1:, :-1] + padded[:-1, :-1])
 
 
 def _robust_inverse_sigma(residual: np.ndarray, sigma: np.ndarray, limit: float) -> np.ndarray:
@@ -221,7 +238,7 @@ class _Refiner:
         )
         sigma = np.where(self.observed, sigma, np.nan)
         self.sigma = sigma
-        scale = s.smoothness * self.slope_noise
+        scale = _bend_scale(quads, s.smoothness * self.slope_noise)
         return _Lagged(
             data=jnp.asarray(np.where(self.observed, self.signal, 0.0)),
             inverse_sigma=jnp.asarray(_robust_inverse_sigma(self.residuals, sigma, limit)),

@@ -10,29 +10,29 @@ from helio_jax.settings import Settings
 class RefineSettings(Settings):
     """The fit of the heights: table `[reconstruct.refine]`."""
 
-    max_rounds: int = Field(4, ge=1, le=50)
+    max_rounds: int = Field(default=4, ge=1, le=50)
     """How often multiple scattering and masks are predicted anew on the current surface."""
-    tolerance_um: float = Field(1.0, gt=0.0, le=1e3)
+    tolerance_um: float = Field(default=1.0, gt=0.0, le=1e3)
     """The fit has converged when a round changes the heights by less than this (root mean square) [um]."""
-    gain_std: float = Field(0.02, gt=0.0, le=1.0)
+    gain_std: float = Field(default=0.02, gt=0.0, le=1.0)
     """Prior deviation of each detector's gain, relative."""
-    offset_std: float = Field(0.01, gt=0.0, le=1.0)
+    offset_std: float = Field(default=0.01, gt=0.0, le=1.0)
     """Prior deviation of each detector's offset, relative to its median signal."""
-    albedo_std: float = Field(0.0, ge=0.0, le=1.0)
+    albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
-    albedo_modes: int = Field(6, ge=1, le=64)
+    albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
-    smoothness: float = Field(0.7, gt=0.0, le=100.0)
+    smoothness: float = Field(default=0.7, gt=0.0, le=100.0)
     """Prior deviation of the change of slope from pixel to pixel, in units of the slope noise of one pixel."""
-    mask_error: float = Field(0.15, ge=0.0, le=10.0)
+    mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
-    multiple_error: float = Field(0.1, ge=0.0, le=10.0)
+    multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)
     """Relative error assumed of the predicted multiple scattering."""
-    robust_limits: tuple[float, ...] = Field((10.0, 5.0, 4.0), min_length=1, max_length=20)
+    robust_limits: tuple[float, ...] = Field(default=(30.0, 10.0, 8.0), min_length=1, max_length=20)
     """Residuals [standard deviations] at which a datum's weight falls to a half, one per re-weighting."""
-    lm_steps: int = Field(4, ge=1, le=1000)
+    lm_steps: int = Field(default=4, ge=1, le=1000)
     """Levenberg-Marquardt steps per re-weighting."""
-    cg_steps: int = Field(40, ge=1, le=10_000)
+    cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
     rays: int = Field(1_500_000, ge=1000, le=10**10)
     """Beam rays per prediction of the multiple scattering, over the whole image."""
@@ -46,14 +46,14 @@ class ReconstructSettings(Settings):
     `refine`: fit of the heights through the render model, with masking, shadows and multiple scattering."""
     integrator: Literal["weighted", "dct_poisson", "harker_oleary", "bilateral"] = "weighted"
     """From slopes to heights: `weighted` cuts depth jumps; the others are kept for comparison."""
-    rounds: int = Field(4, ge=1, le=100)
+    rounds: int = Field(default=4, ge=1, le=100)
     """`nearfield`: how often the directions are evaluated at the current height."""
-    damping: float = Field(0.8, gt=0.0, le=1.0)
+    damping: float = Field(default=0.8, gt=0.0, le=1.0)
     """`nearfield`: share of the new height in each round."""
     border: Literal["flat", "free"] = "flat"
     """Whether the border of the image lies on the flat reference plane: levels the heights there."""
-    border_fraction: float = Field(0.06, gt=0.0, lt=0.5)
+    border_fraction: float = Field(default=0.06, gt=0.0, lt=0.5)
     """Width of that border, as a fraction of the image on each side."""
-    border_std_um: float = Field(2.0, gt=0.0, le=1e4)
+    border_std_um: float = Field(default=2.0, gt=0.0, le=1e4)
     """`refine`: how flat the border is known to be [um]."""
     refine: RefineSettings = RefineSettings()

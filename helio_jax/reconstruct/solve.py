@@ -5,6 +5,8 @@ the current height. refine: the fit of the heights, started from nearfield. Take
 instrument from the stack, and, if the settings say so, that the border of the image is flat; no truth.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from helio_jax.arrays import pitch
@@ -16,6 +18,9 @@ from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruction import REASONS, Reconstruction
+
+if TYPE_CHECKING:
+    from helio_jax.reconstruct.refine import Predict, Report
 
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked in the validity map."""
@@ -79,8 +84,8 @@ def _limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
 def reconstruct_stack(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    predict=None,
-    report=None,
+    predict: "Predict | None" = None,
+    report: "Report | None" = None,
 ) -> Reconstruction:
     """Turn three or more micrographs into heights.
 
@@ -137,7 +142,7 @@ def _from_solution(stack, settings, height, solution) -> Reconstruction:
         is_valid=reason == 0,
         reason=reason,
         residuals=solution.residuals,
-        status=f"solved in {rounds} round(s); {n_few} pixels seen in fewer than {MIN_IMAGES} images got the flat normal",
+        status=f"solved in {rounds} round(s); {n_few} pixels in fewer than {MIN_IMAGES} images took the flat normal",
         provenance={"stack": dict(stack.provenance), "reconstruct": settings.model_dump(mode="json")},
     )
 

@@ -181,7 +181,7 @@ def _load_mesh(path: Path, max_mb: float) -> tuple[np.ndarray, np.ndarray]:
 
     import trimesh
 
-    options = {"skip_materials": True} if kind == "obj" else {}
+    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     try:
         mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options).to_mesh()
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)

@@ -169,6 +169,11 @@ class Intersector:
         if engine == "embree" and self._embree is None and self.triangles.size:
             raise SceneError("engine = 'embree' needs the package embreex, which is not installed here")
 
+    @property
+    def has_embree(self) -> bool:
+        """Whether the triangles are traced by Embree."""
+        return self._embree is not None
+
     def _set_scale(self) -> None:
         low, high = [], []
         if self.triangles.size:

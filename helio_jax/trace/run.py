@@ -162,7 +162,7 @@ def trace_scene(
     n_negative = int(np.sum(total < 0))
     by_order, total = np.maximum(by_order, 0.0), np.maximum(total, 0.0)
     fates = {name: int(n) for name, n in zip(FATES, tally.fates.sum(1), strict=True)}
-    return MicrographStack(
+    stack = MicrographStack(
         counts=n_rays * total.reshape(-1, *shape),
         variance=n_rays**2 * variance.reshape(-1, *shape),
         by_order=n_rays * by_order.reshape(*by_order.shape[:2], *shape),
@@ -177,5 +177,5 @@ def trace_scene(
             "rays": {"launched": sum(fates.values()), **fates},
             "n_negative": n_negative,
         },
-        **(_maps(experiment, grid_x, grid_y, shape) if settings.maps else {}),
     )
+    return stack.replace(**_maps(experiment, grid_x, grid_y, shape)) if settings.maps else stack

@@ -12,7 +12,7 @@ class TraceSettings(Settings):
 
     rays: int = Field(default=256, ge=8, le=10_000_000)
     """Beam rays per pixel; the counts do not depend on it (see scan.atoms_per_pixel), only their error does."""
-    branches: int = Field(8, ge=1, le=1024)
+    branches: int = Field(default=8, ge=1, le=1024)
     """`expected`: paths followed from the first hit of every beam ray, for the multiple scattering."""
     estimator: Literal["expected", "analog"] = "expected"
     """`expected`: closed-form direct term and next-event estimation; `analog`: whole counts of detected rays."""
