@@ -47,7 +47,7 @@ class MicrographStack:
     y: np.ndarray
     instrument: Instrument
     variance: np.ndarray | None = None
-    is_observed: np.ndarray | None = None
+    is_observed: np.ndarray = None  # type: ignore[assignment]  # filled when made
     background: np.ndarray | None = None
     by_order: np.ndarray | None = None
     effuse: np.ndarray | None = None

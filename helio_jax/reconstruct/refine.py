@@ -114,7 +114,7 @@ def _heights(unknowns: _Unknowns, lagged: _Lagged) -> jax.Array:
     return idctn(unknowns.heights * lagged.whitening, norm="ortho")
 
 
-def _albedo(modes: jax.Array, shape: tuple[int, int], std: float) -> jax.Array:
+def _albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
     """Return the smooth albedo exp(sum of cosine modes); the constant mode is left to the gains."""
     if std == 0.0:
         return jnp.ones(shape)

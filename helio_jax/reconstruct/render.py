@@ -6,7 +6,7 @@ hidden_k) with the near-field form factor and the hidden part of it (masks and h
 Compared in tests/physics/test_render.py with the tracer, with which it shares no kernel.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,12 @@ from helio_jax.reconstruct.formfactor import SpotGeometry, form_factor_of_height
 class Quads(NamedTuple):
     """Height and slopes of every pixel [y, x]."""
 
-    height: jax.Array
-    slope_x: jax.Array
-    slope_y: jax.Array
+    height: Any
+    slope_x: Any
+    slope_y: Any
 
 
-def quads_of_corners(corners: jax.Array, dx: float, dy: float) -> Quads:
+def quads_of_corners(corners: Any, dx: float, dy: float) -> Quads:
     """Return the pixels' heights [um] and slopes from corner heights [y + 1, x + 1], um; pitches in um."""
     south, north = corners[:-1], corners[1:]
     sw, se, nw, ne = south[:, :-1], south[:, 1:], north[:, :-1], north[:, 1:]

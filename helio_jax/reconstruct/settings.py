@@ -34,7 +34,7 @@ class RefineSettings(Settings):
     """Levenberg-Marquardt steps per re-weighting."""
     cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
-    rays: int = Field(1_500_000, ge=1000, le=10**10)
+    rays: int = Field(default=1_500_000, ge=1000, le=10**10)
     """Beam rays per prediction of the multiple scattering, over the whole image."""
 
 

@@ -189,15 +189,16 @@ class Intersector:
 
     def _build_embree(self):
         try:
-            from embreex import mesh_construction, rtcore_scene
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
         except ImportError:
             warnings.warn(
                 "embreex has no wheel for this platform: rays are tested against every triangle", stacklevel=3
             )
             return None
-        scene = rtcore_scene.EmbreeScene(robust=True)
+        scene = EmbreeScene(robust=True)
         scaled = ((self.vertices - self.center) / self.half_size).astype(np.float32)
-        self._mesh = mesh_construction.TriangleMesh(scene, scaled, self.triangles)
+        self._mesh = TriangleMesh(scene, scaled, self.triangles)
         one = np.array([[0.0, 0.0, 9.0]], np.float32)
         scene.run(one, -one / 9)  # commits the scene before threads share it
         return scene

@@ -103,7 +103,7 @@ def test_truncated_or_flipped_helio_file(helio_file):
 
 
 def test_truncated_or_flipped_matlab_file(matlab_file):
-    """Catches parsing in this process: SciPy dies of SIGSEGV on 2-3 % of such files (seeds 37 and 49 did when written)."""
+    """Catches parsing in this process: SciPy dies of SIGSEGV on 2-3 % of such files (seeds 37, 49 did)."""
     good = matlab_file.read_bytes()
     assert import_micrographs(matlab_file, make_instrument()).shape == (3, 5, 6)
     for length in (100, 130, len(good) // 2, len(good) - 1):
