@@ -46,7 +46,7 @@ def reference_instrument(about: dict, source: str, distance_um: float, rotation_
         beam=Beam(
             incidence_deg=beam["incidence_deg"],
             pinhole_radius_um=1e3 * beam["pinhole_radius"],
-            source="pencil" if size == 0 else model,
+            source="pencil" if size == 0 else "uniform" if model == "uniform" else "gaussian",
             source_size_mrad=1e3 * size,
         ),
         plate=Plate(working_distance_um=1e3 * beam["design_wd"], sample_distance_um=distance_um),
@@ -73,7 +73,9 @@ def _load(shared: Path, name: str) -> tuple[dict, dict[str, np.ndarray]]:
         return about, {key: arrays[key] for key in arrays.files}
 
 
-def sphere_set(shared: Path, rotation_sign: float = -1.0, cap_height_um: float = 720.0, mirror: bool = False) -> CountSet:
+def sphere_set(
+    shared: Path, rotation_sign: float = -1.0, cap_height_um: float = 720.0, mirror: bool = False
+) -> CountSet:
     """Return sphere_A_53x61; the keyword arguments make wrong models."""
     about, data = _load(shared, "sphere_A_53x61")
     z, x = np.meshgrid(1e3 * data["z"], 1e3 * data["x"], indexing="ij")
@@ -123,6 +125,9 @@ def trench_sets(shared: Path) -> list[tuple[CountSet, np.ndarray]]:
     x, y = -1e3 * data["x"], 1e3 * data["z"]
     rays = about["rays_per_pixel"]
     return [
-        (CountSet("trench z", data["z_hist"][:, 0], 0 * y, y, rays["z_line"], instrument, body), data["z_killed"][:, 0]),
+        (
+            CountSet("trench z", data["z_hist"][:, 0], 0 * y, y, rays["z_line"], instrument, body),
+            data["z_killed"][:, 0],
+        ),
         (CountSet("trench x", data["x_hist"][0], x, 0 * x, rays["x_line"], instrument, body), data["x_killed"][0]),
     ]

@@ -192,8 +192,8 @@ class Instrument(Settings):
                 out.append(Aperture(d.center_um, semi, math.radians(d.rotation_deg or 0.0)))
             else:
                 assert d.polar_deg is not None and d.half_angle_deg is not None  # by the validator above
-                cone = (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg)
-                out.append(cone_ellipse(*map(math.radians, cone), self.working_distance))
+                polar, azimuth, half = map(math.radians, (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg))
+                out.append(cone_ellipse(polar, azimuth, half, self.working_distance))
         return tuple(out)
 
     def spot_position(self, height: Any) -> tuple[Any, Any, Any]:

@@ -264,8 +264,8 @@ def with_provenance(stack: MicrographStack, scene_path: str | Path) -> Micrograp
         "scene_file": path.name,
         "scene_text": path.read_text(encoding="utf-8"),
         "scene": resolved(load_scene(path)),
-        "versions": {name: _version(name) for name in names},
-        "git": _git_commit(),
+        "versions": {name: package_version(name) for name in names},
+        "git": git_commit(),
         "machine": {"processor": platform.machine(), "system": platform.system(), "cpus": os.cpu_count()},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -273,7 +273,7 @@ def with_provenance(stack: MicrographStack, scene_path: str | Path) -> Micrograp
     return stack.replace(provenance={**stack.provenance, **about})
 
 
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -282,7 +282,7 @@ def _version(name: str) -> str:
         return "not installed"
 
 
-def _git_commit() -> str:
+def git_commit() -> str:
     """Return the commit of the checkout that this package runs from, or "" outside one."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
@@ -343,7 +343,7 @@ def diagnose() -> dict[str, Any]:
 
     names = ("helio-jax", "numpy", "scipy", "numba", "embreex", "jax", "optimistix", "trimesh", "h5py", "plotly")
     found: dict[str, Any] = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
-    found |= {name: _version(name) for name in names}
+    found |= {name: package_version(name) for name in names}
     found |= {"cpus": os.cpu_count(), "jax devices": ", ".join(str(d) for d in jax.devices())}
     intersector = Intersector(flat_body(2000.0))
     found["ray engine"] = "embree" if intersector.has_embree else "exhaustive (slow: embreex is not installed)"

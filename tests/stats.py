@@ -14,20 +14,21 @@ P_MIN = FALSE_ALARM / N_CHECKS
 def pooled_chi2(observed: np.ndarray, expected: np.ndarray, variance: np.ndarray, smallest: float = 10.0) -> float:
     """Return the p-value of Poisson counts against expectations that have a variance of their own.
 
-    Cells whose expectation is below `smallest` are pooled in order of expectation until it is reached.
+    Cells are pooled with their neighbours in scan order (not by our noisy expectation) until a block expects `smallest`
+    on average; blocks that still expect less are pooled into one.
     """
-    order = np.argsort(expected.ravel())
-    o, e, v = (np.asarray(a, float).ravel()[order] for a in (observed, expected, variance))
-    groups, total = np.zeros(o.size, int), 0.0
-    for i in range(o.size):
-        if i and total >= smallest:
-            groups[i], total = groups[i - 1] + 1, 0.0
-        elif i:
-            groups[i] = groups[i - 1]
-        total += e[i]
-    o, e, v = (np.bincount(groups, a) for a in (o, e, v))
-    if e[-1] < smallest and e.size > 1:
-        o, e, v = (np.append(a[:-2], a[-2] + a[-1]) for a in (o, e, v))
+    o, e, v = (np.asarray(a, float).ravel() for a in (observed, expected, variance))
+    block = np.arange(o.size) // max(1, int(np.ceil(smallest / max(e.mean(), smallest / o.size))))
+    o, e, v = (np.bincount(block, a) for a in (o, e, v))
+    is_small = e < smallest
+    if is_small.any():
+        o, e, v = (np.append(a[~is_small], a[is_small].sum()) for a in (o, e, v))
+    if e[-1] + v[-1] == 0.0:  # nothing expected here: any count at all is impossible
+        if o[-1] > 0:
+            return 0.0
+        o, e, v = o[:-1], e[:-1], v[:-1]
+    if e.size == 0:
+        return 1.0
     return float(stats.chi2.sf(np.sum((o - e) ** 2 / (e + v)), o.size))
 
 
@@ -45,4 +46,6 @@ def assert_likely(p: float, what: str) -> None:
 
 def assert_mean(value: float, expected: float, std_error: float, what: str) -> None:
     """Fail where a normal mean is further from its expectation than P_MIN allows."""
-    assert_likely(float(2 * stats.norm.sf(abs(value - expected) / std_error)), f"{what}: {value:g} against {expected:g}")
+    assert_likely(
+        float(2 * stats.norm.sf(abs(value - expected) / std_error)), f"{what}: {value:g} against {expected:g}"
+    )

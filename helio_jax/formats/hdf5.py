@@ -208,7 +208,7 @@ def _walk(path: Path, group: h5py.Group, depth: int = 1, count: list[int] | None
     """Yield every object below `group` with its place, following hard links only."""
     count = [0] if count is None else count
     for name in group:
-        place = f"{group.name.rstrip('/')}/{name}"
+        place = f"{str(group.name).rstrip('/')}/{name}"
         count[0] += 1
         if count[0] > _MAX_OBJECTS or depth > _MAX_DEPTH:
             limit = f"{_MAX_OBJECTS} objects, {_MAX_DEPTH} deep"

@@ -99,7 +99,7 @@ def _reduce(name: str, value: Any) -> Any:
             return value
         if name not in _SUMMARISED or not is_number or not np.isfinite(value).any():
             return None
-        good = value[np.isfinite(value)]
+        good = np.asarray(value)[np.isfinite(value)]
         return {"mean": float(good.mean()), "min": float(good.min()), "max": float(good.max())}
     return value if isinstance(value, (bool, int, float, str)) else None
 

@@ -33,7 +33,7 @@ def integrate_slopes(
     """Integrate slopes to a height map.
 
     Pixels of weight 0 have an unknown slope: it is replaced by that of the nearest known pixel and, in `weighted` and
-    `bilateral`, trusted 1e-4 of the median.
+    `bilateral`, trusted 1e-6 of the median.
 
     Args:
         a, b: slopes dh/dX and dh/dY at the pixel centres [1]; NaN only where the weight is 0. At least 3 x 3 pixels.

@@ -79,7 +79,7 @@ def integrate_bilateral(
     if not stiffness > 0 or n_rounds < 1:
         raise SceneError(f"stiffness must be > 0 and n_rounds >= 1, got {stiffness:g} and {n_rounds}")
     normal_z = 1 / np.sqrt(1 + a**2 + b**2)
-    relative = np.maximum(weights / np.median(weights[weights > 0]), 1e-4)
+    relative = np.maximum(weights / np.median(weights[weights > 0]), 1e-6)
     height = integrate_poisson(a, b, dx, dy)
     slope_x, slope_y = (
         np.zeros((a.shape[0], a.shape[1] - 1)),
@@ -89,7 +89,7 @@ def integrate_bilateral(
     for _ in range(n_rounds):
         wanted_x, weight_x = _edges(slope_x, a, normal_z, relative, stiffness)
         wanted_y, weight_y = (e.T for e in _edges(slope_y.T, b.T, normal_z.T, relative.T, stiffness))
-        floor = 1e-6 * max(weight_x.max(), weight_y.max())
+        floor = 1e-8 * max(weight_x.max(), weight_y.max())
         problem = EdgeProblem(wanted_x, wanted_y, np.maximum(weight_x, floor), np.maximum(weight_y, floor), dx, dy)
         height, _ = solve_weighted(problem, height, 10 * tolerance, 40)
         slope_x, slope_y = differentiate(height, dx, dy)

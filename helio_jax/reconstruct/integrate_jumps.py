@@ -15,16 +15,20 @@ from helio_jax.reconstruct.integrate_poisson import (
     EdgesY,
     Image,
     differentiate,
+    differentiate_adjoint,
     integrate_poisson,
     mean_to_edges,
+    solve_poisson,
     solve_weighted,
     solve_weighted_checked,
 )
 
-EDGE_FLOOR = 1e-6  # part of the largest edge weight that every edge keeps, so that no region floats
+Edges = tuple[EdgesX, EdgesY]
+COARSE = 1e-3, 40  # relative residual and largest number of steps of the solves between two reweightings
+MEMBRANE = 1e-7  # weight, of the largest edge weight, that draws every edge to a slope of zero: no region floats
 
 
-def edge_confidence(weights: Image, floor: float = 1e-4) -> tuple[EdgesX, EdgesY]:
+def edge_confidence(weights: Image, floor: float = 1e-6) -> tuple[EdgesX, EdgesY]:
     """Return edge confidences relative to the median pixel: harmonic means of the pixels' weights.
 
     If a pixel's weight is the inverse variance of its slope, the variance of the mean of two is half the inverse of
@@ -70,13 +74,42 @@ def edge_noise(a: Image, b: Image, confidence_x: EdgesX, confidence_y: EdgesY, n
     return np.sqrt(noise**2 / (2 * confidence_x) + kink_x), np.sqrt(noise**2 / (2 * confidence_y) + kink_y)
 
 
-def _problem(
-    slopes: tuple[EdgesX, EdgesY], weight_x: EdgesX, weight_y: EdgesY, dx: float, dy: float, floor: float
-) -> EdgeProblem:
-    """Return the edge problem with weights scaled to a largest of 1 and held above `floor`."""
+def _doubt_guesses(sigma: Edges, slopes: Edges, weights: Image) -> Edges:
+    """Return sigma with the slope itself added in quadrature on edges that touch a pixel of unknown slope.
+
+    Such a slope was copied from a neighbour; without this, copies of a grazing pixel's slope would be believed.
+    """
+    is_unknown = weights == 0
+    guess_x = np.where(is_unknown[:, 1:] | is_unknown[:, :-1], slopes[0], 0.0)
+    guess_y = np.where(is_unknown[1:] | is_unknown[:-1], slopes[1], 0.0)
+    return np.hypot(sigma[0], guess_x), np.hypot(sigma[1], guess_y)
+
+
+def _problem(slopes: Edges, sigma: Edges, jump: Edges, dx: float, dy: float) -> EdgeProblem:
+    """Return the edge problem of weights jump / sigma^2 (largest 1), plus a weak membrane on every edge.
+
+    The membrane, `MEMBRANE` (D h)^2, ties regions that are cut off. It draws towards a slope of zero and not to the
+    edge's own, or one grazing pixel with a slope of 1e8 would outweigh the rest.
+    """
+    weight_x, weight_y = jump[0] / sigma[0] ** 2, jump[1] / sigma[1] ** 2
     largest = max(weight_x.max(), weight_y.max())
-    weight_x, weight_y = np.maximum(weight_x / largest, floor), np.maximum(weight_y / largest, floor)
-    return EdgeProblem(*slopes, weight_x, weight_y, dx, dy)
+    total_x, total_y = weight_x / largest + MEMBRANE, weight_y / largest + MEMBRANE
+    slope_x, slope_y = slopes[0] * (1 - MEMBRANE / total_x), slopes[1] * (1 - MEMBRANE / total_y)
+    return EdgeProblem(slope_x, slope_y, total_x, total_y, dx, dy)
+
+
+def _misfits(height: Image, slopes: Edges, sigma: Edges, dx: float, dy: float) -> Edges:
+    """Return (D h - s) / sigma on the edges."""
+    slope_x, slope_y = differentiate(height, dx, dy)
+    return (slope_x - slopes[0]) / sigma[0], (slope_y - slopes[1]) / sigma[1]
+
+
+def _start(slopes: Edges, sigma: Edges, dx: float, dy: float) -> Image:
+    """Return the plain Poisson height, or a flat one if that fits better, as it does beside slopes of 1e8."""
+    plain = solve_poisson(differentiate_adjoint(*slopes, dx, dy), dx, dy)
+    flat = np.zeros_like(plain)
+    sum_sq = [sum(float(np.sum(r**2)) for r in _misfits(h, slopes, sigma, dx, dy)) for h in (plain, flat)]
+    return plain if sum_sq[0] <= sum_sq[1] else flat
 
 
 def integrate_weighted(
@@ -96,7 +129,7 @@ def integrate_weighted(
     Raises:
         GuardError: conjugate gradients did not reach `tolerance` in `max_steps`.
     """
-    problem = _problem(mean_to_edges(a, b), *edge_confidence(weights), dx, dy, 1e-12)
+    problem = EdgeProblem(*mean_to_edges(a, b), *edge_confidence(weights), dx, dy)
     return solve_weighted_checked(problem, integrate_poisson(a, b, dx, dy), tolerance, max_steps)
 
 
@@ -115,7 +148,7 @@ def integrate_cutting_jumps(
     """Return the height and the edges that stayed intact, by a robust fit of the edge slopes.
 
     Minimises sum_e rho(r_e), r = (D h - s) / sigma, with Geman and McClure's rho = r^2 c^2 / (r^2 + c^2), by
-    reweighting; c falls by halves from the largest misfit of the plain Poisson solution to `cut` (graduated
+    reweighting; c falls by halves from the largest misfit of the fit without cuts to `cut` (graduated
     non-convexity), and stays there for three more rounds. sigma is `edge_noise` of the noise that
     `estimate_slope_noise` finds.
     Valid where each region is tied to the rest through intact edges.
@@ -143,24 +176,21 @@ def integrate_cutting_jumps(
     for name, value in (("cut", cut), ("min_noise", min_noise)):
         if not value > 0:
             raise SceneError(f"{name} must be > 0, got {value:g}")
-    slopes = mean_to_edges(a, b)
     noise = max(estimate_slope_noise(a, b, dx, dy, weights), min_noise)
-    sigma_x, sigma_y = edge_noise(a, b, *edge_confidence(weights), noise)
-    height = integrate_poisson(a, b, dx, dy)
-
-    def misfit(height: Image) -> tuple[EdgesX, EdgesY]:
-        slope_x, slope_y = differentiate(height, dx, dy)
-        return (slope_x - slopes[0]) / sigma_x, (slope_y - slopes[1]) / sigma_y
-
-    largest = max(float(np.abs(r).max()) for r in misfit(height))
+    slopes = mean_to_edges(a, b)
+    sigma = _doubt_guesses(edge_noise(a, b, *edge_confidence(weights), noise), slopes, weights)
+    jump = np.ones_like(sigma[0]), np.ones_like(sigma[1])
+    height = _start(slopes, sigma, dx, dy)
+    height, _ = solve_weighted(_problem(slopes, sigma, jump, dx, dy), height, COARSE[0], COARSE[1])
+    largest = max(float(np.abs(r).max()) for r in _misfits(height, slopes, sigma, dx, dy))
     n_halvings = int(np.ceil(np.log2(max(largest / cut, 1.0))))
     scales = [cut * 2.0**k for k in range(n_halvings, 0, -1)] + [cut] * 4
-    jump_x, jump_y = np.ones_like(sigma_x), np.ones_like(sigma_y)
     for i, scale in enumerate(scales):
-        jump_x, jump_y = ((1 + (r / scale) ** 2) ** -2 for r in misfit(height))
-        problem = _problem(slopes, jump_x / sigma_x**2, jump_y / sigma_y**2, dx, dy, EDGE_FLOOR)
+        jump_x, jump_y = ((1 + (r / scale) ** 2) ** -2 for r in _misfits(height, slopes, sigma, dx, dy))
+        jump = jump_x, jump_y
+        problem = _problem(slopes, sigma, jump, dx, dy)
         if i < len(scales) - 1:
-            height, _ = solve_weighted(problem, height, 10 * tolerance, 40)
+            height, _ = solve_weighted(problem, height, COARSE[0], COARSE[1])
         else:
             height = solve_weighted_checked(problem, height, tolerance, max_steps)
-    return height, jump_x, jump_y
+    return height, jump[0], jump[1]

@@ -11,9 +11,9 @@ from numba import njit
 
 from helio_jax.instrument import Instrument
 
-RIM_POINTS = (10, 16, 24, 64, 256)
+RIM_POINTS = (12, 16, 24, 32, 64, 256)
 """Rim points of the trapezoid rule, the first ones for far points."""
-RIM_RATIOS = (4.0, 2.0, 1.2, 0.3)
+RIM_RATIOS = (4.0, 2.0, 1.2, 0.7, 0.3)
 """Distance to the plate in largest semi-axes above which each of RIM_POINTS is used (error < 1e-9)."""
 
 

@@ -1,0 +1,144 @@
+"""The command line, as a user meets it: files, output, exit codes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def helio(*args: object, **kwargs) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "helio_jax", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def small_scene(tmp_path_factory) -> Path:
+    """Sphere A on 31 x 31 pixels; its instrument is named by absolute path."""
+    text = (ROOT / "scenes" / "sphere_a.toml").read_text()
+    text = text.replace('"instruments/', f'"{(ROOT / "scenes" / "instruments").as_posix()}/')
+    text = text.replace("nx = 121", "nx = 31").replace("ny = 121", "ny = 31")
+    text = text.replace("pixel_size_um = 30.0", "pixel_size_um = 117.0")
+    path = tmp_path_factory.mktemp("scene") / "small.toml"
+    path.write_text(
+        text.replace('method = "refine"', 'method = "nearfield"') + "\n[reconstruct.refine]\nmax_rounds = 1\n"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(small_scene, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("run")
+    done = helio("run", small_scene, "-o", out, "--json")
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(done.stdout)  # stdout is one JSON object, progress went to stderr
+    assert 0.5 < scores["recovered_height"] < 1.5
+    return out
+
+
+def test_run_leaves_all_files(finished):
+    """Catches a stage that is skipped or writes elsewhere."""
+    names = {p.name for p in finished.iterdir()}
+    assert names == {"micrographs.h5", "height.h5", "report.html", "report.png", "scores.json"}
+
+
+def test_steps_one_by_one(small_scene, finished, tmp_path):
+    """simulate, reconstruct, evaluate, report, info on files give exit code 0 and say what they did."""
+    stack, height = tmp_path / "s.h5", tmp_path / "h.h5"
+    assert helio("simulate", small_scene, "-o", stack, "--rays", 16, "--noise").returncode == 0
+    assert helio("reconstruct", stack, "-o", height, "--method", "refine").returncode == 0
+    scored = helio("evaluate", height, "--truth", small_scene, "--json")
+    assert scored.returncode == 0 and json.loads(scored.stdout)["n_pixels"] > 50
+    against = helio("evaluate", height, "--truth", finished / "height.h5", "--json")
+    assert against.returncode == 0 and json.loads(against.stdout)["rms_image"] < 1.0
+    report = helio("report", height, "-o", tmp_path / "r.html", "--stack", stack, "--truth", small_scene)
+    assert report.returncode == 0 and (tmp_path / "r.png").stat().st_size > 10_000
+    info = helio("info", stack)
+    assert info.returncode == 0 and "micrographs" in info.stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "words"),
+    [
+        (["run", "nowhere.toml"], 2, "nowhere.toml"),
+        (["frobnicate"], 2, ""),
+        (["reconstruct", "nowhere.h5", "-o", "x.h5"], 3, "nowhere.h5"),
+        (["import", "{junk}", "-o", "x.h5"], 3, "junk.mat"),
+        (["info", "{junk}"], 3, "junk.mat"),
+        (["reconstruct", "{stack}", "-o", "{out}", "--method", "magic"], 2, "method"),
+    ],
+)
+def test_exit_codes(args, code, words, finished, tmp_path):
+    """Documented exit codes, one clear message, no traceback; catches crashes reported as usage errors."""
+    junk = tmp_path / "junk.mat"
+    junk.write_bytes(b"\x00\x01 not a mat file" * 50)
+    places = {"junk": junk, "stack": finished / "micrographs.h5", "out": tmp_path / "x.h5"}
+    done = helio(*[str(a).format(**places) for a in args], cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_wrong_scene_lists_all_errors(tmp_path, small_scene):
+    """Two errors in one file are both told, with place and limit."""
+    bad = tmp_path / "bad.toml"
+    bad.write_text(
+        small_scene.read_text().replace("nx = 31", "nx = -4").replace("radius_um = 1000.0", "radius_um = 0.0")
+    )
+    done = helio("validate", bad)
+    assert done.returncode == 2
+    assert "scan.nx" in done.stderr and "radius_um" in done.stderr
+
+
+def test_validate_schema_doctor_cite():
+    """The small commands work on a fresh installation."""
+    for name in ("sphere_a", "sphere_b", "step", "trench", "pyramid", "measured_sphere_a"):
+        done = helio("validate", ROOT / "scenes" / f"{name}.toml")
+        assert done.returncode == 0, done.stderr
+    assert "properties" in json.loads(helio("schema").stdout)
+    doctor = helio("doctor", "--json")
+    assert doctor.returncode == 0 and json.loads(doctor.stdout)["ok"]
+    assert "arXiv" in helio("cite").stdout
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_interrupt_ends_with_130(small_scene, tmp_path):
+    """Ctrl-C: exit code 130, no half-written file."""
+    command = [sys.executable, "-m", "helio_jax", "simulate", str(small_scene), "-o", str(tmp_path / "s.h5")]
+    process = subprocess.Popen([*command, "--rays", "200000"], stderr=subprocess.PIPE, text=True)
+    time.sleep(8)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_imports_measured_files(shared, tmp_path):
+    """B-SHeM, A-SHeM and the reference simulator's files end as HDF5 that info reads."""
+    scenes = ROOT / "scenes"
+    cases = {
+        "sc100351.mat": "measured_sphere_a.toml",
+        "scan003259.mat": "instruments/ashem_normal.toml",
+        "sphere_a_simulated.mat": "sphere_a.toml",
+    }
+    for name, instrument in cases.items():
+        out = tmp_path / f"{name}.h5"
+        done = helio("import", shared / "data" / name, "-o", out, "--instrument", scenes / instrument)
+        assert done.returncode == 0, done.stderr
+        assert helio("info", out, "--json").returncode == 0
+
+
+def test_help_is_fast():
+    """`helio --help` stays light: three times the 0.3 s aim, so that a busy machine does not fail it."""
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        assert helio("--help").returncode == 0
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.9
