@@ -143,6 +143,10 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
 def _load_in_child(path: str | os.PathLike, places: tuple[str, ...], max_bytes: int) -> dict[str, Any]:
     """Check the file's size, then have a child process read it."""
     safe.check_size(path, max_bytes)
+    with Path(path).open("rb") as file:
+        head = file.read(8)
+    if head != b"\x89HDF\r\n\x1a\n":
+        raise InputFileError(f"{path} is not an HDF5 file: its first bytes are {head!r}")
     memory = 2 * max_bytes + safe.GIB
     return safe.call_in_child(
         "helio_jax.formats.hdf5:load_fields", path, places, max_bytes, memory_bytes=memory, seconds=300

@@ -48,6 +48,7 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
         InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument does not fit.
     """
     safe.check_size(path, MAX_FILE_BYTES)
+    _check_header(Path(path))
     digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     tree = safe.call_in_child("helio_jax.formats.matlab:load_tree", path, memory_bytes=3 * safe.GIB, seconds=120)
     kind = _find_kind(str(path), tree)
@@ -66,18 +67,18 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
         raise InputFileError(f"{path}: {e}") from None
 
 
-def load_tree(path: Path) -> dict[str, Any]:
-    """Parse a level 5 MATLAB file and drop what is large and no image; runs in a child process.
-
-    Raises:
-        InputFileError: not a level 5 MATLAB file.
-    """
+def _check_header(path: Path) -> None:
+    """Check that a file says it is a level 5 MATLAB file."""
     with path.open("rb") as file:
-        head = file.read(128)
+        head = file.read(19)
     if head.startswith(b"MATLAB 7.3"):
         raise InputFileError(f"{path} is a MATLAB 7.3 (HDF5) file: save it again with save(..., '-v7')")
-    if not head.startswith(b"MATLAB 5.0 MAT-file"):
-        raise InputFileError(f"{path} is not a MATLAB file (level 5): its header starts with {head[:19]!r}")
+    if head != b"MATLAB 5.0 MAT-file":
+        raise InputFileError(f"{path} is not a MATLAB file (level 5): its header starts with {head!r}")
+
+
+def load_tree(path: Path) -> dict[str, Any]:
+    """Parse a level 5 MATLAB file and drop what is large and no image; runs in a child process."""
     from pymatreader import read_mat  # here, so that this process alone loads it
 
     tree = read_mat(str(path))

@@ -76,7 +76,8 @@ def integrate_with_jumps(
 
     Returns:
         height [um]; jump_x of the edges (i, j)-(i, j+1) and jump_y of the edges (i, j)-(i+1, j), from 1 = intact to
-        0 = cut; below 1/4 the misfit exceeds `cut` standard deviations.
+        0 = cut; below 1/4 the misfit exceeds `cut` standard deviations of that edge. An edge beside a grazing pixel has
+        a large one: it counts for little in the fit and yet may be marked intact.
     """
     a, b, trust = _prepare(a, b, dx, dy, weights)
     return _call(integrate_cutting_jumps, options, a, b, dx, dy, trust)

@@ -18,6 +18,8 @@ from helio_jax.reconstruct.integrate_poisson import (
     solve_weighted_checked,
 )
 
+MEMBRANE = 1e-9  # weight, where a flat pixel of median confidence has 1, that draws every edge to a slope of zero
+
 
 def _side_weights(slope: EdgesX, normal_z: Image, stiffness: float) -> tuple[EdgesX, EdgesX]:
     """Return, for edges along the last axis, the weight of the edge to its left and to its right pixel.
@@ -34,11 +36,14 @@ def _side_weights(slope: EdgesX, normal_z: Image, stiffness: float) -> tuple[Edg
 def _edges(
     slope: EdgesX, pixel_slope: Image, normal_z: Image, pixel_weight: Image, stiffness: float
 ) -> tuple[EdgesX, EdgesX]:
-    """Return the wanted slope and the weight of the edges along the last axis: both pixels' terms in one."""
+    """Return the wanted slope and the weight of the edges along the last axis: both pixels' terms in one.
+
+    A weak membrane (a wanted slope of zero) holds the edges that neither pixel trusts.
+    """
     left, right = _side_weights(slope, normal_z, stiffness)
     strength = pixel_weight * normal_z**2
     left, right = left * strength[:, :-1], right * strength[:, 1:]
-    total = left + right
+    total = left + right + MEMBRANE
     return (left * pixel_slope[:, :-1] + right * pixel_slope[:, 1:]) / total, total
 
 
@@ -89,8 +94,7 @@ def integrate_bilateral(
     for _ in range(n_rounds):
         wanted_x, weight_x = _edges(slope_x, a, normal_z, relative, stiffness)
         wanted_y, weight_y = (e.T for e in _edges(slope_y.T, b.T, normal_z.T, relative.T, stiffness))
-        floor = 1e-8 * max(weight_x.max(), weight_y.max())
-        problem = EdgeProblem(wanted_x, wanted_y, np.maximum(weight_x, floor), np.maximum(weight_y, floor), dx, dy)
+        problem = EdgeProblem(wanted_x, wanted_y, weight_x, weight_y, dx, dy)
         height, _ = solve_weighted(problem, height, 10 * tolerance, 40)
         slope_x, slope_y = differentiate(height, dx, dy)
         old, objective = objective, _objective(problem, slope_x, slope_y)

@@ -15,10 +15,8 @@ from helio_jax.reconstruct.integrate_poisson import (
     EdgesY,
     Image,
     differentiate,
-    differentiate_adjoint,
     integrate_poisson,
     mean_to_edges,
-    solve_poisson,
     solve_weighted,
     solve_weighted_checked,
 )
@@ -104,14 +102,6 @@ def _misfits(height: Image, slopes: Edges, sigma: Edges, dx: float, dy: float) -
     return (slope_x - slopes[0]) / sigma[0], (slope_y - slopes[1]) / sigma[1]
 
 
-def _start(slopes: Edges, sigma: Edges, dx: float, dy: float) -> Image:
-    """Return the plain Poisson height, or a flat one if that fits better, as it does beside slopes of 1e8."""
-    plain = solve_poisson(differentiate_adjoint(*slopes, dx, dy), dx, dy)
-    flat = np.zeros_like(plain)
-    sum_sq = [sum(float(np.sum(r**2)) for r in _misfits(h, slopes, sigma, dx, dy)) for h in (plain, flat)]
-    return plain if sum_sq[0] <= sum_sq[1] else flat
-
-
 def integrate_weighted(
     a: Image,
     b: Image,
@@ -143,25 +133,24 @@ def integrate_cutting_jumps(
     cut: float = 3.0,
     min_noise: float = 0.05,
     tolerance: float = 1e-4,
-    max_steps: int = 1000,
+    max_steps: int = 2000,
 ) -> tuple[Image, EdgesX, EdgesY]:
     """Return the height and the edges that stayed intact, by a robust fit of the edge slopes.
 
     Minimises sum_e rho(r_e), r = (D h - s) / sigma, with Geman and McClure's rho = r^2 c^2 / (r^2 + c^2), by
     reweighting; c falls by halves from the largest misfit of the fit without cuts to `cut` (graduated
-    non-convexity), and stays there for three more rounds. sigma is `edge_noise` of the noise that
-    `estimate_slope_noise` finds.
-    Valid where each region is tied to the rest through intact edges.
+    non-convexity) and stays there for three more rounds. sigma: `edge_noise`, of `estimate_slope_noise`'s noise.
+    Valid where each region is tied to the rest through intact edges, and the slopes on the two sides of a jump differ,
+    as at a shadow edge, above which the surface grazes the beam. A step between two planes of equal slope leaves a
+    trace only where its height changes along it, and is smeared in part.
 
     Args:
         a, b: slopes dh/dX, dh/dY [1], finite.
         dx, dy: pitches [um].
         weights: pixel confidences >= 0, proportional to the inverse variance of the slopes.
         cut: misfit, in standard deviations of an edge, at which its weight has fallen to a quarter; > 0.
-        min_noise: least noise of one pixel's slope [1]. Noise-free slopes would otherwise make every error of the
-            trapezoid rule a jump; slopes from micrographs are no better than this near edges.
-        tolerance: relative residual of the last solve.
-        max_steps: conjugate-gradient steps of the last solve at most.
+        min_noise: least noise of one pixel's slope [1]; with less, errors of the trapezoid rule become jumps.
+        tolerance, max_steps: relative residual and largest number of steps of the last solve.
 
     Returns:
         height [um], mean zero; and jump_x, jump_y in (0, 1]: 1 intact, 0 cut, 1/4 at a misfit of `cut`.
@@ -180,14 +169,14 @@ def integrate_cutting_jumps(
     slopes = mean_to_edges(a, b)
     sigma = _doubt_guesses(edge_noise(a, b, *edge_confidence(weights), noise), slopes, weights)
     jump = np.ones_like(sigma[0]), np.ones_like(sigma[1])
-    height = _start(slopes, sigma, dx, dy)
-    height, _ = solve_weighted(_problem(slopes, sigma, jump, dx, dy), height, COARSE[0], COARSE[1])
+    start = integrate_poisson(a, b, dx, dy)
+    height, _ = solve_weighted(_problem(slopes, sigma, jump, dx, dy), start, COARSE[0], COARSE[1])
     largest = max(float(np.abs(r).max()) for r in _misfits(height, slopes, sigma, dx, dy))
     n_halvings = int(np.ceil(np.log2(max(largest / cut, 1.0))))
     scales = [cut * 2.0**k for k in range(n_halvings, 0, -1)] + [cut] * 4
     for i, scale in enumerate(scales):
-        jump_x, jump_y = ((1 + (r / scale) ** 2) ** -2 for r in _misfits(height, slopes, sigma, dx, dy))
-        jump = jump_x, jump_y
+        misfit_x, misfit_y = _misfits(height, slopes, sigma, dx, dy)
+        jump = (1 + (misfit_x / scale) ** 2) ** -2, (1 + (misfit_y / scale) ** 2) ** -2
         problem = _problem(slopes, sigma, jump, dx, dy)
         if i < len(scales) - 1:
             height, _ = solve_weighted(problem, height, COARSE[0], COARSE[1])

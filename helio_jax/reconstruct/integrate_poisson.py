@@ -117,7 +117,7 @@ def solve_weighted(problem: EdgeProblem, start: Image, tolerance: float, max_ste
 
     Args:
         problem: weights > 0 (a floor of 1e-6 of the largest is enough to hold every region).
-        start: first height [um].
+        start: first height [um]; a flat one is taken if it has the smaller residual, as beside slopes of 1e8.
         tolerance: stop when the residual, in the norm of the preconditioner, is this part of that of a zero height.
         max_steps: at most this many steps.
 
@@ -129,11 +129,12 @@ def solve_weighted(problem: EdgeProblem, start: Image, tolerance: float, max_ste
     """
     dx, dy = problem.dx, problem.dy
     height = start - start.mean()
-    source = problem.residual(np.zeros_like(start))
-    limit = tolerance**2 * _dot(source, solve_poisson(source, dx, dy))
-    rest = problem.residual(height)
-    step = preconditioned = solve_poisson(rest, dx, dy)
-    size = _dot(rest, preconditioned)
+    source, rest = problem.residual(np.zeros_like(start)), problem.residual(height)
+    zero_step, step = solve_poisson(source, dx, dy), solve_poisson(rest, dx, dy)
+    zero_size, size = _dot(source, zero_step), _dot(rest, step)
+    limit = tolerance**2 * zero_size
+    if size > zero_size:
+        height, rest, step, size = np.zeros_like(start), source, zero_step, zero_size
     for _ in range(max_steps):
         if size <= limit:
             return height, True

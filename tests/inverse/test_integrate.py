@@ -3,8 +3,6 @@
 Helper `sphere` is a closed form in the beam frame (arrays.py): pixel (X, Y) sees the first hit (X - h tan t, Y, h).
 """
 
-import time
-
 import numpy as np
 import pytest
 
@@ -192,7 +190,7 @@ def test_dirichlet_border_is_zero_and_the_inside_exact():
     np.testing.assert_allclose(height, h, atol=1e-10 * h.max())
 
 
-@pytest.mark.parametrize("options", [{"variant": "tikhonov", "strength": 60.0}, {"variant": "spectral"}])
+@pytest.mark.parametrize("options", [{"variant": "tikhonov", "strength": 15.0}, {"variant": "spectral"}])
 def test_regularised_variants_filter_noise(options):
     """On noisy slopes both beat the plain solution: catches a regularisation that is not applied."""
     x, y = axes(60, 60, 10.0, 10.0)
@@ -299,19 +297,24 @@ def test_kink_variance():
     assert sigma_x[0, 0] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-5)
 
 
-def test_straight_step_is_cut_exactly():
-    """A step of 200 um that ends inside the raster, all slopes zero on both sides but the true ramp of its height
-    along y: h = min(max(y, 0), 300) for x > 0. Catches cuts in the wrong place and jump maps that are shifted."""
-    x, y = axes(60, 80, 10.0, 10.0)
-    ramp = np.clip(y, 0, 300.0)
-    h = np.where(x > 0, ramp, 0.0)
-    b = np.where((x > 0) & (y > 0) & (y < 300), 1.0, 0.0)
-    height, jump_x, jump_y = integrate_with_jumps(np.zeros(x.shape), b, 10.0, 10.0)
-    assert jump_x.shape == (80, 59) and jump_y.shape == (79, 60)
-    is_cut = jump_x < 0.25
-    assert is_cut[y[:, 0] > 20, 29].all(), "the step's edges must be cut"
-    assert not is_cut[:, :29].any() and not is_cut[:, 30:].any() and jump_y.min() > 0.25
-    np.testing.assert_allclose(centred(height), centred(h), atol=1.0)
+@pytest.mark.parametrize("centre", [A, B], ids=["A", "B"])
+def test_cuts_lie_on_the_jump(centre):
+    """Edges whose true drop exceeds the slopes' by 6 sigma are cut (95 %), those within 1 sigma are not (99 %): catches
+    jump maps that are shifted by a pixel, exchanged, or inverted."""
+    *_, h, a, b, _ = sphere(centre, FINE)
+    _, *jumps = integrate_with_jumps(a, b, *FINE[2:])
+    assert [jump.shape for jump in jumps] == [(351, 303), (350, 304)]
+    sigmas = integrate_jumps.edge_noise(a, b, np.ones((351, 303)), np.ones((350, 304)), 0.05)
+    slopes, means = integrate_poisson.differentiate(h, *FINE[2:]), integrate_poisson.mean_to_edges(a, b)
+    for jump, slope, mean, sigma in zip(jumps, slopes, means, sigmas, strict=True):
+        misfit = np.abs(slope - mean) / sigma
+        n_jumps = np.sum(misfit > 6)
+        print(
+            f"cut: {np.mean(jump[misfit > 6] < 0.25):.3f} of {n_jumps}, of the rest {np.mean(jump[misfit < 1] < 0.25)}"
+        )
+        assert n_jumps > 40
+        assert np.mean(jump[misfit > 6] < 0.25) > 0.95
+        assert np.mean(jump[misfit < 1] < 0.25) < 0.01
 
 
 def smooth_surfaces():
@@ -328,17 +331,21 @@ def smooth_surfaces():
 
 @pytest.mark.parametrize(("name", "h", "a", "b"), list(smooth_surfaces()))
 def test_smooth_surfaces_are_not_cut(name, h, a, b):
-    """Without jumps the robust fit is the plain one: no false cut; noise-free within the scheme's error, and with
-    slope noise 0.05 within 1.3 times the plain error. Catches a noise scale that is too small."""
+    """Without jumps the robust fit is the plain one: no cut and no more than the plain fit's error on exact slopes;
+    with slope noise 0.05 cuts at the rate of 3-sigma noise (0.3 %) and at most 1.25 times the plain error (a robust
+    fit pays a little for Gaussian noise). Catches a noise scale that is too small."""
     plain = integrate_slopes(a, b, 12.0, 15.0, method="dct_poisson")
     height, jump_x, jump_y = integrate_with_jumps(a, b, 12.0, 15.0)
-    assert min(jump_x.min(), jump_y.min()) > 0.9
-    assert np.abs(height - plain).max() < 1e-3 * np.ptp(h)
+    assert min(jump_x.min(), jump_y.min()) > 0.98
+    worst = np.abs(plain - centred(h)).max()
+    assert worst < 0.005 * np.ptp(h), "the surface must be smooth on this raster"
+    assert np.abs(height - centred(h)).max() < 1.01 * worst
+    assert np.abs(height - plain).max() < worst
     noise = np.random.default_rng(12).normal(0, 0.05, (2, *a.shape))
     plain = integrate_slopes(a + noise[0], b + noise[1], 12.0, 15.0, method="dct_poisson")
     height, jump_x, jump_y = integrate_with_jumps(a + noise[0], b + noise[1], 12.0, 15.0)
-    assert np.mean(jump_x < 0.25) < 1e-3 and np.mean(jump_y < 0.25) < 1e-3
-    assert np.std(height - centred(h)) < 1.3 * np.std(plain - centred(h))
+    assert np.mean(jump_x < 0.25) < 5e-3 and np.mean(jump_y < 0.25) < 5e-3
+    assert np.std(height - centred(h)) < 1.25 * np.std(plain - centred(h))
 
 
 @pytest.mark.parametrize(("centre", "wanted"), [(A, 0.885), (B, 0.717)])
@@ -356,23 +363,35 @@ def test_sphere_height_with_jumps_cut(centre, raster, noise):
     """Apex within 2 % and RMS error within 3 % of H: catches jumps that are smeared, or a wrong chord being cut."""
     x, y, h, a, b, r = sphere(centre, raster)
     a, b = np.stack([a, b]) + noise * np.random.default_rng(13).normal(size=(2, *a.shape))
-    start = time.perf_counter()
     apex, rms = score(integrate_slopes(a, b, *raster[2:]), x, y, h, r)
-    print(f"apex {100 * apex:.1f} % rms {100 * rms:.2f} % {time.perf_counter() - start:.2f} s")
+    print(f"apex {100 * apex:.1f} % rms {100 * rms:.2f} %")
     assert abs(apex - 1) < 0.02 and rms < 0.03
 
 
-@pytest.mark.parametrize("weight", [0.0, 1e-3])
-@pytest.mark.parametrize("centre", [A, B], ids=["A", "B"])
-def test_sphere_with_garbage_in_a_masked_ring(centre, weight):
-    """Half a ring of masked pixels at the foot with slopes of 5 noise, low weight: apex within 3 %, RMS 4 %. Catches
-    garbage that is integrated, and its edges being taken for the jump."""
-    x, y, h, a, b, r = sphere(centre, COARSE)
+@pytest.mark.parametrize("weight", [0.0, 1e-4])
+@pytest.mark.parametrize(("centre", "raster"), [(A, COARSE), (B, FINE)], ids=["A-coarse", "B-fine"])
+def test_sphere_with_garbage_in_a_masked_ring(centre, raster, weight):
+    """Half a ring of masked pixels at the foot with slopes of 5 noise (100 times that assumed elsewhere, so weight
+    1e-4, or 0): apex within 2 %, RMS 4 %. Catches garbage that is integrated, and unknown slopes that are believed."""
+    x, y, h, a, b, r = sphere(centre, raster)
     is_masked = (np.abs(r - 1010) < 60) & (y > 0)
     a[is_masked], b[is_masked] = 5 * np.random.default_rng(14).normal(size=(2, int(is_masked.sum())))
-    apex, rms = score(integrate_slopes(a, b, *COARSE[2:], weights=np.where(is_masked, weight, 1.0)), x, y, h, r)
+    apex, rms = score(integrate_slopes(a, b, *raster[2:], weights=np.where(is_masked, weight, 1.0)), x, y, h, r)
     print(f"apex {100 * apex:.1f} % rms {100 * rms:.2f} %")
-    assert abs(apex - 1) < 0.03 and rms < 0.04
+    assert abs(apex - 1) < 0.02 and rms < 0.04
+
+
+@pytest.mark.parametrize("name", ["weighted", "bilateral"])
+def test_one_grazing_pixel_does_no_harm(name):
+    """A slope of 1e9 at one pixel of a plane leaves the rest within 0.1 um: catches a floor on the weights that
+    makes a believed slope of it, and unknown neighbours that copy it."""
+    x, y = axes(40, 30, 10.0, 10.0)
+    a, b = np.full(x.shape, 0.3), np.full(x.shape, -0.2)
+    a[15, 20] = 1e9
+    weights = np.ones(x.shape)
+    weights[14:17, 21:23] = 0
+    error = integrate_slopes(a, b, 10.0, 10.0, weights=weights, method=name) - (0.3 * x - 0.2 * y)
+    assert np.ptp(np.delete(error, 20, axis=1)) < 0.1
 
 
 @pytest.mark.parametrize("centre", [A, B], ids=["A", "B"])
