@@ -229,7 +229,7 @@ def _with_child_function(monkeypatch, body: str) -> str:
     ("body", "match"),
     [
         ("lambda p: ctypes.string_at(0)", "killed by signal 11"),
-        ("lambda p: bytearray(1 << 40)", "needs more than 1024 MiB"),
+        ("lambda p: bytearray(3 << 30)", "needs more than 1024 MiB"),
         ("lambda p: [0 for _ in iter(int, 1)]", "killed by signal|MiB"),
         ("lambda p: sys.exit(3)", "code 3"),
         ("lambda p: 1 / 0", "ZeroDivisionError"),
