@@ -3,7 +3,7 @@
 A point of height h seen at beam position (X, Y) lies at (X - h tx, Y - h ty, h), with (tx, ty) = tan t (cos phi,
 sin phi). Its tangents along X and Y give the normal n ~ (-a, -b, 1 - a tx - b ty) for the slopes a = dh/dX, b =
 dh/dY: linear in the slopes, valid wherever the beam sees the surface (n . u < 0). Works on NumPy and JAX arrays.
-Source: DESIGN.md section 1; own derivation, tests/physics/test_beamframe.py.
+Source: DESIGN.md section 1; own derivation, tests/unit/test_conventions.py.
 """
 
 from typing import Any

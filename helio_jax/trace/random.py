@@ -2,7 +2,7 @@
 
 Every random number is a pure function of (seed, pixel, ray, event), so a result does not depend on how
 the work is divided among threads or machines. Philox 4x64-10: Salmon et al., "Parallel random numbers: as easy
-as 1, 2, 3", SC11; tested word for word against NumPy's own Philox (tests/unit/test_random.py).
+as 1, 2, 3", SC11; tested word for word against NumPy's own Philox (tests/physics/test_tracer.py).
 """
 
 import numpy as np

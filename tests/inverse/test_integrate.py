@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.reconstruct import integrate_jumps, integrate_poisson, integrate_sylvester
+from helio_jax.reconstruct import integrate_bilateral, integrate_jumps, integrate_poisson, integrate_sylvester
 from helio_jax.reconstruct.integrate import integrate_slopes, integrate_with_jumps
 
 INTEGRATORS = {
@@ -401,3 +401,11 @@ def test_bilateral_finds_the_apex(centre):
     apex, rms = score(integrate_slopes(a, b, *COARSE[2:], method="bilateral"), x, y, h, r)
     print(f"apex {100 * apex:.1f} % rms {100 * rms:.2f} %")
     assert abs(apex - 1) < 0.02 and rms < 0.08
+
+
+def test_edge_that_no_side_trusts_stays_finite():
+    """Between two pixels that both trust their other side w underflows to 0: catches 0 / 0 beside steps of slope 40."""
+    slope, ones = np.array([[0.0, 1e3, 0.0]]), np.ones((1, 4))
+    wanted, weight = integrate_bilateral._edges(slope, 0.3 * ones, ones, ones, 2.0)
+    np.testing.assert_allclose(wanted, [[0.3, 0.0, 0.3]], atol=1e-8)
+    assert 0 < weight[0, 1] < 1e-6 < weight[0, 0]
