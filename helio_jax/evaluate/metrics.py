@@ -297,7 +297,7 @@ def evaluate_height(rec: Reconstruction, truth: Truth) -> Scores:
         InputFileError: the truth has another raster.
         GuardError: no common pixel, no flat, nothing in the region, or a truth without any height range.
 
-    Source: S. Lambrick, A. Radic, C. Zhao, arXiv 2501.14833 (RMS and shape error, with the square its formula lacks).
+    Source: A. Radić et al., arXiv 2501.14833 (RMS and shape error, with the square its formula lacks).
     """
     error, level = height_error(rec, truth)
     is_scored = np.isfinite(error)

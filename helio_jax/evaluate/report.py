@@ -23,7 +23,7 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 CITATION = (
-    "S. Lambrick, A. Radic, C. Zhao et al., Heliometric stereo: a new frontier in surface profilometry, "
+    "A. Radić, S. Lambrick, C. Zhao et al., Heliometric stereo: a new frontier in surface profilometry, "
     "arXiv:2501.14833 (the method).",
     "helio_jax, version as given under provenance (this software).",
 )

@@ -1,7 +1,7 @@
 """The linear photometric solution: albedo and normal of every pixel from three or more images.
 
-I_k = rho n . Phi_k per pixel, weighted least squares (Woodham, Opt. Eng. 19 (1980) 139; for helium: Lambrick,
-Radic, Zhao, arXiv 2501.14833). `Phi` may be constant (the paper's far-field method) or a function of the
+I_k = rho n . Phi_k per pixel, weighted least squares (Woodham, Opt. Eng. 19 (1980) 139; for helium: Radić et
+al., arXiv 2501.14833). `Phi` may be constant (the paper's far-field method) or a function of the
 pixel's current height (near field). Knows no shadows, masks or multiple scattering; NumPy only.
 """
 

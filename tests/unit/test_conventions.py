@@ -399,3 +399,12 @@ def test_beam_pitch_is_stretched_along_the_beam():
         x, y = raster.positions(Beam(incidence_deg=30.0, azimuth_deg=azimuth))
         assert (step(x), step(y)) == pytest.approx(expected, abs=1e-3)
         assert x.size == 4 and y.size == 3 and x.mean() == pytest.approx(0.0) and y[1] == 0.0
+
+
+def test_ellipse_turns_counter_clockwise():
+    """The long axis of an ellipse turned by +30 deg points to +x, +y seen from above; catches the opposite sense."""
+    plate = Plate(working_distance_um=4000.0)
+    detector = Detector(name="d", center_um=(0.0, 0.0), axes_um=(2000.0, 500.0), rotation_deg=30.0)
+    rim = Instrument(plate=plate, detector=(detector,)).apertures()[0].rim(64)[0]
+    tip = rim[np.argmax(rim[:, 0])]
+    assert tip[0] > 800.0 and tip[1] > 400.0
