@@ -118,7 +118,7 @@ def simulate(
     changes = _given(rays=rays, seed=seed, workers=workers, estimator=estimator)
     with _Bar("tracing") as bar:
         stack = pipeline.simulate(loaded, progress=bar, **changes)
-    stack = pipeline.with_provenance(pipeline.record(loaded, stack) if noise else stack, scene)
+    stack = pipeline.with_provenance(pipeline.record(loaded, stack) if noise else stack, loaded, scene)
     write(stack, output)
     print(f"{output}: {stack.shape[0]} micrographs of {stack.shape[2]} x {stack.shape[1]} pixels ({stack.noise})")
 

@@ -52,3 +52,11 @@ def check_axis(name: str, values: np.ndarray, error: type[HelioError]) -> None:
 def pitch(axis: np.ndarray) -> float:
     """Return the step of a regular axis [um]; 1 um for a single position."""
     return float((axis[-1] - axis[0]) / (axis.size - 1)) if axis.size > 1 else 1.0
+
+
+def border_mask(shape: tuple[int, int], fraction: float) -> np.ndarray:
+    """Return True in the frame along the image's border whose width is `fraction` of each side [y, x]."""
+    ny, nx = (max(1, round(fraction * n)) for n in shape)
+    frame = np.ones(shape, bool)
+    frame[ny:-ny, nx:-nx] = False
+    return frame

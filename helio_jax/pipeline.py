@@ -256,14 +256,14 @@ class RunResult:
         }
 
 
-def with_provenance(stack: MicrographStack, scene_path: str | Path) -> MicrographStack:
+def with_provenance(stack: MicrographStack, scene: SceneFile, scene_path: str | Path) -> MicrographStack:
     """Return the stack with what is needed to make it again: scene text, versions, commit, command line, time."""
     path = Path(scene_path)
     names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
     about = {
         "scene_file": path.name,
         "scene_text": path.read_text(encoding="utf-8"),
-        "scene": resolved(load_scene(path)),
+        "scene": resolved(scene),
         "versions": {name: package_version(name) for name in names},
         "git": git_commit(),
         "machine": {"processor": platform.machine(), "system": platform.system(), "cpus": os.cpu_count()},
@@ -322,7 +322,7 @@ def run(
     }
     files = {label: out / name for label, name in names.items()}
     with stage("simulating micrographs") as progress:
-        stack = with_provenance(record(scene, simulate(scene, progress=progress)), scene_path)
+        stack = with_provenance(record(scene, simulate(scene, progress=progress)), scene, scene_path)
     write(stack, files["micrographs"])
     with stage("reconstructing heights") as progress:
         rec = reconstruct(stack, settings=scene.reconstruct, report=progress)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array, pitch
+from helio_jax.arrays import as_float_array, border_mask, pitch
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.reconstruction import Reconstruction
 
@@ -181,18 +181,10 @@ def axis_distance(rec: Reconstruction, true_height: np.ndarray, center: tuple[fl
     return np.hypot(x - center[0], y - center[1])
 
 
-def _border(shape: tuple[int, int]) -> np.ndarray:
-    """Return True on a frame of `BORDER_FRACTION` of each side, at least one pixel [y, x]."""
-    is_inner = np.zeros(shape, bool)
-    rows, columns = (max(1, round(BORDER_FRACTION * n)) for n in shape)
-    is_inner[rows:-rows, columns:-columns] = True
-    return ~is_inner
-
-
 def flat_mask(rec: Reconstruction, truth: Truth) -> np.ndarray:
     """Return True where the level is taken: the substrate beyond the region, or the raster's border [y, x]."""
     if truth.region is None:
-        return _border(rec.height.shape)  # type: ignore[arg-type]
+        return border_mask(rec.height.shape, BORDER_FRACTION)  # type: ignore[arg-type]
     return axis_distance(rec, truth.height, truth.region.center) > truth.region.substrate_radius
 
 

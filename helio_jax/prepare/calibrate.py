@@ -10,6 +10,7 @@ unknowns of the fit, with wide priors. Needs a flat border and a spot that is ma
 import numpy as np
 from pydantic import Field
 
+from helio_jax.arrays import border_mask
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.settings import Settings
@@ -26,13 +27,6 @@ class CalibrateSettings(Settings):
     """Quantile of each image that is taken as a wholly masked spot."""
     masked_share: float = Field(default=0.27, ge=0.0, lt=0.9)
     """Multiple scattering in such a spot, as a share of the flat's signal (0.27 in the simulated sphere A)."""
-
-
-def _flat_frame(shape: tuple[int, int], fraction: float) -> np.ndarray:
-    ny, nx = (max(1, round(fraction * n)) for n in shape)
-    frame = np.ones(shape, bool)
-    frame[ny:-ny, nx:-nx] = False
-    return frame
 
 
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
@@ -65,7 +59,7 @@ def calibrate_on_border(
         GuardError: a detector's border is not brighter than its background, so that it has no signal.
     """
     is_row_slow = stack.fast_axis == "x"
-    frame = _flat_frame(stack.shape[1:], settings.border_fraction)
+    frame = border_mask(stack.shape[1:], settings.border_fraction)
     steady = np.where(stack.is_observed, stack.counts, np.nan)
     for k, image in enumerate(steady):
         if is_row_slow:

@@ -29,11 +29,3 @@ def slopes_of_normal(normal: np.ndarray, shift: tuple[float, float]) -> tuple[np
     is_facing = facing > MIN_FACING
     c = np.maximum(facing, MIN_FACING)
     return -normal[..., 0] / c, -normal[..., 1] / c, is_facing
-
-
-def border_mask(shape: tuple[int, int], fraction: float) -> np.ndarray:
-    """Return True in the frame along the image's border whose width is `fraction` of each side [y, x]."""
-    ny, nx = (max(1, round(fraction * n)) for n in shape)
-    frame = np.ones(shape, bool)
-    frame[ny:-ny, nx:-nx] = False
-    return frame

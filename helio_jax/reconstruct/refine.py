@@ -20,7 +20,8 @@ import optimistix as optx
 from jax.scipy.fft import idctn
 from scipy.fft import dctn
 
-from helio_jax.reconstruct.beamframe import border_mask, normal_of_slopes
+from helio_jax.arrays import border_mask
+from helio_jax.reconstruct.beamframe import normal_of_slopes
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.render import Quads, quads_of_corners, render_single
 from helio_jax.reconstruct.settings import ReconstructSettings

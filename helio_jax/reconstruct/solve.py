@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import border_mask, pitch
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.beamframe import border_mask, slopes_of_normal
+from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
