@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.ndimage import gaussian_filter
 
 from helio_jax.arrays import pitch
 from helio_jax.config import SceneFile, load_scene, resolved
@@ -37,15 +36,19 @@ from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres, flat_body, surface_body
-from helio_jax.trace.intersect import MISS, Intersector
+from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.masks import hidden_form_factor
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
 from helio_jax.trace.settings import TraceSettings
 
 SUBSTRATE_RATIO = 1.35
 """Where a scene does not say: the substrate begins at this many radii of the scored region."""
-SMOOTH_PIXELS = 1.5
-"""Gaussian width over which the traced multiple scattering is averaged before it is subtracted [pixels]."""
+SMOOTH_PIXELS = 1.0
+"""Gaussian width over which the traced multiple scattering is averaged [pixels] ..."""
+SMOOTH_BEND = 0.2
+"""... and the difference of unit normals at which a neighbour counts less."""
+MAX_BURIED = 0.05
+"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface its view of the apertures is taken [pixels]."""
 
@@ -80,37 +83,67 @@ def record(scene: SceneFile, stack: MicrographStack) -> MicrographStack:
 
 
 def make_predictor(
-    stack: MicrographStack, n_rays: int, seed: int = 7, workers: int | None = None
+    stack: MicrographStack,
+    n_rays: int,
+    substrate_um: float | None = None,
+    seed: int = 7,
+    workers: int | None = None,
 ) -> Callable[[np.ndarray, np.ndarray], Prediction]:
     """Return a function that traces what a surface does beyond direct single scattering.
 
-    The surface is continued by a flat at z = 0 for one image size beyond each border. Seeds are fixed, so that
+    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border. Seeds are fixed, so that
     successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
     grid_x, grid_y = np.meshgrid(stack.x, stack.y)
     offset = np.stack(instrument.sample_origin(grid_x.ravel(), grid_y.ravel())[:2], -1)
     size = max(np.ptp(stack.x), np.ptp(stack.y))
-    reach = max(np.abs(stack.x).max(), np.abs(stack.y).max()) + size
+    border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
+    reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
     lift = LIFT_PIXELS * min(pitch(stack.x), pitch(stack.y))
-    settings = TraceSettings(rays=max(8, n_rays // grid_x.size), branches=8, n_orders=2, seed=seed, workers=workers)
+    branches = max(1, round(n_rays / grid_x.size / 8))
+    settings = TraceSettings(rays=8, branches=branches, n_orders=2, seed=seed, workers=workers)
 
     def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
         x, y = instrument.surface_position(grid_x, grid_y, height)
         body = surface_body(x, y, height, reach, level=0.0, beam_shift=instrument.beam_shift)
         experiment = make_experiment(body, instrument, settings)
-        tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers)
-        multiple = tally.probability()[0][1].reshape(-1, *height.shape)
         normal = normals.reshape(-1, 3)
         point = np.stack([x, y, height], -1).reshape(-1, 3) + lift * normal
+        first = Hits.on_mesh(point, normal)
+        tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers, first=first, max_lost=MAX_BURIED)
+        multiple = tally.probability()[0][1].reshape(-1, *height.shape)
         triangle = np.zeros(len(point), np.int32)
         hidden, _ = hidden_form_factor(experiment.intersector, instrument, point, normal, triangle, offset)
         return Prediction(
-            multiple=gaussian_filter(multiple, (0, SMOOTH_PIXELS, SMOOTH_PIXELS), mode="nearest"),
+            multiple=smooth_along_surface(multiple, normals),
             hidden=np.moveaxis(hidden.reshape(-1, *height.shape, 3), -1, 1),
         )
 
     return predict
+
+
+def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return images [detector, y, x] averaged over neighbours whose unit normals [y, x, 3] are alike.
+
+    A joint bilateral filter: traced noise is averaged, the bend at a sphere's rim stays sharp. Source: Petschnigg
+    et al., ACM Trans. Graph. 23 (2004) 664, eq. 3.
+    """
+    reach = int(np.ceil(2.5 * SMOOTH_PIXELS))
+    margin = ((reach, reach), (reach, reach), (0, 0))
+    both = np.concatenate([np.moveaxis(images, 0, -1), normals], -1)
+    around = np.pad(both, margin, mode="edge")
+    ny, nx = images.shape[1:]
+    total, weights = np.zeros((ny, nx, len(images))), np.zeros((ny, nx))
+    for i in range(2 * reach + 1):
+        for j in range(2 * reach + 1):
+            near = around[i : i + ny, j : j + nx]
+            distance = ((i - reach) ** 2 + (j - reach) ** 2) / SMOOTH_PIXELS**2
+            bend = ((near[..., -3:] - normals) ** 2).sum(-1) / SMOOTH_BEND**2
+            weight = np.exp(-0.5 * (distance + bend))
+            total += weight[..., None] * near[..., :-3]
+            weights += weight
+    return np.moveaxis(total / weights[..., None], -1, 0)
 
 
 def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None) -> MicrographStack:
@@ -145,8 +178,8 @@ def reconstruct(
         one = calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
-    predict = make_predictor(one, chosen.refine.rays) if chosen.method == "refine" else None
-    return reconstruct_stack(one, chosen, predict, report)
+    refine = chosen.refine
+    return reconstruct_stack(one, chosen, lambda level: make_predictor(level, refine.rays, refine.substrate_um), report)
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:

@@ -73,6 +73,13 @@ class SpotGeometry:
     def __init__(self, instrument: Instrument, n_rim: int = N_RIM) -> None:
         self.instrument = instrument
         self.rims = rim_table(instrument, n_rim)
+        self._key = (instrument.model_dump_json(), n_rim)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SpotGeometry) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
     def position(self, height: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return lab x, y and the depth below the plate [um]."""

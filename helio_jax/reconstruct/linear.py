@@ -10,11 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 
 MIN_IMAGES = 3
 """Images needed per pixel: three unknowns (albedo times normal)."""
 _ROBUST_ROUNDS = 5
 _DARK_LIMIT = 3.0
+_SLOPE_STD = 4.0
+"""Prior deviation of a beam-frame slope where the albedo is known."""
+_NEWTON_STEPS = 8
 
 
 @dataclass(frozen=True)
@@ -97,3 +101,47 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     top = np.quantile(confidence[ok], 0.9) if ok.any() else 1.0
     slope_weight = np.where(ok, np.clip(confidence / (top or 1.0), 0.05, 1.0), 0.0)
     return PhotometricSolution(normals, np.where(ok, rho, np.nan), slope_weight, n_images, residuals)
+
+
+def solve_known_albedo(
+    signal: np.ndarray, variance: np.ndarray, phi: np.ndarray, start: np.ndarray, shift: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve for the two beam-frame slopes of every pixel where the albedo is known to be 1.
+
+    Two unknowns instead of three: pixels that are masked in one of three detectors stay determined. Damped
+    Gauss-Newton on (a, b) with a weak prior N(0, `_SLOPE_STD`^2), which holds what no datum fixes.
+
+    Args:
+        signal, variance: single-scattering data [detector, y, x], NaN where not observed.
+        phi: visible form factors [detector, 3, y, x].
+        start: unit normals [y, x, 3].
+        shift: `Instrument.beam_shift`.
+
+    Returns:
+        Slopes dh/dX, dh/dY [2, y, x], and their posterior covariances [y, x, 2, 2].
+
+    Source: own derivation; the same equations as Woodham (1980) with rho given.
+    """
+    observed = np.isfinite(signal)
+    data, weight = np.where(observed, signal, 0.0), np.where(observed, 1.0 / np.sqrt(variance), 0.0)
+    a, b, _ = slopes_of_normal(start, shift)
+    slopes = np.clip(np.stack([a, b], -1), -_SLOPE_STD, _SLOPE_STD)
+    prior = np.eye(2) / _SLOPE_STD**2
+    tangents = np.array([[-1.0, 0.0, -shift[0]], [0.0, -1.0, -shift[1]]])
+    for _ in range(_NEWTON_STEPS):
+        normal = np.stack(normal_of_slopes(slopes[..., 0], slopes[..., 1], shift))
+        length = np.sqrt((normal**2).sum(0))
+        unit = normal / length
+        model = np.einsum("kiyx,iyx->kyx", phi, unit)
+        along = np.einsum("kiyx,si->skyx", phi, tangents)
+        turn = np.einsum("iyx,si->syx", unit, tangents)
+        jacobian = (along - model * turn[:, None]) / length * weight
+        misfit = (data - model) * weight
+        information = np.einsum("skyx,tkyx->yxst", jacobian, jacobian) + prior
+        right = np.einsum("skyx,kyx->yxs", jacobian, misfit) - slopes / _SLOPE_STD**2
+        step = np.linalg.solve(information, right[..., None])[..., 0]
+        limit = 0.5 * np.sqrt(1.0 + (slopes**2).sum(-1, keepdims=True))
+        slopes = slopes + step * np.minimum(
+            1.0, limit / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-12)
+        )
+    return np.moveaxis(slopes, -1, 0), np.linalg.inv(information)

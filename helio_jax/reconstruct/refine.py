@@ -1,10 +1,12 @@
 """Fit the heights themselves to the micrographs through the render model (the only door to optimistix).
 
-Outer loop: predict multiple scattering and hidden aperture parts on the current surface (a callable that the
-pipeline supplies, so this stage knows no tracer), update the robust weights, then a few Levenberg-Marquardt steps
-on corner heights, gain, offset and a smooth albedo. The heights are whitened by the cosine transform,
-z = DCT^-1(y / sqrt(lambda)): the data fix slopes, so in y the Hessian is near the identity and plain
-conjugate gradients converge in a few steps. Masked and multiply scattered counts are lagged constants.
+Unknowns: height and two slopes of every pixel, gain and offset of every detector, a smooth albedo. Outer loop:
+predict multiple scattering and hidden aperture parts on the current surface (a callable that the pipeline supplies,
+so this stage knows no tracer), decide which edges are smooth, kinked or cut (`edges`), renew the robust weights, then
+a few Levenberg-Marquardt steps. All of that is lagged: constant during a step.
+
+The unknowns are whitened so that plain conjugate gradients converge in a few steps: heights by the cosine transform,
+h = DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as deviations from the heights' one-sided differences.
 """
 
 from collections.abc import Callable
@@ -19,11 +21,12 @@ import numpy as np
 import optimistix as optx
 from jax.scipy.fft import idctn
 from scipy.fft import dctn
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
-from helio_jax.reconstruct.beamframe import normal_of_slopes
+from helio_jax.reconstruct.edges import Edges, along, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.render import Quads, quads_of_corners, render_single
+from helio_jax.reconstruct.render import render_single, unit_normal
 from helio_jax.reconstruct.settings import ReconstructSettings
 
 
@@ -39,39 +42,92 @@ class Prediction:
     multiple: np.ndarray
     hidden: np.ndarray
 
+    def about(self, normals: np.ndarray) -> "Prediction":
+        """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
 
-_FIRST_STEP_SIZE = 1e4
-"""Inverse of the first Levenberg-Marquardt damping, in whitened variables."""
+        A facet whose normal has the vertical part n_z sees the ground around it with the view factor (1 - n_z) / 2, so
+        what the ground sends it changes by -M / (1 - n_z) per unit of n_z. This goes where `hidden` goes and changes
+        nothing at the facet's own normal: it only makes the rounds converge faster beside steep walls, where slope and
+        multiple scattering depend on one another. Level facets get no correction. Source: own derivation.
+        """
+        up = normals[..., 2]
+        slope = np.where(up < _LEVEL, self.multiple / np.maximum(1.0 - up, 1.0 - _LEVEL), 0.0)
+        hidden = self.hidden.copy()
+        hidden[:, 2] += slope
+        return Prediction(self.multiple + slope * up, hidden)
 
+    def doubt(self, normals: np.ndarray, mask_error: float, multiple_error: float) -> np.ndarray:
+        """Return the standard deviation to be expected of it [detector, y, x], for unit normals [y, x, 3].
+
+        Two parts of each term: a share of its own size, and its change over half a pixel, for the surface that
+        it was made for is only known from pixel to pixel.
+        """
+        hidden = np.einsum("kiyx,yxi->kyx", self.hidden, normals)
+        parts = [
+            share * image + 1j * 0.5 * _largest_change(image)
+            for image, share in ((hidden, mask_error), (self.multiple, multiple_error))
+        ]
+        return np.hypot(*map(np.abs, parts))
+
+
+def _largest_change(image: np.ndarray) -> np.ndarray:
+    """Return the largest difference of every pixel [detector, y, x] from its neighbours in the row and the column."""
+    high, low = (f(image, size=(1, 3, 3)) for f in (maximum_filter, minimum_filter))
+    return np.maximum(high - image, image - low)
+
+
+class Surface(NamedTuple):
+    """Heights [um] and beam-frame slopes dh/dX, dh/dY at the beam positions [y, x]."""
+
+    height: Any
+    slope_x: Any
+    slope_y: Any
+
+    def normals(self, shift: tuple[float, float]) -> np.ndarray:
+        """Return the unit normals [y, x, 3]."""
+        return np.moveaxis(np.asarray(unit_normal(self.slope_x, self.slope_y, shift)), 0, -1)
+
+
+_FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
+"""Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
+_LEVEL = 0.9
+"""Facets whose unit normal has a larger vertical part count as level."""
 _EDGE_BENDS = 4.0
-"""Changes of slope above this many prior deviations are edges: their smoothness weight falls off."""
-_MAX_STEEPNESS = 20.0
-"""Largest 1 + slope^2 by which the smoothness prior is relaxed."""
+"""Bends of the normal above this many prior deviations are edges: their smoothness weight falls off."""
 
 Predict = Callable[[np.ndarray, np.ndarray], Prediction]
-"""(pixel heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
 
 
-class _Lagged(NamedTuple):
+class Lagged(NamedTuple):
     """Everything the residuals hold fixed during one least-squares solve."""
 
     data: jax.Array
     inverse_sigma: jax.Array
     multiple: jax.Array
     hidden: jax.Array
-    smooth_x: jax.Array
-    smooth_y: jax.Array
+    intact_x: jax.Array
+    intact_y: jax.Array
+    edge_x: jax.Array
+    edge_y: jax.Array
+    bend_x: jax.Array
+    bend_y: jax.Array
     border: jax.Array
     whitening: jax.Array
-    prior: jax.Array
+    slope_scale_x: jax.Array
+    slope_scale_y: jax.Array
+    gain_std: jax.Array
+    offset_std: jax.Array
 
 
-class _Unknowns(NamedTuple):
-    """Unknowns of the fit: whitened corner heights, gain and offset in prior deviations, albedo modes."""
+class Unknowns(NamedTuple):
+    """Whitened heights and slopes [y, x]; gain and offset in prior deviations [detector]; albedo modes."""
 
-    heights: jax.Array
+    height: jax.Array
+    slope_x: jax.Array
+    slope_y: jax.Array
     log_gain: jax.Array
     offset: jax.Array
     albedo: jax.Array
@@ -85,34 +141,55 @@ class _TruncatedCG(lx.CG):
         return solution, lx.RESULTS.successful, stats
 
 
+class _NearlyNewton(optx.ClassicalTrustRegion):
+    """Trust region that starts with little damping: the start is good, and damping would freeze weak modes."""
+
+    def init(self, y, f_info_struct):
+        state = super().init(y, f_info_struct)
+        return eqx.tree_at(lambda s: s.step_size, state, jnp.asarray(_FIRST_STEP_SIZE))
+
+
 @dataclass(frozen=True)
 class Fit:
-    """Result of the fit; arrays as in `Reconstruction`, plus the history of the outer rounds."""
+    """Result of the fit; arrays as in `Reconstruction`.
 
-    corners: np.ndarray
-    height: np.ndarray
+    Attributes:
+        surface: heights and slopes.
+        normals: unit normals [y, x, 3].
+        albedo: relative reflectivity [y, x].
+        gain, offset: per detector, data = gain * model + offset.
+        residuals: (model - data) / standard deviation [detector, y, x].
+        weight: what robust weighting left of each datum [detector, y, x].
+        intact: what is left of the weakest edge of each pixel [y, x]; 0 at a jump.
+        changes: root mean square height change of every round [um].
+        contraction: ratio of the last two changes, or None.
+        status: a sentence: how the fit ended.
+        is_converged: whether it reached its tolerance.
+        is_interrupted: whether it was stopped from the keyboard.
+    """
+
+    surface: Surface
     normals: np.ndarray
     albedo: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
     residuals: np.ndarray
     weight: np.ndarray
+    intact: np.ndarray
     changes: tuple[float, ...]
+    contraction: float | None
     status: str
     is_converged: bool
+    is_interrupted: bool = False
 
 
 def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float) -> np.ndarray:
-    """Return the deviation of each cosine mode of the corner heights that a slope noise per pixel leaves, um."""
+    """Return the deviation of each cosine mode of the heights that a slope noise per pixel leaves, um."""
     ky = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[0]) / shape[0]) / dy
     kx = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[1]) / shape[1]) / dx
     eigenvalue = ky[:, None] ** 2 + kx[None, :] ** 2
     eigenvalue[0, 0] = eigenvalue.ravel()[1:].min()
     return slope_noise / np.sqrt(eigenvalue)
-
-
-def _heights(unknowns: _Unknowns, lagged: _Lagged) -> jax.Array:
-    return idctn(unknowns.heights * lagged.whitening, norm="ortho")
 
 
 def _albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
@@ -126,147 +203,182 @@ def _albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
     return jnp.exp(idctn(spectrum, norm="ortho"))
 
 
-class _Model(eqx.Module):
+class Model(eqx.Module):
     """Static part of the residual function."""
 
     geometry: SpotGeometry = eqx.field(static=True)
     dx: float = eqx.field(static=True)
     dy: float = eqx.field(static=True)
-    gain_std: float = eqx.field(static=True)
-    offset_std: float = eqx.field(static=True)
     albedo_std: float = eqx.field(static=True)
 
-    def counts(self, unknowns: _Unknowns, lagged: _Lagged) -> jax.Array:
+    def surface(self, unknowns: Unknowns, lagged: Lagged) -> Surface:
+        """Return heights and slopes of whitened unknowns."""
+        height = idctn(unknowns.height * lagged.whitening, norm="ortho")
+        base_x = one_sided(jnp.diff(height, axis=1) / self.dx, lagged.intact_x, 1)
+        base_y = one_sided(jnp.diff(height, axis=0) / self.dy, lagged.intact_y, 0)
+        return Surface(
+            height,
+            base_x + lagged.slope_scale_x * unknowns.slope_x,
+            base_y + lagged.slope_scale_y * unknowns.slope_y,
+        )
+
+    def counts(self, unknowns: Unknowns, lagged: Lagged, height: jax.Array, normal: jax.Array) -> jax.Array:
         """Return the expected data [detector, y, x] in units of the beam."""
-        corners = _heights(unknowns, lagged)
-        single = render_single(corners, lagged.hidden, self.geometry, self.dx, self.dy)
-        albedo = _albedo(unknowns.albedo, single.shape[1:], self.albedo_std)
-        gain = jnp.exp(self.gain_std * unknowns.log_gain)[:, None, None]
-        offset = (self.offset_std * lagged.prior * unknowns.offset)[:, None, None]
+        single = render_single(height, normal, lagged.hidden, self.geometry)
+        albedo = _albedo(unknowns.albedo, height.shape, self.albedo_std)
+        gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
+        offset = (lagged.offset_std * unknowns.offset)[:, None, None]
         return gain * (albedo * single + lagged.multiple) + offset
 
-    def residuals(self, unknowns: _Unknowns, lagged: _Lagged) -> dict[str, jax.Array]:
+    def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:
         """Return all residuals in standard deviations."""
-        corners = _heights(unknowns, lagged)
+        surface = self.surface(unknowns, lagged)
+        normal = unit_normal(surface.slope_x, surface.slope_y, self.geometry.instrument.beam_shift)
         return {
-            "data": (self.counts(unknowns, lagged) - lagged.data) * lagged.inverse_sigma,
-            "smooth_x": jnp.diff(corners, n=2, axis=1) * lagged.smooth_x,
-            "smooth_y": jnp.diff(corners, n=2, axis=0) * lagged.smooth_y,
-            "border": corners * lagged.border,
+            "data": (self.counts(unknowns, lagged, surface.height, normal) - lagged.data) * lagged.inverse_sigma,
+            "edge_x": (jnp.diff(surface.height, axis=1) / self.dx - 0.5 * sum(along(surface.slope_x, 1)))
+            * lagged.edge_x,
+            "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
+            * lagged.edge_y,
+            "bend_x": jnp.diff(normal, n=2, axis=2) * lagged.bend_x,
+            "bend_y": jnp.diff(normal, n=2, axis=1) * lagged.bend_y,
+            "border": surface.height * lagged.border,
             "gain": unknowns.log_gain,
             "offset": unknowns.offset,
             "albedo": unknowns.albedo,
         }
 
 
-class _NearlyNewton(optx.ClassicalTrustRegion):
-    """Trust region that starts with little damping: the start is good, and damping would freeze weak modes."""
+class Solution(NamedTuple):
+    """One solve: unknowns, surface, expected data, steps taken, and the cost of every kind of residual."""
 
-    def init(self, y, f_info_struct):
-        state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.asarray(_FIRST_STEP_SIZE))
+    unknowns: Unknowns
+    surface: Surface
+    counts: jax.Array
+    n_steps: jax.Array
+    cost: dict[str, jax.Array]
 
 
 @eqx.filter_jit
-def _solve(model: _Model, start: _Unknowns, lagged: _Lagged, max_steps: int, cg_steps: int):
+def _solve(model: Model, start: Unknowns, lagged: Lagged, max_steps: int, cg_steps: int) -> Solution:
     solver = optx.LevenbergMarquardt(
         rtol=1e-4, atol=1e-6, linear_solver=lx.Normal(_TruncatedCG(rtol=1e-2, atol=1e-12, max_steps=cg_steps))
     )
-    solver = eqx.tree_at(lambda s: s.search, solver, _NearlyNewton(), is_leaf=lambda n: n is solver.search)
-    solution = optx.least_squares(
+    solver = eqx.tree_at(
+        lambda s: s.search, solver, _NearlyNewton(low_constant=_SHRINK), is_leaf=lambda n: n is solver.search
+    )
+    found = optx.least_squares(
         lambda u, args: model.residuals(u, args), solver, start, args=lagged, max_steps=max_steps, throw=False
     )
-    return solution.value, model.counts(solution.value, lagged), solution.stats["num_steps"]
+    surface = model.surface(found.value, lagged)
+    normal = unit_normal(surface.slope_x, surface.slope_y, model.geometry.instrument.beam_shift)
+    counts = model.counts(found.value, lagged, surface.height, normal)
+    cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(found.value, lagged).items()}
+    return Solution(found.value, surface, counts, found.stats["num_steps"], cost)
 
 
-def _curvature_weight(corners: np.ndarray, axis: int, pitch: float, scale: np.ndarray) -> np.ndarray:
-    """Return edge-preserving weights of the second differences: Geman-McClure, deviation `scale` per pixel."""
-    bend = np.diff(corners, n=2, axis=axis) / pitch
-    middle = (slice(None), slice(1, -1)) if axis == 1 else (slice(1, -1), slice(None))
-    local = scale[middle]
-    return 1.0 / (pitch * local) / (1.0 + (bend / (_EDGE_BENDS * local)) ** 2)
+class Refiner:
+    """State of one fit: the data, the current surface and instrument, and the lagged quantities."""
 
-
-def _bend_scale(quads: Quads, scale: float) -> np.ndarray:
-    """Return the prior deviation of slope changes at every corner, for equal changes of the surface's angle.
-
-    A change of angle d theta changes a slope by (1 + slope^2) d theta: steep parts may bend more, as do round ones.
-    """
-    steepness = 1.0 + np.asarray(quads.slope_x) ** 2 + np.asarray(quads.slope_y) ** 2
-    padded = np.pad(np.minimum(steepness, _MAX_STEEPNESS), 1, mode="edge")
-    return scale * 0.25 * (padded[1:, 1:] + padded[:-1, 1:] + padded[1:, :-1] + padded[:-1, :-1])
-
-
-def _robust_inverse_sigma(residual: np.ndarray, sigma: np.ndarray, limit: float) -> np.ndarray:
-    """Return Geman-McClure weighted 1 / sigma for standardised residuals (0 where nothing was observed)."""
-    return np.where(
-        np.isfinite(sigma), 1.0 / (1.0 + (residual / limit) ** 2) / np.where(np.isfinite(sigma), sigma, 1), 0.0
-    )
-
-
-class _Refiner:
-    """State of one fit: the data, the current unknowns, and the lagged quantities."""
-
-    def __init__(self, signal, variance, geometry, dx, dy, corners, settings: ReconstructSettings) -> None:
+    def __init__(self, signal, variance, geometry, dx, dy, start: Surface, settings: ReconstructSettings) -> None:
         s = settings.refine
         self.signal, self.variance, self.settings = signal, variance, s
-        self.model = _Model(geometry, dx, dy, s.gain_std, s.offset_std, s.albedo_std)
-        self.dx, self.dy = dx, dy
-        observed = np.isfinite(signal)
-        self.observed = observed
+        self.model = Model(geometry, dx, dy, s.albedo_std)
+        self.shift = geometry.instrument.beam_shift
+        self.observed = np.isfinite(signal)
         self.mean_signal = np.array(
-            [np.median(s[o]) if o.any() else 1.0 for s, o in zip(signal, observed, strict=True)]
+            [np.median(d[o]) if o.any() else 1.0 for d, o in zip(signal, self.observed, strict=True)]
         )
         relative = np.sqrt(np.nanmedian(variance / self.mean_signal[:, None, None] ** 2))
         self.slope_noise = float(np.clip(relative, 1e-3, 1.0))
-        self.whitening = _whitening(corners.shape, dx, dy, self.slope_noise)
-        self.border = _border_weight(corners.shape, settings)
+        shape = start.height.shape
+        self.whitening = _whitening(shape, dx, dy, self.slope_noise)
+        self.border = _border_weight(shape, settings)
+        self.surface = Surface(*map(np.asarray, start))
         k, n = signal.shape[0], s.albedo_modes
-        self.unknowns = _Unknowns(
-            jnp.asarray(_forward_whitened(corners, self.whitening)), jnp.zeros(k), jnp.zeros(k), jnp.zeros((n, n))
-        )
+        self.log_gain, self.offset, self.albedo = np.zeros(k), np.zeros(k), np.zeros((n, n))
         self.residuals = np.zeros(signal.shape)
+        self.weight = np.ones(signal.shape)
+        self.intact = np.ones(shape)
 
-    def lag(self, prediction: Prediction, limit: float) -> _Lagged:
-        """Freeze prediction, robust weights and edge weights at the current surface."""
-        s = self.settings
-        corners = self.corners()
-        quads = quads_of_corners(corners, self.dx, self.dy)
-        normal = _unit_normals(quads, self.model.geometry.instrument.beam_shift)
-        hidden_signal = np.einsum("kiyx,yxi->kyx", prediction.hidden, normal)
-        sigma = np.sqrt(
-            self.variance + (s.mask_error * hidden_signal) ** 2 + (s.multiple_error * prediction.multiple) ** 2
+    def lag(
+        self, prediction: Prediction, limit: float, cut: float, is_instrument_free: bool = True
+    ) -> tuple[Unknowns, Lagged]:
+        """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
+        s, m = self.settings, self.model
+        height, slope_x, slope_y = self.surface
+        normal = np.moveaxis(self.surface.normals(self.shift), -1, 0)
+        doubt = prediction.doubt(self.predicted_normals, s.mask_error, s.multiple_error)
+        sigma = np.sqrt(self.variance + doubt**2)
+        self.sigma = np.where(self.observed, sigma, np.inf)
+        self.weight = geman_mcclure(self.residuals, limit)
+        prediction = prediction.about(self.predicted_normals)
+        edges_x = find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut)
+        edges_y = find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut)
+        self.intact = np.minimum(_weakest(edges_x.intact, 1), _weakest(edges_y.intact, 0))
+        scale_x, scale_y = (self._slope_scale(e, axis) for e, axis in ((edges_x, 1), (edges_y, 0)))
+        base_x = one_sided(np.diff(height, axis=1) / m.dx, edges_x.intact, 1)
+        base_y = one_sided(np.diff(height, axis=0) / m.dy, edges_y.intact, 0)
+        unknowns = Unknowns(
+            dctn(height, norm="ortho") / self.whitening,
+            (slope_x - base_x) / scale_x,
+            (slope_y - base_y) / scale_y,
+            self.log_gain,
+            self.offset,
+            self.albedo,
         )
-        sigma = np.where(self.observed, sigma, np.nan)
-        self.sigma = sigma
-        scale = _bend_scale(quads, s.smoothness * self.slope_noise)
-        return _Lagged(
-            data=jnp.asarray(np.where(self.observed, self.signal, 0.0)),
-            inverse_sigma=jnp.asarray(_robust_inverse_sigma(self.residuals, sigma, limit)),
-            multiple=jnp.asarray(prediction.multiple),
-            hidden=jnp.asarray(prediction.hidden),
-            smooth_x=jnp.asarray(_curvature_weight(corners, 1, self.dx, scale)),
-            smooth_y=jnp.asarray(_curvature_weight(corners, 0, self.dy, scale)),
-            border=jnp.asarray(self.border),
-            whitening=jnp.asarray(self.whitening),
-            prior=jnp.asarray(self.mean_signal),
+        lagged = Lagged(
+            data=np.where(self.observed, self.signal, 0.0),
+            inverse_sigma=self.weight / self.sigma,
+            multiple=prediction.multiple,
+            hidden=prediction.hidden,
+            intact_x=edges_x.intact,
+            intact_y=edges_y.intact,
+            edge_x=edges_x.weight,
+            edge_y=edges_y.weight,
+            bend_x=self._bend_weight(normal, 2),
+            bend_y=self._bend_weight(normal, 1),
+            border=self.border,
+            whitening=self.whitening,
+            slope_scale_x=scale_x,
+            slope_scale_y=scale_y,
+            gain_std=s.gain_std * np.full(len(self.signal), float(is_instrument_free)),
+            offset_std=s.offset_std * self.mean_signal * float(is_instrument_free),
         )
+        return Unknowns(*map(jnp.asarray, unknowns)), Lagged(*map(jnp.asarray, lagged))
 
-    def corners(self) -> np.ndarray:
-        """Return the current corner heights [y + 1, x + 1], um."""
-        return np.asarray(idctn(self.unknowns.heights * self.whitening, norm="ortho"))
+    def _bend_weight(self, normal: np.ndarray, axis: int) -> np.ndarray:
+        """Return edge-preserving weights of the second differences of the unit normals [3, y, x] along an axis."""
+        std = self.settings.smoothness * self.slope_noise
+        bend = np.linalg.norm(np.diff(normal, n=2, axis=axis), axis=0)
+        return geman_mcclure(bend, _EDGE_BENDS * std) / std
 
-    def step(self, lagged: _Lagged) -> None:
-        """Solve one weighted least-squares problem from the current unknowns."""
+    def _slope_scale(self, edges: Edges, axis: int) -> np.ndarray:
+        """Return how far a slope may move from its one-sided difference: what edges and datum leave of it."""
+        steepness = 1.0 + self.surface.slope_x**2 + self.surface.slope_y**2
+        return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / (self.slope_noise * steepness) ** 2)
+
+    def step(self, prediction: Prediction, limit: float, cut: float, is_instrument_free: bool) -> Solution:
+        """Solve one weighted least-squares problem from the current surface."""
         s = self.settings
-        self.unknowns, counts, _ = _solve(self.model, self.unknowns, lagged, s.lm_steps, s.cg_steps)
-        difference = np.asarray(counts) - np.asarray(lagged.data)
-        self.residuals = np.where(self.observed, difference / np.where(self.observed, self.sigma, 1.0), 0.0)
-        self.weight = np.asarray(lagged.inverse_sigma) * np.where(self.observed, self.sigma, 0.0)
+        found = _solve(self.model, *self.lag(prediction, limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
+        self.surface = Surface(*map(np.asarray, found.surface))
+        self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
+        self.albedo = np.asarray(found.unknowns.albedo)
+        difference = np.asarray(found.counts) - np.where(self.observed, self.signal, 0.0)
+        self.residuals = difference / self.sigma
+        return found
+
+
+def _weakest(edge: np.ndarray, axis: int) -> np.ndarray:
+    """Return the smaller value of every pixel's two edges along an axis [y, x]."""
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    return np.minimum(*along(np.pad(edge, pad, constant_values=1.0), axis))
 
 
 def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
-    """Return the prior weight of each corner height: the outermost ring is flat, or just the mean height is held."""
+    """Return the prior weight of each height: the outermost ring is flat, or just the mean height is held."""
     weight = np.zeros(shape)
     if settings.border == "flat":
         weight[border_mask(shape, 1.0 / max(shape))] = 1.0 / settings.border_std_um
@@ -275,85 +387,88 @@ def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.
     return weight
 
 
-def _forward_whitened(corners: np.ndarray, whitening: np.ndarray) -> np.ndarray:
-    return dctn(corners, norm="ortho") / whitening
-
-
-def _unit_normals(quads: Any, shift: tuple[float, float]) -> np.ndarray:
-    normal = np.stack([np.asarray(c) for c in normal_of_slopes(quads.slope_x, quads.slope_y, shift)], -1)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-
-
 def fit_heights(
     signal: np.ndarray,
     variance: np.ndarray,
     geometry: SpotGeometry,
     dx: float,
     dy: float,
-    corners: np.ndarray,
+    start: Surface,
     settings: ReconstructSettings,
     predict: Predict,
     report: Report | None = None,
 ) -> Fit:
-    """Fit corner heights, gains, offsets and a smooth albedo to the micrographs.
+    """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
+
+    Interrupted from the keyboard after the first round, it returns the best so far.
 
     Args:
         signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
         geometry: near-field geometry of the scan.
         dx, dy: raster pitch, um.
-        corners: start [y + 1, x + 1], um.
+        start: heights and slopes, e.g. of the photometric solution.
         settings: priors, steps, rounds.
         predict: multiple scattering and hidden form factor on a surface.
         report: called before each outer round.
 
     Source: own derivation; Levenberg-Marquardt of optimistix; lagged robust weights (Geman and McClure, 1987).
     """
+    s = settings.refine
     with jax.enable_x64(True):
-        refiner = _Refiner(signal, variance, geometry, dx, dy, corners, settings)
-        shift = geometry.instrument.beam_shift
+        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings)
         changes: list[float] = []
-        rounds = settings.refine.max_rounds
-        for number in range(rounds):
-            before = Quads(*map(np.asarray, quads_of_corners(refiner.corners(), dx, dy)))
+        is_interrupted = False
+        said = "start"
+        for number in range(s.max_rounds):
             if report:
-                last = f"height change {changes[-1]:.2f} um" if changes else "start"
-                report(number, rounds, last)
-            prediction = predict(before.height, _unit_normals(before, shift))
-            all_limits = settings.refine.robust_limits
-            limits = all_limits if number == 0 else all_limits[-1:] * 2
-            for limit in limits:
-                refiner.step(refiner.lag(prediction, limit))
-            after = quads_of_corners(refiner.corners(), dx, dy)
-            changes.append(float(np.sqrt(np.mean((after.height - before.height) ** 2))))
-            if changes[-1] < settings.refine.tolerance_um:
+                report(number, s.max_rounds, said)
+            before = refiner.surface
+            try:
+                refiner.predicted_normals = before.normals(refiner.shift)
+                prediction = predict(before.height, refiner.predicted_normals)
+                stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
+                for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
+                    found = refiner.step(prediction, limit, cut, number >= s.fixed_rounds)
+            except KeyboardInterrupt:
+                if not changes:
+                    raise
+                refiner.surface, is_interrupted = before, True
                 break
-        return _finish(refiner, changes, dx, dy)
+            changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
+            cost = float(sum(found.cost.values()))
+            said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
+            if changes[-1] < s.tolerance_um:
+                break
+        return _finish(refiner, changes, is_interrupted)
 
 
-def _finish(refiner: _Refiner, changes: list[float], dx: float, dy: float) -> Fit:
-    s, u = refiner.settings, refiner.unknowns
-    quads = quads_of_corners(refiner.corners(), dx, dy)
-    is_converged = changes[-1] < s.tolerance_um
-    is_diverging = len(changes) > 2 and changes[-1] > 1.5 * changes[-2] > 0
-    if is_converged:
-        status = f"converged: the last round changed the heights by {changes[-1]:.2f} um (limit {s.tolerance_um:g} um)"
-    elif is_diverging:
-        status = f"diverging: height changes per round grew to {changes[-1]:.2f} um; lower mask_error or use nearfield"
+def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool) -> Fit:
+    s, surface = refiner.settings, refiner.surface
+    contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
+    is_converged = changes[-1] < s.tolerance_um and not is_interrupted
+    last = (
+        f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {s.tolerance_um:g} um)"
+    )
+    if is_interrupted:
+        status = f"interrupted: best so far; {last}"
+    elif is_converged:
+        status = f"converged: {last}"
+    elif contraction is not None and contraction > 1.0:
+        status = f"diverging: {last}, {contraction:.2f} times the round before; raise mask_error or use nearfield"
     else:
-        status = (
-            f"stopped after {len(changes)} rounds: the last one changed the heights by {changes[-1]:.2f} um "
-            f"(limit {s.tolerance_um:g} um); raise max_rounds for more"
-        )
+        status = f"stopped: {last}; raise max_rounds for more"
     return Fit(
-        corners=refiner.corners(),
-        height=np.asarray(quads.height),
-        normals=_unit_normals(quads, refiner.model.geometry.instrument.beam_shift),
-        albedo=np.asarray(_albedo(u.albedo, refiner.signal.shape[1:], s.albedo_std)),
-        gain=np.exp(s.gain_std * np.asarray(u.log_gain)),
-        offset=s.offset_std * refiner.mean_signal * np.asarray(u.offset),
+        surface=surface,
+        normals=surface.normals(refiner.shift),
+        albedo=np.asarray(_albedo(jnp.asarray(refiner.albedo), surface.height.shape, s.albedo_std)),
+        gain=np.exp(s.gain_std * refiner.log_gain),
+        offset=s.offset_std * refiner.mean_signal * refiner.offset,
         residuals=refiner.residuals,
         weight=refiner.weight,
+        intact=refiner.intact,
         changes=tuple(changes),
+        contraction=contraction,
         status=status,
         is_converged=is_converged,
+        is_interrupted=is_interrupted,
     )

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from helio_jax.settings import Settings
 
@@ -10,7 +10,7 @@ from helio_jax.settings import Settings
 class RefineSettings(Settings):
     """The fit of the heights: table `[reconstruct.refine]`."""
 
-    max_rounds: int = Field(default=4, ge=1, le=50)
+    max_rounds: int = Field(default=3, ge=1, le=50)
     """How often multiple scattering and masks are predicted anew on the current surface."""
     tolerance_um: float = Field(default=1.0, gt=0.0, le=1e3)
     """The fit has converged when a round changes the heights by less than this (root mean square) [um]."""
@@ -22,20 +22,39 @@ class RefineSettings(Settings):
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
-    smoothness: float = Field(default=0.7, gt=0.0, le=100.0)
-    """Prior deviation of the change of slope from pixel to pixel, in units of the slope noise of one pixel."""
+    smoothness: float = Field(default=0.5, gt=0.0, le=100.0)
+    """Prior deviation of the normals' second difference from pixel to pixel, in units of one pixel's slope noise."""
+    substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
+    """Side of the flat substrate that scatters around the image; default: half an image size beyond each border."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)
     """Relative error assumed of the predicted multiple scattering."""
-    robust_limits: tuple[float, ...] = Field(default=(30.0, 10.0, 8.0), min_length=1, max_length=20)
-    """Residuals [standard deviations] at which a datum's weight falls to a half, one per re-weighting."""
+    robust_limits: tuple[float, ...] = Field(default=(10.0, 10.0, 8.0), min_length=1, max_length=20)
+    """Residuals [standard deviations] at which a datum's weight falls to a half, for each re-weighting of round 1."""
+    jump_limits: tuple[float, ...] = Field(default=(4.0, 3.0, 3.0), min_length=1, max_length=20)
+    """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
+    fixed_rounds: int = Field(default=1, ge=0, le=50)
+    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude."""
+    reweightings: int = Field(default=2, ge=1, le=100)
+    """Re-weightings in every later round, with the last limits."""
+    coarsest_pixels: int = Field(default=100, ge=8, le=10_000)
+    """The start is found on every 2nd, 4th, ... row and column while that leaves this many pixels a side."""
+    photometric_rounds: int = Field(default=3, ge=1, le=20)
+    """Photometric solutions on every level, each corrected by a prediction on the last, before the fit."""
     lm_steps: int = Field(default=4, ge=1, le=1000)
     """Levenberg-Marquardt steps per re-weighting."""
     cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
     rays: int = Field(default=1_500_000, ge=1000, le=10**10)
-    """Beam rays per prediction of the multiple scattering, over the whole image."""
+    """Paths per prediction of the multiple scattering, over the whole image (8 or more per pixel)."""
+
+    @model_validator(mode="after")
+    def _has_matching_stages(self) -> "RefineSettings":
+        n_robust, n_jump = len(self.robust_limits), len(self.jump_limits)
+        if n_robust != n_jump:
+            raise ValueError(f"robust_limits ({n_robust}) and jump_limits ({n_jump}) must be of the same length")
+        return self
 
 
 class ReconstructSettings(Settings):

@@ -5,6 +5,7 @@ the current height. refine: the fit of the heights, started from nearfield. Take
 instrument from the stack, and, if the settings say so, that the border of the image is flat; no truth.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,17 +16,15 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
-from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
+from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruction import REASONS, Reconstruction
 
 if TYPE_CHECKING:
-    from helio_jax.reconstruct.refine import Predict, Report
+    from helio_jax.reconstruct.refine import Predict, Prediction, Report, Surface
 
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked in the validity map."""
-JUMP_PITCHES = 3.0
-"""Height differences between neighbouring pixels above this many pitches are taken as jumps at the start."""
 _FEW, _MASKED, _JUMP = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3]))
 
 
@@ -84,7 +83,7 @@ def _limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
 def reconstruct_stack(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    predict: "Predict | None" = None,
+    make_predict: "Callable[[MicrographStack], Predict] | None" = None,
     report: "Report | None" = None,
 ) -> Reconstruction:
     """Turn three or more micrographs into heights.
@@ -92,7 +91,7 @@ def reconstruct_stack(
     Args:
         stack: images of one scan; background known or zero.
         settings: method and options.
-        predict: for `refine`, what a surface does beyond single scattering (`refine.Predict`).
+        make_predict: for `refine`: from a stack to what a surface on its raster does beyond single scattering.
         report: called before each round of `refine`.
 
     Raises:
@@ -105,30 +104,30 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans into one set"
         )
     geometry = SpotGeometry(stack.instrument)
-    rounds = 1 if settings.method == "linear" else settings.rounds
-    height, solution = solve_nearfield(stack, settings, geometry, rounds)
-    if settings.method != "refine":
-        result = _from_solution(stack, settings, height, solution)
+    if settings.method == "refine":
+        result = _refined(stack, settings, geometry, make_predict, report)
     else:
-        result = _refined(stack, settings, geometry, height, solution, predict, report)
+        rounds = 1 if settings.method == "linear" else settings.rounds
+        result = _from_solution(stack, settings, *solve_nearfield(stack, settings, geometry, rounds))
     if not np.all(np.isfinite(result.height)):
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
     return result
 
 
-def _validity(stack: MicrographStack, solution: PhotometricSolution) -> np.ndarray:
+def _validity(stack: MicrographStack) -> np.ndarray:
     """Return why a pixel is not valid, from the data alone (index into REASONS)."""
     reason = np.zeros(stack.shape[1:], np.uint8)
     signal, _ = signal_of(stack)
     flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
     n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
-    reason[solution.n_images - n_dark < MIN_IMAGES - 1] = _MASKED
-    reason[solution.n_images < MIN_IMAGES] = _FEW
+    n_images = stack.is_observed.sum(0)
+    reason[n_images - n_dark < MIN_IMAGES - 1] = _MASKED
+    reason[n_images < MIN_IMAGES] = _FEW
     return reason
 
 
 def _from_solution(stack, settings, height, solution) -> Reconstruction:
-    reason = _validity(stack, solution)
+    reason = _validity(stack)
     n_few = int(np.sum(reason == _FEW))
     rounds = 1 if settings.method == "linear" else settings.rounds
     return Reconstruction(
@@ -147,32 +146,71 @@ def _from_solution(stack, settings, height, solution) -> Reconstruction:
     )
 
 
-def _refined(stack, settings, geometry, start, solution, predict, report) -> Reconstruction:
-    from helio_jax.reconstruct.refine import fit_heights
-    from helio_jax.reconstruct.render import corners_of_pixels
+def _strides(shape: tuple[int, ...], coarsest: int) -> list[int]:
+    """Return by how much each level thins the raster, coarse to fine: powers of two down to `coarsest` pixels a side."""
+    strides = [1]
+    while min(shape[1:]) // (2 * strides[0]) >= coarsest:
+        strides.insert(0, 2 * strides[0])
+    return strides
 
-    if predict is None:
+
+def _corrected(stack, settings, geometry, height, normals, predict) -> "Surface":
+    """Return heights and slopes of the photometric solution of albedo 1 that a prediction on a surface corrects."""
+    from helio_jax.reconstruct.refine import Surface
+
+    signal, variance = signal_of(stack)
+    shift = stack.instrument.beam_shift
+    prediction = predict(height, normals)
+    doubt = prediction.doubt(normals, settings.refine.mask_error, settings.refine.multiple_error)
+    near = prediction.about(normals)
+    visible = geometry.form_factor(height) - near.hidden
+    (a, b), _ = solve_known_albedo(signal - near.multiple, variance + doubt**2, visible, normals, shift)
+    weight = np.ones(stack.shape[1:])
+    height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), "weighted", weight)
+    return Surface(_limited(_level(height, settings, weight), stack), a, b)
+
+
+def _resampled(surface: "Surface", coarse: MicrographStack, fine: MicrographStack) -> "Surface":
+    """Return a coarse level's surface on the finer raster: each point continues the plane of its nearest neighbour.
+
+    So kinks and jumps stay between two points and are not smeared.
+    """
+    from helio_jax.reconstruct.refine import Surface
+
+    i, j = (np.abs(c[None, :] - f[:, None]).argmin(1) for c, f in ((coarse.y, fine.y), (coarse.x, fine.x)))
+    height, a, b = (field[np.ix_(i, j)] for field in surface)
+    return Surface(height + a * (fine.x - coarse.x[j])[None, :] + b * (fine.y - coarse.y[i])[:, None], a, b)
+
+
+def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
+    from helio_jax.reconstruct.refine import fit_heights
+
+    if make_predict is None:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    dx, dy = pitch(stack.x), pitch(stack.y)
+    shift, last = stack.instrument.beam_shift, None
+    for stride in _strides(stack.shape, settings.refine.coarsest_pixels):
+        level = stack.every(stride)
+        predict = make_predict(level)
+        if last is None:
+            height, solution = solve_nearfield(level, settings, geometry, settings.rounds)
+            height, normals = _limited(height, level), solution.normals
+        else:
+            resampled = _resampled(start, last, level)
+            height, normals = resampled.height, resampled.normals(shift)
+        for _ in range(settings.refine.photometric_rounds):
+            start = _corrected(level, settings, geometry, height, normals, predict)
+            height, normals = start.height, start.normals(shift)
+        last = level
     signal, variance = signal_of(stack)
-    start = _limited(start, stack)
-    fit = fit_heights(
-        signal,
-        variance,
-        geometry,
-        dx,
-        dy,
-        corners_of_pixels(start, JUMP_PITCHES * max(dx, dy)),
-        settings,
-        predict,
-        report,
-    )
-    reason = _validity(stack, solution)
-    reason[(reason == 0) & (fit.weight.min(0) < 0.25)] = _JUMP
+    dx, dy = pitch(stack.x), pitch(stack.y)
+    fit = fit_heights(signal, variance, geometry, dx, dy, start, settings, predict, report)
+    reason = _validity(stack)
+    is_doubted = fit.weight.min(0, where=np.isfinite(signal), initial=1.0) < 0.5
+    reason[(reason == 0) & (is_doubted | (fit.intact < 0.25))] = _JUMP
     return Reconstruction(
-        height=fit.height,
+        height=fit.surface.height,
         raster_x=stack.x,
         raster_y=stack.y,
         instrument=stack.instrument,
@@ -189,5 +227,6 @@ def _refined(stack, settings, geometry, start, solution, predict, report) -> Rec
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),
             "height_changes_um": list(fit.changes),
+            "contraction": fit.contraction,
         },
     )

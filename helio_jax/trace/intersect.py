@@ -39,6 +39,15 @@ class Hits:
     surface: np.ndarray
     is_back: np.ndarray
 
+    def take(self, keep: np.ndarray | slice) -> "Hits":
+        """Return some of the hits."""
+        return Hits(self.point[keep], self.normal[keep], self.surface[keep], self.is_back[keep])
+
+    @classmethod
+    def on_mesh(cls, point: np.ndarray, normal: np.ndarray) -> "Hits":
+        """Return known points [n, 3] of a triangle mesh, with the normals [n, 3] that they scatter by."""
+        return cls(point, normal, np.zeros(len(point), np.int32), np.zeros(len(point), bool))
+
 
 @njit(cache=True, nogil=True)
 def _nearest_sphere(o, d, spheres, skip):

@@ -71,11 +71,15 @@ def trace_pixels(
     y: np.ndarray,
     workers: int | None = None,
     progress: Progress | None = None,
+    first: Hits | None = None,
+    max_lost: float = MAX_LOST,
 ) -> Tally:
     """Trace the pixels at beam positions (x, y) [n], um, in this order.
 
+    With `first` [n] the atoms start from these points of the sample, with these normals, instead of from the beam.
+
     Raises:
-        GuardError: rays are unaccounted for, or more than `MAX_LOST` of them were lost.
+        GuardError: rays are unaccounted for, or a larger share than `max_lost` of them was lost.
     """
     size = max(1, RAYS_PER_BLOCK // (experiment.sampling.n_rays * experiment.sampling.n_branches))
     starts = range(0, len(x), size)
@@ -84,7 +88,7 @@ def trace_pixels(
     def job(start: int) -> Callable[[], Tally]:
         part = slice(start, start + size)
         ids = np.arange(len(x))[part]
-        return lambda: trace_block(experiment, ids, x[part], y[part])
+        return lambda: trace_block(experiment, ids, x[part], y[part], first.take(part) if first else None)
 
     parts = []
     with ThreadPoolExecutor(workers) as pool:
@@ -93,18 +97,18 @@ def trace_pixels(
             if progress:
                 progress(len(parts), len(starts))
     tally = Tally.join(parts)
-    _guard(tally)
+    _guard(tally, max_lost)
     return tally
 
 
-def _guard(tally: Tally) -> None:
+def _guard(tally: Tally, max_lost: float) -> None:
     if tally.n_unaccounted:
         raise GuardError(f"{tally.n_unaccounted} rays are unaccounted for: please report it with the scene")
     launched = tally.n_launched * tally.fates.shape[1]
     lost = int(tally.fates[LOST].sum())
-    if lost > MAX_LOST * launched:
+    if lost > max_lost * launched:
         raise GuardError(
-            f"{lost} of {launched} rays ({lost / launched:.2%}, limit {MAX_LOST:.2%}) met a surface from behind: the "
+            f"{lost} of {launched} rays ({lost / launched:.2%}, limit {max_lost:.2%}) met a surface from behind: the "
             "mesh has holes or inverted normals; repair it (helio validate SCENE shows where)"
         )
 

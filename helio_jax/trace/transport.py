@@ -14,7 +14,7 @@ from numba import njit
 
 from helio_jax.instrument import Instrument
 from helio_jax.trace.direct import ApertureTable, aperture_point, find_aperture, form_factor
-from helio_jax.trace.intersect import Intersector
+from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED, Tally
 
@@ -199,13 +199,16 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, point, normal, surface,
     return _Paths(origin, _bounce(normal, u), pixel, path, u[:, 2:].copy(), skip)
 
 
-def trace_block(experiment: Experiment, pixel_ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Tally:
+def trace_block(
+    experiment: Experiment, pixel_ids: np.ndarray, x: np.ndarray, y: np.ndarray, first: Hits | None = None
+) -> Tally:
     """Trace all rays of some pixels; a pure function of its arguments.
 
     Args:
         experiment: sample, instrument and settings.
         pixel_ids: number of each pixel in the scan, the key of its random numbers [pixels].
         x, y: beam positions [pixels], um.
+        first: where all beam rays of a pixel meet the sample [pixels], where that is known; default: traced.
     """
     e, s, table = experiment, experiment.sampling, experiment.apertures
     tally = Tally.zeros(
@@ -215,7 +218,10 @@ def trace_block(experiment: Experiment, pixel_ids: np.ndarray, x: np.ndarray, y:
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
     paths = _launch_paths(e, ids, x, y)
     for event in range(e.max_events + 1):
-        hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
+        if event == 0 and first is not None:
+            hits = first.take(paths.pixel)
+        else:
+            hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
         keep = _settle(
             event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, hits.point, hits.surface,
             hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin,
