@@ -30,7 +30,7 @@ from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.refine import Prediction
+from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
@@ -91,8 +91,8 @@ def make_predictor(
 ) -> Callable[[np.ndarray, np.ndarray], Prediction]:
     """Return a function that traces what a surface does beyond direct single scattering.
 
-    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border. Seeds are fixed, so that
-    successive predictions differ by the surface, not by noise.
+    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
+    Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
     grid_x, grid_y = np.meshgrid(stack.x, stack.y)

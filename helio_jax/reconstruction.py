@@ -4,7 +4,7 @@ Height [y, x] belongs to beam position (raster_x[j], raster_y[i]); the surface p
 (x[y, x], y[y, x]), which oblique incidence shifts by -h tan t. Overhangs and shadows are jumps. No computation.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,14 @@ from helio_jax.arrays import as_float_array, check_axis
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 
-REASONS = ("valid", "fewer than 3 images", "masked in too many detectors", "depth jump", "outside the data")
+REASONS = (
+    "valid",
+    "fewer than 3 images",
+    "masked in too many detectors",
+    "depth jump",
+    "outside the data",
+    "floating",
+)
 """What the integers of `Reconstruction.reason` mean."""
 
 
@@ -30,6 +37,7 @@ class Reconstruction:
         normals: unit surface normals, up [y, x, 3].
         albedo: relative reflectivity, flat = 1 [y, x].
         height_std: standard deviation of each height [um], or None where the method gives none.
+        height_samples: joint posterior deviations of all heights [sample, y, x], um, or None; see `spread`.
         is_valid: True where the height rests on enough data [y, x].
         reason: index into `REASONS` [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
@@ -48,6 +56,7 @@ class Reconstruction:
     is_valid: np.ndarray
     reason: np.ndarray
     height_std: np.ndarray | None = None
+    height_samples: np.ndarray | None = None
     residuals: np.ndarray | None = None
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
@@ -67,6 +76,7 @@ class Reconstruction:
             "height": shape,
             "albedo": shape,
             "height_std": shape,
+            "height_samples": (None, *shape),
             "normals": (*shape, 3),
             "residuals": (n_detectors, *shape),
             "gain": (n_detectors,),
@@ -82,6 +92,18 @@ class Reconstruction:
             put(name, value.astype(kind))
         if self.reason.max(initial=0) >= len(REASONS):
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
+
+    def spread(self, number: Callable[[np.ndarray], float]) -> tuple[float, float]:
+        """Return a number derived from the heights and its standard deviation; the latter is NaN without samples.
+
+        Args:
+            number: from heights [y, x], um, e.g. the mean of one terrace minus that of another.
+        """
+        value = float(number(self.height))
+        if self.height_samples is None:
+            return value, float("nan")
+        drawn = [float(number(self.height + deviation)) - value for deviation in self.height_samples]
+        return value, float(np.sqrt(np.mean(np.square(drawn))))
 
     @property
     def x(self) -> np.ndarray:

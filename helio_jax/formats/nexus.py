@@ -65,6 +65,7 @@ STACK_FIELDS = (
 RECONSTRUCTION_FIELDS = (
     Field("height", "height/height", "um", "height above the reference plane"),
     Field("height_std", "height/height_errors", "um", "standard deviation of the height"),
+    Field("height_samples", "height_samples", "um", "joint posterior deviations of the heights"),
     Field("raster_x", "height/raster_x", "um", "beam position x on the sample plane"),
     Field("raster_y", "height/raster_y", "um", "beam position y on the sample plane"),
     Field("normals", "normals", "", "unit surface normal (x, y, z), up"),

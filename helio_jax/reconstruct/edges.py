@@ -39,7 +39,7 @@ def to_pixels(edge: Any, axis: int) -> Any:
 
 
 def one_sided(slope: Any, intact: Any, axis: int) -> Any:
-    """Return pixel slopes [y, x] as means of the edges' slopes, weighted by how intact they are: never across a jump."""
+    """Return pixel slopes [y, x]: means of the edges' slopes, weighted by how intact they are, never across a jump."""
     return to_pixels(intact * slope, axis) / (to_pixels(intact, axis) + _NO_EDGE)
 
 

@@ -42,7 +42,7 @@ def form_factor(rims: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -
         fx, fy, fz = carry
         return (fx - depth * ty * w, fy + depth * tx * w, fz + (rx * ty - ry * tx) * w), None
 
-    n = rims.shape[2]
+    n, rims = rims.shape[2], rims.astype(x.dtype)
     zero = jnp.zeros((rims.shape[0], *x.shape), x.dtype)
     per_point = (rims[:, 0, :, 0].T, rims[:, 0, :, 1].T, rims[:, 1, :, 0].T, rims[:, 1, :, 1].T)
     total, _ = jax.lax.scan(of_point, (zero, zero, zero), per_point)

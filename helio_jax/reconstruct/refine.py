@@ -11,7 +11,7 @@ h = DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as deviations from
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,79 +19,17 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jax.scipy.fft import idctn
 from scipy.fft import dctn
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
-from helio_jax.reconstruct.edges import Edges, along, find_edges, geman_mcclure, one_sided, to_pixels
+from helio_jax.reconstruct.edges import Edges, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.render import render_single, unit_normal
+from helio_jax.reconstruct.model import Lagged, Model, Prediction, Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.settings import ReconstructSettings
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What the current surface does beyond direct single scattering, per beam atom.
-
-    Attributes:
-        multiple: detection probability of order 2 and above [detector, y, x].
-        hidden: hidden part of the vector form factor [detector, 3, y, x].
-    """
-
-    multiple: np.ndarray
-    hidden: np.ndarray
-
-    def about(self, normals: np.ndarray) -> "Prediction":
-        """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
-
-        A facet whose normal has the vertical part n_z sees the ground around it with the view factor (1 - n_z) / 2, so
-        what the ground sends it changes by -M / (1 - n_z) per unit of n_z. This goes where `hidden` goes and changes
-        nothing at the facet's own normal: it only makes the rounds converge faster beside steep walls, where slope and
-        multiple scattering depend on one another. Level facets get no correction. Source: own derivation.
-        """
-        up = normals[..., 2]
-        slope = np.where(up < _LEVEL, self.multiple / np.maximum(1.0 - up, 1.0 - _LEVEL), 0.0)
-        hidden = self.hidden.copy()
-        hidden[:, 2] += slope
-        return Prediction(self.multiple + slope * up, hidden)
-
-    def doubt(self, normals: np.ndarray, mask_error: float, multiple_error: float) -> np.ndarray:
-        """Return the standard deviation to be expected of it [detector, y, x], for unit normals [y, x, 3].
-
-        Two parts of each term: a share of its own size, and its change over half a pixel, for the surface that
-        it was made for is only known from pixel to pixel.
-        """
-        hidden = np.einsum("kiyx,yxi->kyx", self.hidden, normals)
-        parts = [
-            share * image + 1j * 0.5 * _largest_change(image)
-            for image, share in ((hidden, mask_error), (self.multiple, multiple_error))
-        ]
-        return np.hypot(*map(np.abs, parts))
-
-
-def _largest_change(image: np.ndarray) -> np.ndarray:
-    """Return the largest difference of every pixel [detector, y, x] from its neighbours in the row and the column."""
-    high, low = (f(image, size=(1, 3, 3)) for f in (maximum_filter, minimum_filter))
-    return np.maximum(high - image, image - low)
-
-
-class Surface(NamedTuple):
-    """Heights [um] and beam-frame slopes dh/dX, dh/dY at the beam positions [y, x]."""
-
-    height: Any
-    slope_x: Any
-    slope_y: Any
-
-    def normals(self, shift: tuple[float, float]) -> np.ndarray:
-        """Return the unit normals [y, x, 3]."""
-        return np.moveaxis(np.asarray(unit_normal(self.slope_x, self.slope_y, shift)), 0, -1)
-
+from helio_jax.reconstruct.uncertainty import MAX_PIXELS, Posterior, linearise, sample_posterior
 
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
-_LEVEL = 0.9
-"""Facets whose unit normal has a larger vertical part count as level."""
 _EDGE_BENDS = 4.0
 """Bends of the normal above this many prior deviations are edges: their smoothness weight falls off."""
 
@@ -99,38 +37,6 @@ Predict = Callable[[np.ndarray, np.ndarray], Prediction]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
-
-
-class Lagged(NamedTuple):
-    """Everything the residuals hold fixed during one least-squares solve."""
-
-    data: jax.Array
-    inverse_sigma: jax.Array
-    multiple: jax.Array
-    hidden: jax.Array
-    intact_x: jax.Array
-    intact_y: jax.Array
-    edge_x: jax.Array
-    edge_y: jax.Array
-    bend_x: jax.Array
-    bend_y: jax.Array
-    border: jax.Array
-    whitening: jax.Array
-    slope_scale_x: jax.Array
-    slope_scale_y: jax.Array
-    gain_std: jax.Array
-    offset_std: jax.Array
-
-
-class Unknowns(NamedTuple):
-    """Whitened heights and slopes [y, x]; gain and offset in prior deviations [detector]; albedo modes."""
-
-    height: jax.Array
-    slope_x: jax.Array
-    slope_y: jax.Array
-    log_gain: jax.Array
-    offset: jax.Array
-    albedo: jax.Array
 
 
 class _TruncatedCG(lx.CG):
@@ -160,7 +66,8 @@ class Fit:
         gain, offset: per detector, data = gain * model + offset.
         residuals: (model - data) / standard deviation [detector, y, x].
         weight: what robust weighting left of each datum [detector, y, x].
-        intact: what is left of the weakest edge of each pixel [y, x]; 0 at a jump.
+        intact_x, intact_y: what is left of the edges between pixels [y, x - 1], [y - 1, x]; 0 at a jump.
+        posterior: error bars, or None where none were asked for.
         changes: root mean square height change of every round [um].
         contraction: ratio of the last two changes, or None.
         status: a sentence: how the fit ended.
@@ -175,7 +82,9 @@ class Fit:
     offset: np.ndarray
     residuals: np.ndarray
     weight: np.ndarray
-    intact: np.ndarray
+    intact_x: np.ndarray
+    intact_y: np.ndarray
+    posterior: Posterior | None
     changes: tuple[float, ...]
     contraction: float | None
     status: str
@@ -190,63 +99,6 @@ def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float)
     eigenvalue = ky[:, None] ** 2 + kx[None, :] ** 2
     eigenvalue[0, 0] = eigenvalue.ravel()[1:].min()
     return slope_noise / np.sqrt(eigenvalue)
-
-
-def _albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
-    """Return the smooth albedo exp(sum of cosine modes); the constant mode is left to the gains."""
-    if std == 0.0:
-        return jnp.ones(shape)
-    n = modes.shape[0]
-    rank = jnp.hypot(*jnp.meshgrid(jnp.arange(n), jnp.arange(n), indexing="ij"))
-    scale = std * jnp.sqrt(shape[0] * shape[1]) / jnp.maximum(rank, 1.0) ** 2
-    spectrum = jnp.zeros(shape).at[:n, :n].set((modes * scale).at[0, 0].set(0.0))
-    return jnp.exp(idctn(spectrum, norm="ortho"))
-
-
-class Model(eqx.Module):
-    """Static part of the residual function."""
-
-    geometry: SpotGeometry = eqx.field(static=True)
-    dx: float = eqx.field(static=True)
-    dy: float = eqx.field(static=True)
-    albedo_std: float = eqx.field(static=True)
-
-    def surface(self, unknowns: Unknowns, lagged: Lagged) -> Surface:
-        """Return heights and slopes of whitened unknowns."""
-        height = idctn(unknowns.height * lagged.whitening, norm="ortho")
-        base_x = one_sided(jnp.diff(height, axis=1) / self.dx, lagged.intact_x, 1)
-        base_y = one_sided(jnp.diff(height, axis=0) / self.dy, lagged.intact_y, 0)
-        return Surface(
-            height,
-            base_x + lagged.slope_scale_x * unknowns.slope_x,
-            base_y + lagged.slope_scale_y * unknowns.slope_y,
-        )
-
-    def counts(self, unknowns: Unknowns, lagged: Lagged, height: jax.Array, normal: jax.Array) -> jax.Array:
-        """Return the expected data [detector, y, x] in units of the beam."""
-        single = render_single(height, normal, lagged.hidden, self.geometry)
-        albedo = _albedo(unknowns.albedo, height.shape, self.albedo_std)
-        gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
-        offset = (lagged.offset_std * unknowns.offset)[:, None, None]
-        return gain * (albedo * single + lagged.multiple) + offset
-
-    def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:
-        """Return all residuals in standard deviations."""
-        surface = self.surface(unknowns, lagged)
-        normal = unit_normal(surface.slope_x, surface.slope_y, self.geometry.instrument.beam_shift)
-        return {
-            "data": (self.counts(unknowns, lagged, surface.height, normal) - lagged.data) * lagged.inverse_sigma,
-            "edge_x": (jnp.diff(surface.height, axis=1) / self.dx - 0.5 * sum(along(surface.slope_x, 1)))
-            * lagged.edge_x,
-            "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
-            * lagged.edge_y,
-            "bend_x": jnp.diff(normal, n=2, axis=2) * lagged.bend_x,
-            "bend_y": jnp.diff(normal, n=2, axis=1) * lagged.bend_y,
-            "border": surface.height * lagged.border,
-            "gain": unknowns.log_gain,
-            "offset": unknowns.offset,
-            "albedo": unknowns.albedo,
-        }
 
 
 class Solution(NamedTuple):
@@ -271,8 +123,7 @@ def _solve(model: Model, start: Unknowns, lagged: Lagged, max_steps: int, cg_ste
         lambda u, args: model.residuals(u, args), solver, start, args=lagged, max_steps=max_steps, throw=False
     )
     surface = model.surface(found.value, lagged)
-    normal = unit_normal(surface.slope_x, surface.slope_y, model.geometry.instrument.beam_shift)
-    counts = model.counts(found.value, lagged, surface.height, normal)
+    counts = model.counts(surface, found.value, lagged)
     cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(found.value, lagged).items()}
     return Solution(found.value, surface, counts, found.stats["num_steps"], cost)
 
@@ -296,10 +147,17 @@ class Refiner:
         self.border = _border_weight(shape, settings)
         self.surface = Surface(*map(np.asarray, start))
         k, n = signal.shape[0], s.albedo_modes
-        self.log_gain, self.offset, self.albedo = np.zeros(k), np.zeros(k), np.zeros((n, n))
+        self.log_gain, self.offset, self.log_multiple, self.albedo = (
+            np.zeros(k),
+            np.zeros(k),
+            np.zeros(k),
+            np.zeros((n, n)),
+        )
+        nothing = np.zeros(signal.shape)
+        self.prediction = Prediction(nothing, np.stack([nothing] * 3, 1))
+        self.predicted_normals = np.zeros((*shape, 3))
         self.residuals = np.zeros(signal.shape)
         self.weight = np.ones(signal.shape)
-        self.intact = np.ones(shape)
 
     def lag(
         self, prediction: Prediction, limit: float, cut: float, is_instrument_free: bool = True
@@ -315,7 +173,7 @@ class Refiner:
         prediction = prediction.about(self.predicted_normals)
         edges_x = find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut)
         edges_y = find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut)
-        self.intact = np.minimum(_weakest(edges_x.intact, 1), _weakest(edges_y.intact, 0))
+        self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
         scale_x, scale_y = (self._slope_scale(e, axis) for e, axis in ((edges_x, 1), (edges_y, 0)))
         base_x = one_sided(np.diff(height, axis=1) / m.dx, edges_x.intact, 1)
         base_y = one_sided(np.diff(height, axis=0) / m.dy, edges_y.intact, 0)
@@ -325,6 +183,7 @@ class Refiner:
             (slope_y - base_y) / scale_y,
             self.log_gain,
             self.offset,
+            self.log_multiple,
             self.albedo,
         )
         lagged = Lagged(
@@ -344,6 +203,7 @@ class Refiner:
             slope_scale_y=scale_y,
             gain_std=s.gain_std * np.full(len(self.signal), float(is_instrument_free)),
             offset_std=s.offset_std * self.mean_signal * float(is_instrument_free),
+            multiple_std=s.multiple_error * np.full(len(self.signal), float(is_instrument_free)),
         )
         return Unknowns(*map(jnp.asarray, unknowns)), Lagged(*map(jnp.asarray, lagged))
 
@@ -364,17 +224,56 @@ class Refiner:
         found = _solve(self.model, *self.lag(prediction, limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
         self.surface = Surface(*map(np.asarray, found.surface))
         self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
+        self.log_multiple = np.asarray(found.unknowns.log_multiple)
         self.albedo = np.asarray(found.unknowns.albedo)
         difference = np.asarray(found.counts) - np.where(self.observed, self.signal, 0.0)
         self.residuals = difference / self.sigma
         return found
 
 
-def _weakest(edge: np.ndarray, axis: int) -> np.ndarray:
-    """Return the smaller value of every pixel's two edges along an axis [y, x]."""
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (1, 1)
-    return np.minimum(*along(np.pad(edge, pad, constant_values=1.0), axis))
+def _thinning(shape: tuple[int, int]) -> int:
+    """Return the power of two by which rows and columns are thinned for the posterior."""
+    stride = 1
+    while (shape[0] // stride) * (shape[1] // stride) > MAX_PIXELS:
+        stride *= 2
+    return stride
+
+
+def _posterior(refiner: Refiner, settings: ReconstructSettings) -> Posterior | None:
+    """Return the posterior at the fit, on a thinned raster where the full one is too large.
+
+    There a pixel stands for stride^2 data. A kink lies in one of `stride` edges of each of `stride` parallel paths, so
+    an edge of the thinned raster doubts the trapezoid rule stride^1.5 times less than the same kink would let it.
+    """
+    s, m = refiner.settings, refiner.model
+    stride = _thinning(refiner.signal.shape[1:])
+    if s.samples == 0:
+        return None
+    thin = (slice(None, None, stride),) * 2
+    part = Refiner(
+        refiner.signal[:, *thin],
+        refiner.variance[:, *thin],
+        m.geometry,
+        m.dx * stride,
+        m.dy * stride,
+        Surface(*(field[thin] for field in refiner.surface)),
+        settings,
+    )
+    for name in ("log_gain", "offset", "log_multiple", "albedo"):
+        setattr(part, name, getattr(refiner, name))
+    part.residuals = refiner.residuals[:, *thin]
+    part.predicted_normals = refiner.predicted_normals[thin]
+    p = refiner.prediction
+    unknowns, lagged = part.lag(
+        Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin]), s.robust_limits[-1], s.jump_limits[-1]
+    )
+    lagged = lagged._replace(
+        inverse_sigma=lagged.inverse_sigma * stride,
+        edge_x=lagged.edge_x * stride**1.5,
+        edge_y=lagged.edge_y * stride**1.5,
+    )
+    found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples)
+    return found.on_raster(refiner.signal.shape[1:], stride)
 
 
 def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
@@ -425,7 +324,7 @@ def fit_heights(
             before = refiner.surface
             try:
                 refiner.predicted_normals = before.normals(refiner.shift)
-                prediction = predict(before.height, refiner.predicted_normals)
+                prediction = refiner.prediction = predict(before.height, refiner.predicted_normals)
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
                     found = refiner.step(prediction, limit, cut, number >= s.fixed_rounds)
@@ -439,10 +338,11 @@ def fit_heights(
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um:
                 break
-        return _finish(refiner, changes, is_interrupted)
+        posterior = None if is_interrupted else _posterior(refiner, settings)
+        return _finish(refiner, changes, is_interrupted, posterior)
 
 
-def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool) -> Fit:
+def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s, surface = refiner.settings, refiner.surface
     contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
     is_converged = changes[-1] < s.tolerance_um and not is_interrupted
@@ -460,12 +360,14 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool) -> Fit
     return Fit(
         surface=surface,
         normals=surface.normals(refiner.shift),
-        albedo=np.asarray(_albedo(jnp.asarray(refiner.albedo), surface.height.shape, s.albedo_std)),
+        albedo=np.asarray(smooth_albedo(jnp.asarray(refiner.albedo), surface.height.shape, s.albedo_std)),
         gain=np.exp(s.gain_std * refiner.log_gain),
         offset=s.offset_std * refiner.mean_signal * refiner.offset,
         residuals=refiner.residuals,
         weight=refiner.weight,
-        intact=refiner.intact,
+        intact_x=refiner.intact_x,
+        intact_y=refiner.intact_y,
+        posterior=posterior,
         changes=tuple(changes),
         contraction=contraction,
         status=status,

@@ -46,6 +46,8 @@ class RefineSettings(Settings):
     """Levenberg-Marquardt steps per re-weighting."""
     cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
+    samples: int = Field(default=32, ge=0, le=10_000)
+    """Samples of the posterior, from which the standard deviation of every height is taken; 0: no error bars."""
     rays: int = Field(default=1_500_000, ge=1000, le=10**10)
     """Paths per prediction of the multiple scattering, over the whole image (8 or more per pixel)."""
 

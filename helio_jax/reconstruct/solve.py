@@ -17,15 +17,13 @@ from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
+from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruct.validity import floating, reasons_from_data, reasons_from_fit, regions
+from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
-    from helio_jax.reconstruct.refine import Predict, Prediction, Report, Surface
-
-MASK_LIMIT = 0.1
-"""A datum darker than this share of the detector's flat signal counts as masked in the validity map."""
-_FEW, _MASKED, _JUMP = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3]))
+    from helio_jax.reconstruct.refine import Fit, Predict, Report
 
 
 def _level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:
@@ -114,21 +112,9 @@ def reconstruct_stack(
     return result
 
 
-def _validity(stack: MicrographStack) -> np.ndarray:
-    """Return why a pixel is not valid, from the data alone (index into REASONS)."""
-    reason = np.zeros(stack.shape[1:], np.uint8)
-    signal, _ = signal_of(stack)
-    flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
-    n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
-    n_images = stack.is_observed.sum(0)
-    reason[n_images - n_dark < MIN_IMAGES - 1] = _MASKED
-    reason[n_images < MIN_IMAGES] = _FEW
-    return reason
-
-
 def _from_solution(stack, settings, height, solution) -> Reconstruction:
-    reason = _validity(stack)
-    n_few = int(np.sum(reason == _FEW))
+    reason = reasons_from_data(stack)
+    n_few = int(np.sum(stack.is_observed.sum(0) < MIN_IMAGES))
     rounds = 1 if settings.method == "linear" else settings.rounds
     return Reconstruction(
         height=height,
@@ -147,17 +133,15 @@ def _from_solution(stack, settings, height, solution) -> Reconstruction:
 
 
 def _strides(shape: tuple[int, ...], coarsest: int) -> list[int]:
-    """Return by how much each level thins the raster, coarse to fine: powers of two down to `coarsest` pixels a side."""
+    """Return the thinning of every level, coarse to fine: powers of two down to `coarsest` pixels a side."""
     strides = [1]
     while min(shape[1:]) // (2 * strides[0]) >= coarsest:
         strides.insert(0, 2 * strides[0])
     return strides
 
 
-def _corrected(stack, settings, geometry, height, normals, predict) -> "Surface":
+def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     """Return heights and slopes of the photometric solution of albedo 1 that a prediction on a surface corrects."""
-    from helio_jax.reconstruct.refine import Surface
-
     signal, variance = signal_of(stack)
     shift = stack.instrument.beam_shift
     prediction = predict(height, normals)
@@ -170,16 +154,51 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> "Surface"
     return Surface(_limited(_level(height, settings, weight), stack), a, b)
 
 
-def _resampled(surface: "Surface", coarse: MicrographStack, fine: MicrographStack) -> "Surface":
+def _resampled(surface: Surface, coarse: MicrographStack, fine: MicrographStack) -> Surface:
     """Return a coarse level's surface on the finer raster: each point continues the plane of its nearest neighbour.
 
     So kinks and jumps stay between two points and are not smeared.
     """
-    from helio_jax.reconstruct.refine import Surface
-
     i, j = (np.abs(c[None, :] - f[:, None]).argmin(1) for c, f in ((coarse.y, fine.y), (coarse.x, fine.x)))
     height, a, b = (field[np.ix_(i, j)] for field in surface)
     return Surface(height + a * (fine.x - coarse.x[j])[None, :] + b * (fine.y - coarse.y[i])[:, None], a, b)
+
+
+def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
+    """Return by how many per cent the highest point moves per per cent of signal of each gain and offset.
+
+    All other unknowns follow the forced change; heights count from the median.
+    """
+    if fit.posterior is None:
+        return {}
+    height = fit.surface.height - np.median(fit.surface.height)
+    top = np.unravel_index(np.argmax(np.abs(height)), height.shape)
+    std = {"log_gain": settings.refine.gain_std, "offset": settings.refine.offset_std}
+    return {
+        name: float(response[top] / height[top] / std[name.split("[")[0]])
+        for name, response in zip(fit.posterior.names, fit.posterior.response, strict=True)
+        if name.split("[")[0] in std and height[top] != 0
+    }
+
+
+def _multiscale_start(stack, settings, geometry, make_predict) -> "tuple[Surface, Predict]":
+    """Return the corrected photometric solution, found coarse to fine, and the prediction on the full raster."""
+    shift, last = stack.instrument.beam_shift, None
+    surface = Surface(*np.zeros((3, 1, 1)))
+    for stride in _strides(stack.shape, settings.refine.coarsest_pixels):
+        level = stack.every(stride)
+        predict = make_predict(level)
+        if last is None:
+            height, solution = solve_nearfield(level, settings, geometry, settings.rounds)
+            height, normals = _limited(height, level), solution.normals
+        else:
+            surface = _resampled(surface, last, level)
+            height, normals = surface.height, surface.normals(shift)
+        for _ in range(settings.refine.photometric_rounds):
+            surface = _corrected(level, settings, geometry, height, normals, predict)
+            height, normals = surface.height, surface.normals(shift)
+        last = level
+    return surface, predict
 
 
 def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
@@ -189,26 +208,16 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    shift, last = stack.instrument.beam_shift, None
-    for stride in _strides(stack.shape, settings.refine.coarsest_pixels):
-        level = stack.every(stride)
-        predict = make_predict(level)
-        if last is None:
-            height, solution = solve_nearfield(level, settings, geometry, settings.rounds)
-            height, normals = _limited(height, level), solution.normals
-        else:
-            resampled = _resampled(start, last, level)
-            height, normals = resampled.height, resampled.normals(shift)
-        for _ in range(settings.refine.photometric_rounds):
-            start = _corrected(level, settings, geometry, height, normals, predict)
-            height, normals = start.height, start.normals(shift)
-        last = level
+    start, predict = _multiscale_start(stack, settings, geometry, make_predict)
     signal, variance = signal_of(stack)
     dx, dy = pitch(stack.x), pitch(stack.y)
     fit = fit_heights(signal, variance, geometry, dx, dy, start, settings, predict, report)
-    reason = _validity(stack)
-    is_doubted = fit.weight.min(0, where=np.isfinite(signal), initial=1.0) < 0.5
-    reason[(reason == 0) & (is_doubted | (fit.intact < 0.25))] = _JUMP
+    posterior = fit.posterior
+    is_floating = np.zeros(stack.shape[1:], bool)
+    if posterior is not None:
+        is_floating = floating(fit.surface.height, posterior.samples, regions(fit.intact_x, fit.intact_y))
+    worst = fit.weight.min(0, where=np.isfinite(signal), initial=1.0)
+    reason = reasons_from_fit(reasons_from_data(stack), worst, fit.intact_x, fit.intact_y, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,
@@ -217,6 +226,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         method="refine",
         normals=fit.normals,
         albedo=fit.albedo,
+        height_std=None if posterior is None else posterior.height_std,
+        height_samples=None if posterior is None else posterior.samples,
         is_valid=reason == 0,
         reason=reason,
         residuals=fit.residuals,
@@ -228,5 +239,6 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
             "reconstruct": settings.model_dump(mode="json"),
             "height_changes_um": list(fit.changes),
             "contraction": fit.contraction,
+            "sensitivity": sensitivity(fit, settings),
         },
     )

@@ -1,0 +1,195 @@
+"""The forward model of the fit: from whitened unknowns to residuals in standard deviations (JAX, differentiable).
+
+What is known of the surface: the data, the edges between pixels, the bends of the normal, the flat border. What is
+known of the instrument: priors of gain, offset and of the scale of the predicted multiple scattering. `Lagged`
+holds all that is constant during one least-squares solve. How it is solved is `refine`'s matter.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.fft import idctn
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from helio_jax.reconstruct.edges import along, one_sided
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.render import render_single, unit_normal
+
+_LEVEL = 0.9
+"""Facets whose unit normal has a larger vertical part count as level."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the current surface does beyond direct single scattering, per beam atom.
+
+    Attributes:
+        multiple: detection probability of order 2 and above [detector, y, x].
+        hidden: hidden part of the vector form factor [detector, 3, y, x].
+    """
+
+    multiple: np.ndarray
+    hidden: np.ndarray
+
+    def about(self, normals: np.ndarray) -> "Prediction":
+        """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
+
+        A facet whose normal has the vertical part n_z sees the ground around it with the view factor (1 - n_z) / 2, so
+        what the ground sends it changes by -M / (1 - n_z) per unit of n_z. This goes where `hidden` goes and changes
+        nothing at the facet's own normal: it only makes the rounds converge faster beside steep walls, where slope and
+        multiple scattering depend on one another. Level facets get no correction. Source: own derivation.
+        """
+        up = normals[..., 2]
+        slope = np.where(up < _LEVEL, self.multiple / np.maximum(1.0 - up, 1.0 - _LEVEL), 0.0)
+        hidden = self.hidden.copy()
+        hidden[:, 2] += slope
+        return Prediction(self.multiple + slope * up, hidden)
+
+    def doubt(self, normals: np.ndarray, mask_error: float, multiple_error: float) -> np.ndarray:
+        """Return the standard deviation to be expected of it [detector, y, x], for unit normals [y, x, 3].
+
+        Two parts of each term: a share of its own size, and its change over half a pixel, for the surface that
+        it was made for is only known from pixel to pixel.
+        """
+        hidden = np.einsum("kiyx,yxi->kyx", self.hidden, normals)
+        parts = [
+            share * image + 1j * 0.5 * _largest_change(image)
+            for image, share in ((hidden, mask_error), (self.multiple, multiple_error))
+        ]
+        return np.hypot(*map(np.abs, parts))
+
+
+def _largest_change(image: np.ndarray) -> np.ndarray:
+    """Return the largest difference of every pixel [detector, y, x] from its neighbours in the row and the column."""
+    high, low = (f(image, size=(1, 3, 3)) for f in (maximum_filter, minimum_filter))
+    return np.maximum(high - image, image - low)
+
+
+class Surface(NamedTuple):
+    """Heights [um] and beam-frame slopes dh/dX, dh/dY at the beam positions [y, x]."""
+
+    height: Any
+    slope_x: Any
+    slope_y: Any
+
+    def normals(self, shift: tuple[float, float]) -> np.ndarray:
+        """Return the unit normals [y, x, 3]."""
+        return np.moveaxis(np.asarray(unit_normal(self.slope_x, self.slope_y, shift)), 0, -1)
+
+
+class Lagged(NamedTuple):
+    """Everything the residuals hold fixed during one least-squares solve."""
+
+    data: Any
+    inverse_sigma: Any
+    multiple: Any
+    hidden: Any
+    intact_x: Any
+    intact_y: Any
+    edge_x: Any
+    edge_y: Any
+    bend_x: Any
+    bend_y: Any
+    border: Any
+    whitening: Any
+    slope_scale_x: Any
+    slope_scale_y: Any
+    gain_std: Any
+    offset_std: Any
+    multiple_std: Any
+
+
+class Unknowns(NamedTuple):
+    """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; albedo modes.
+
+    All but the surface in prior deviations.
+    """
+
+    height: Any
+    slope_x: Any
+    slope_y: Any
+    log_gain: Any
+    offset: Any
+    log_multiple: Any
+    albedo: Any
+
+
+def smooth_albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
+    """Return the smooth albedo exp(sum of cosine modes); the constant mode is left to the gains."""
+    if std == 0.0:
+        return jnp.ones(shape)
+    n = modes.shape[0]
+    rank = jnp.hypot(*jnp.meshgrid(jnp.arange(n), jnp.arange(n), indexing="ij"))
+    scale = std * jnp.sqrt(shape[0] * shape[1]) / jnp.maximum(rank, 1.0) ** 2
+    spectrum = jnp.zeros(shape).at[:n, :n].set((modes * scale).at[0, 0].set(0.0))
+    return jnp.exp(idctn(spectrum, norm="ortho"))
+
+
+class Model(eqx.Module):
+    """Static part of the residual function."""
+
+    geometry: SpotGeometry = eqx.field(static=True)
+    dx: float = eqx.field(static=True)
+    dy: float = eqx.field(static=True)
+    albedo_std: float = eqx.field(static=True)
+
+    def surface(self, unknowns: Unknowns, lagged: Lagged) -> Surface:
+        """Return heights and slopes of whitened unknowns."""
+        height = idctn(unknowns.height * lagged.whitening, norm="ortho")
+        base_x = one_sided(jnp.diff(height, axis=1) / self.dx, lagged.intact_x, 1)
+        base_y = one_sided(jnp.diff(height, axis=0) / self.dy, lagged.intact_y, 0)
+        return Surface(
+            height,
+            base_x + lagged.slope_scale_x * unknowns.slope_x,
+            base_y + lagged.slope_scale_y * unknowns.slope_y,
+        )
+
+    def thinned(self, stride: int) -> "Model":
+        """Return the model of every `stride`-th row and column."""
+        return Model(self.geometry, self.dx * stride, self.dy * stride, self.albedo_std)
+
+    @property
+    def instrument_fields(self) -> tuple[str, ...]:
+        """Names of the unknowns that are not the surface."""
+        always = ("log_gain", "offset", "log_multiple")
+        return (*always, "albedo") if self.albedo_std > 0 else always
+
+    def normal(self, surface: Surface) -> jax.Array:
+        """Return the unit normals [3, y, x]."""
+        return unit_normal(surface.slope_x, surface.slope_y, self.geometry.instrument.beam_shift)
+
+    def counts(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return the expected data [detector, y, x] in units of the beam."""
+        single = render_single(surface.height, self.normal(surface), lagged.hidden, self.geometry)
+        albedo = smooth_albedo(unknowns.albedo, surface.height.shape, self.albedo_std)
+        gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
+        offset = (lagged.offset_std * unknowns.offset)[:, None, None]
+        multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
+        return gain * (albedo * single + multiple) + offset
+
+    def data_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return (model - data) / standard deviation, robustly weighted [detector, y, x]."""
+        return (self.counts(surface, unknowns, lagged) - lagged.data) * lagged.inverse_sigma
+
+    def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:
+        """Return all residuals in standard deviations."""
+        surface = self.surface(unknowns, lagged)
+        normal = self.normal(surface)
+        return {
+            "data": self.data_residuals(surface, unknowns, lagged),
+            "edge_x": (jnp.diff(surface.height, axis=1) / self.dx - 0.5 * sum(along(surface.slope_x, 1)))
+            * lagged.edge_x,
+            "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
+            * lagged.edge_y,
+            "bend_x": jnp.diff(normal, n=2, axis=2) * lagged.bend_x,
+            "bend_y": jnp.diff(normal, n=2, axis=1) * lagged.bend_y,
+            "border": surface.height * lagged.border,
+            "gain": unknowns.log_gain,
+            "offset": unknowns.offset,
+            "multiple": unknowns.log_multiple,
+            "albedo": unknowns.albedo,
+        }

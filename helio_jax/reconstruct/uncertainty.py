@@ -1,0 +1,199 @@
+"""Error bars of the fit: the Laplace posterior of heights and slopes, with the instrument marginalised.
+
+At the minimum the whitened residuals are linear in the unknowns, r = J_s ds + J_c dc, with the surface s (height and
+two slopes of every pixel, coupled to neighbours only) and the few instrument parameters c (gains, offsets, albedo
+modes, or whatever is added later). The information of the surface, A = J_s' J_s, is sparse and factorised once; it
+is bordered by B = J_s' J_c. The Schur complement S = J_c' J_c - B' A^-1 B is the instrument's marginal information, and
+-A^-1 B is what the surface does when an instrument parameter is forced: the sensitivity to calibration. A sample of
+the joint posterior is the answer to standard normal noise in every residual, so each derived number (area,
+angle, step) gets its error bar from the same samples.
+
+On rasters above `MAX_PIXELS` every 2nd (4th, ...) row and column stands for the rest, which is stated in the result.
+"""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from helio_jax.reconstruct.model import Lagged, Model, Surface, Unknowns
+
+MAX_PIXELS = 30_000
+"""Largest raster whose information matrix is factorised; above, the raster is thinned."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """The residuals of a fit to first order, in standard deviations.
+
+    Attributes:
+        surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
+        instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
+        names: of the instrument parameters.
+        shape: of the raster (y, x).
+    """
+
+    surface: sparse.csr_matrix
+    instrument: np.ndarray
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the data leave open.
+
+    Attributes:
+        samples: deviations of the heights [sample, y, x], um.
+        instrument_samples: of the instrument parameters, in prior deviations [sample, parameter].
+        response: what the heights do when a parameter is forced by one prior deviation [parameter, y, x], um.
+        instrument_covariance: in prior deviations [parameter, parameter].
+        names: of the instrument parameters.
+        stride: thinning of the raster at which it was computed (1: none).
+    """
+
+    samples: np.ndarray
+    instrument_samples: np.ndarray
+    response: np.ndarray
+    instrument_covariance: np.ndarray
+    names: tuple[str, ...]
+    stride: int = 1
+
+    @property
+    def height_std(self) -> np.ndarray:
+        """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
+        return np.sqrt(np.mean(self.samples**2, axis=0))
+
+    def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
+        """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
+        if stride == 1:
+            return self
+        nearest = [
+            np.minimum(np.rint(np.arange(n) / stride).astype(int), m - 1)
+            for n, m in zip(shape, self.samples.shape[1:], strict=True)
+        ]
+        full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
+        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride)
+
+
+class _Rows:
+    """Collects sparse rows block by block."""
+
+    def __init__(self, n_pixels: int) -> None:
+        self._blocks: list[sparse.csr_matrix] = []
+        self._n = n_pixels
+
+    def add(self, *terms: tuple[np.ndarray, int, np.ndarray]) -> None:
+        """Add one row per pixel of the terms: (pixel index, 0 height, 1 slope x or 2 slope y, value)."""
+        count = terms[0][0].size
+        row = np.tile(np.arange(count), len(terms))
+        column = np.concatenate([3 * pixel.ravel() + part for pixel, part, _ in terms])
+        value = np.concatenate([np.broadcast_to(v, p.shape).ravel() for p, _, v in terms])
+        self._blocks.append(sparse.csr_matrix((value, (row, column)), shape=(count, 3 * self._n)))
+
+    @property
+    def n_rows(self) -> int:
+        return sum(block.shape[0] for block in self._blocks)  # type: ignore[index]  # SciPy's stubs allow no shape
+
+    def stack(self, n_more: int) -> sparse.csr_matrix:
+        """Return all rows, and `n_more` empty ones below."""
+        empty = sparse.csr_matrix((n_more, 3 * self._n))
+        return sparse.csr_matrix(sparse.vstack([*self._blocks, empty]))
+
+
+@eqx.filter_jit
+def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
+    """Return how data residuals and normals of a pixel follow its own height and slopes, and the instrument."""
+    one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
+    directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
+
+    def along(function, direction):
+        return jax.jvp(function, (surface,), (direction,))[1]
+
+    data = [along(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
+    normal = [along(model.normal, d) for d in directions]
+    free = {name: getattr(unknowns, name) for name in model.instrument_fields}
+    instrument = jax.jacfwd(lambda v: model.data_residuals(surface, unknowns._replace(**v), lagged))(free)
+    return data, normal, instrument
+
+
+def _ends(pixel: np.ndarray, axis: int, n: int) -> list[np.ndarray]:
+    """Return the n + 1 pixels of every run of neighbours along an axis."""
+    return [np.take(pixel, range(i, pixel.shape[axis] - n + i), axis) for i in range(n + 1)]
+
+
+def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
+    """Return the Jacobian of `model.residuals` at the fit, in terms of the surface itself instead of its whitened form.
+
+    tests/inverse/test_uncertainty.py compares it with the automatic Jacobian of the residuals.
+    """
+    surface = model.surface(unknowns, lagged)
+    shape = surface.height.shape
+    pixel = np.arange(surface.height.size).reshape(shape)
+    data, normal, by_parameter = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    rows = _Rows(pixel.size)
+    for k in range(data[0].shape[0]):
+        rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
+    n_data = data[0].size
+    for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
+        before, after = _ends(pixel, axis, 1)
+        w = np.asarray(weight)
+        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
+    for axis, weight in ((1, lagged.bend_x), (0, lagged.bend_y)):
+        runs = list(zip(_ends(pixel, axis, 2), (1.0, -2.0, 1.0), strict=True))
+        for i in range(3):
+            rows.add(
+                *(
+                    (p, part, factor * np.asarray(weight) * normal[part][i].ravel()[p])
+                    for p, factor in runs
+                    for part in (1, 2)
+                )
+            )
+    rows.add((pixel, 0, np.asarray(lagged.border)))
+    names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
+    columns = np.concatenate([block.reshape(n_data, -1) for block in by_parameter.values()], 1)
+    matrix = rows.stack(n_more=len(names))
+    instrument = np.zeros((rows.n_rows + len(names), len(names)))
+    instrument[:n_data] = columns
+    instrument[-len(names) :] = np.eye(len(names))
+    return Linearised(matrix, instrument, tuple(names), shape)
+
+
+def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0) -> Posterior:
+    """Factorise the information and draw samples of the joint posterior.
+
+    Args:
+        linear: residuals at the fit, from `linearise`.
+        n_samples: samples.
+        seed: of the noise.
+
+    Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
+        Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case.
+    """
+    js, jc = linear.surface, linear.instrument
+    n_rows = jc.shape[0]
+    information = (js.T @ js).tocsc()
+    factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    border = js.T @ jc
+    answer = factor.solve(border)
+    covariance = np.linalg.inv(jc.T @ jc - border.T @ answer)
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((n_rows, n_samples))
+    right_s, right_c = js.T @ noise, jc.T @ noise
+    free = factor.solve(right_s)
+    instrument = covariance @ (right_c - border.T @ free)
+    surface = free - answer @ instrument
+    to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
+    return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
+
+
+def exact_height_covariance(linear: Linearised) -> np.ndarray:
+    """Return the posterior covariance of the heights [y * x, y * x], um^2, dense; for rasters of up to 32 x 32."""
+    both = np.hstack([linear.surface.toarray(), linear.instrument])
+    covariance = np.linalg.inv(both.T @ both)
+    n = 3 * linear.shape[0] * linear.shape[1]
+    return covariance[:n:3, :n:3]

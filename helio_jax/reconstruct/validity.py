@@ -1,0 +1,92 @@
+"""Why a height should not be trusted: too few images, masks, a depth jump, or a region whose level nothing fixes."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of
+from helio_jax.reconstruction import REASONS
+
+MASK_LIMIT = 0.1
+"""A datum darker than this share of the detector's flat signal counts as masked."""
+INTACT = 0.25
+"""Edges with less weight than this are depth jumps; so is a pixel with such an edge."""
+TRUSTED = 0.5
+"""A pixel with a datum of less robust weight than this is not explained by the model."""
+FLOATING = 0.2
+"""A region is floating when its level is uncertain by more than this share of its step to the ground."""
+MIN_REGION = 16
+"""Smaller regions are part of the jump that surrounds them [pixels]."""
+_FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))
+
+
+def reasons_from_data(stack: MicrographStack) -> np.ndarray:
+    """Return why a pixel is not valid, from the data alone (index into REASONS) [y, x]."""
+    reason = np.zeros(stack.shape[1:], np.uint8)
+    signal, _ = signal_of(stack)
+    flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
+    n_images = stack.is_observed.sum(0)
+    n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
+    reason[n_images - n_dark < MIN_IMAGES - 1] = _MASKED
+    reason[n_images < MIN_IMAGES] = _FEW
+    return reason
+
+
+def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
+    """Return the number of the region of every pixel [y, x]: pixels joined by intact edges; the largest region is 0.
+
+    Args:
+        intact_x, intact_y: what is left of the edges [y, x - 1], [y - 1, x].
+    """
+    shape = (intact_x.shape[0], intact_y.shape[1])
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    joined_x, joined_y = intact_x >= INTACT, intact_y >= INTACT
+    start = np.concatenate([pixel[:, :-1][joined_x], pixel[:-1][joined_y]])
+    end = np.concatenate([pixel[:, 1:][joined_x], pixel[1:][joined_y]])
+    graph = coo_matrix((np.ones(start.size), (start, end)), shape=(pixel.size, pixel.size))
+    labels = connected_components(graph, directed=False)[1]
+    order = np.argsort(-np.bincount(labels), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    return rank[labels].reshape(shape)
+
+
+def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
+
+    Args:
+        height: [y, x], um.
+        samples: posterior deviations [sample, y, x], um.
+        region: from `regions` [y, x].
+    """
+    flags = np.zeros(height.shape, bool)
+    ground = region == 0
+    for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
+        inside = region == number
+        step = abs(float(np.median(height[inside]) - np.median(height[ground])))
+        spread = float(np.std(samples[:, inside].mean(1) - samples[:, ground].mean(1)))
+        flags |= inside & (spread > FLOATING * step)
+    return flags
+
+
+def reasons_from_fit(
+    reason: np.ndarray, weight: np.ndarray, intact_x: np.ndarray, intact_y: np.ndarray, is_floating: np.ndarray
+) -> np.ndarray:
+    """Add what the fit knows to the reasons from the data [y, x].
+
+    Args:
+        reason: from `reasons_from_data` [y, x].
+        weight: robust weight left of the worst datum [y, x].
+        intact_x, intact_y: what is left of the edges.
+        is_floating: from `floating` [y, x].
+    """
+    at_jump = np.zeros(reason.shape, bool)
+    at_jump[:, 1:] |= intact_x < INTACT
+    at_jump[:, :-1] |= intact_x < INTACT
+    at_jump[1:] |= intact_y < INTACT
+    at_jump[:-1] |= intact_y < INTACT
+    out = reason.copy()
+    out[(out == 0) & (at_jump | (weight < TRUSTED))] = _JUMP
+    out[(out == 0) & is_floating] = _FLOATING
+    return out
