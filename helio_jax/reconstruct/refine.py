@@ -319,10 +319,10 @@ def fit_heights(
         is_interrupted = False
         said = "start"
         for number in range(s.max_rounds):
-            if report:
-                report(number, s.max_rounds, said)
             before = refiner.surface
             try:
+                if report:
+                    report(number, s.max_rounds, said)
                 refiner.predicted_normals = before.normals(refiner.shift)
                 prediction = refiner.prediction = predict(before.height, refiner.predicted_normals)
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))

@@ -25,7 +25,7 @@ class RefineSettings(Settings):
     smoothness: float = Field(default=0.5, gt=0.0, le=100.0)
     """Prior deviation of the normals' second difference from pixel to pixel, in units of one pixel's slope noise."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
-    """Side of the flat substrate that scatters around the image; default: half an image size beyond each border."""
+    """Side of the flat that scatters around the image [um]; default: half an image size beyond each border."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)

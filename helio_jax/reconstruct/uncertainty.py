@@ -134,7 +134,8 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
-    data, normal, by_parameter = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    data, normal, found = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    by_parameter = {name: found[name] for name in model.instrument_fields}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))

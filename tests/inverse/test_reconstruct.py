@@ -12,7 +12,8 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.linear import solve_linear
+from helio_jax.reconstruct.linear import solve_known_albedo, solve_linear
+from helio_jax.reconstruct.model import Prediction
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 
@@ -127,3 +128,57 @@ def test_reference_sphere_by_rounds_of_physics(shared):
     assert 0.82 <= score["linear"].recovered_height <= 0.88
     assert score["nearfield"].rms_region <= 0.06 and 0.90 <= score["nearfield"].recovered_height <= 1.03
     assert score["refine"].rms_region <= score["nearfield"].rms_region
+
+
+def test_known_albedo_solution_is_exact_even_with_two_images(bshem):
+    """Two unknown slopes per pixel: exact from exact data, also where one of three images is missing."""
+    stack, height, normal = bump_stack(bshem)
+    signal = stack.counts / stack.n_rays
+    signal[0, :10] = np.nan
+    flat = np.broadcast_to([0.0, 0.0, 1.0], normal.shape)
+    phi = SpotGeometry(bshem).form_factor(height)
+    slopes, covariance = solve_known_albedo(signal, np.full(signal.shape, 1e-14), phi, flat, bshem.beam_shift)
+    a, b, _ = slopes_of_normal(normal, bshem.beam_shift)
+    assert np.allclose(slopes, [a, b], atol=1e-4)
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+def test_prediction_about_a_normal_changes_nothing_there():
+    """The linear model of the own normal is exact at that normal and darkens a facet that turns towards level."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(4, 5, 3)) + [0, 0, 2]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    was = Prediction(rng.uniform(0, 1, (3, 4, 5)), rng.normal(size=(3, 3, 4, 5)))
+    near = was.about(normals)
+    value = lambda p, n: p.multiple - np.einsum("kiyx,yxi->kyx", p.hidden, n)  # noqa: E731
+    assert np.allclose(value(near, normals), value(was, normals))
+    level = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
+    is_steep = normals[..., 2] < 0.9
+    assert np.all((value(near, level) - value(was, level))[:, is_steep] < 0)
+
+
+def test_every_keeps_pixels_and_their_places(bshem):
+    """Thinning takes whole pixels, symmetrically: rows 0, 2, ... of an odd number of rows."""
+    stack, _, _ = bump_stack(bshem, n=47)
+    thin = stack.every(2)
+    assert thin.shape == (3, 24, 24)
+    assert np.array_equal(thin.counts, stack.counts[:, ::2, ::2]) and np.array_equal(thin.x, stack.x[::2])
+
+
+def test_interrupted_fit_keeps_the_best_so_far(bshem):
+    """Ctrl-C in a later round returns what was reached, and says so; in the first round there is nothing to keep."""
+    stack, height, _ = bump_stack(bshem)
+    for stop_at in (1, 0):
+
+        def report(number, rounds, said, stop_at=stop_at):
+            if number == stop_at:
+                raise KeyboardInterrupt
+
+        refine = {"max_rounds": 3, "tolerance_um": 1e-6, "samples": 0}
+        if stop_at == 0:
+            with pytest.raises(KeyboardInterrupt):
+                pipeline.reconstruct(stack, "refine", report=report, refine=refine)
+            continue
+        rec = pipeline.reconstruct(stack, "refine", report=report, refine=refine)
+        assert rec.status.startswith("interrupted")
+        assert rec.height.max() == pytest.approx(height.max(), rel=0.1)

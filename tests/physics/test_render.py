@@ -5,7 +5,6 @@ form factor on quads of corner heights in JAX.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -36,18 +35,16 @@ def instrument() -> Instrument:
     )
 
 
-def cap_corners(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the true heights at the corners of the pixels, um."""
-    corner = [np.append(axis - 0.5 * PITCH, axis[-1] + 0.5 * PITCH) for axis in (x, y)]
-    sphere = np.array([CAP.row])
-    return first_hit_spheres(*np.meshgrid(*corner), sphere, instrument.beam_shift)[0]
+def cap(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true heights [y, x], um, and unit normals [3, y, x] at the beam positions."""
+    height, normal = first_hit_spheres(*np.meshgrid(x, y), np.array([CAP.row]), instrument.beam_shift)
+    return height, np.moveaxis(normal, -1, 0)
 
 
 def test_render_is_the_tracers_single_scattering(instrument):
-    """Agree to 1e-3 on a cap of 1 mm radius at a pitch of 10 um.
+    """Agree to 1e-9 on a cap of 1 mm radius, point by point: both take the spot for a point.
 
-    Bias: the mean of four corners lies pitch^2 / (4 R) = 0.025 um low (x 1.3 obliquely), and the quad's slope is off by
-    O(pitch^2 / R^2) = 1e-4. Rejected wrong model: slopes of the sample frame instead of the beam frame (several %).
+    Rejected wrong models: columns and rows exchanged (several %); the height's near field left out (1 % per 40 um).
     Catches: a wrong near field, sign of the beam shift, exchanged slopes, rotation of the ellipses.
     """
     x = np.arange(-150.0, 151.0, PITCH) + 120.0  # the cap's top is seen downstream of its axis
@@ -57,34 +54,11 @@ def test_render_is_the_tracers_single_scattering(instrument):
     tally = trace_pixels(make_experiment(body, instrument, TraceSettings(rays=8)), grid_x, grid_y)
     traced = tally.probability()[0][0].reshape(-1, y.size, x.size)
     geometry, hidden = SpotGeometry(instrument), np.zeros((3, 3, y.size, x.size))
-    corners = cap_corners(instrument, x, y)
+    height, normal = cap(instrument, x, y)
     with jax.enable_x64(True):
-        rendered = np.asarray(render_single(jnp.asarray(corners), jnp.asarray(hidden), geometry, PITCH, PITCH))
-        mirrored = np.asarray(
-            render_single(jnp.asarray(corners.T), jnp.asarray(hidden.swapaxes(2, 3)), geometry, 10, 10)
-        )
-    assert np.abs(rendered / traced - 1.0).max() < 1e-3
+        rendered = np.asarray(render_single(height, normal, hidden, geometry))
+        mirrored = np.asarray(render_single(height.T, normal[[1, 0, 2]].swapaxes(1, 2), hidden.swapaxes(2, 3), geometry))
+        far = np.asarray(render_single(np.zeros_like(height), normal, hidden, geometry))
+    assert np.abs(rendered / traced - 1.0).max() < 1e-9
     assert np.abs(mirrored.swapaxes(1, 2) / traced - 1.0).max() > 0.03
-
-
-def test_render_derivative(instrument):
-    """Taylor remainder falls as step^2, and <J v, w> = <v, J' w>. Catches a custom derivative that is off by a term."""
-    rng = np.random.default_rng(7)
-    x, y = np.arange(6) * PITCH, np.arange(5) * PITCH
-    corners = cap_corners(instrument, x, y)
-    direction, weight = rng.normal(size=corners.shape), rng.normal(size=(3, 5, 6))
-    geometry, hidden = SpotGeometry(instrument), rng.normal(scale=1e-3, size=(3, 3, 5, 6))
-    with jax.enable_x64(True):
-
-        def model(heights):
-            return render_single(heights, jnp.asarray(hidden), geometry, PITCH, PITCH)
-
-        start = jnp.asarray(corners)
-        value, slope = jax.jvp(model, (start,), (jnp.asarray(direction),))
-        steps = (0.4, 0.2, 0.1)
-        rest = [float(jnp.abs(model(start + s * direction) - value - s * slope).max()) for s in steps]
-        (back,) = jax.vjp(model, start)[1](jnp.asarray(weight))
-        forth = float(jnp.sum(slope * weight))
-    ratios = [rest[0] / rest[1], rest[1] / rest[2]]
-    assert all(3.6 < ratio < 4.4 for ratio in ratios), ratios
-    assert forth == pytest.approx(float(np.sum(np.asarray(back) * direction)), rel=1e-10)
+    assert np.abs(far / traced - 1.0).max() > 0.03
