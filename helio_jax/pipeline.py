@@ -29,15 +29,16 @@ from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
+from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
+from helio_jax.reconstruct.visibility import hidden_form_factor
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres, flat_body, surface_body
 from helio_jax.trace.intersect import MISS, Hits, Intersector
-from helio_jax.trace.masks import hidden_form_factor
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
 from helio_jax.trace.settings import TraceSettings
 
@@ -50,7 +51,7 @@ SMOOTH_BEND = 0.2
 MAX_BURIED = 0.05
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
 LIFT_PIXELS = 0.1
-"""How far off a reconstructed (noisy) surface its view of the apertures is taken [pixels]."""
+"""How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
 
 
 def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> MicrographStack:
@@ -89,18 +90,20 @@ def make_predictor(
     seed: int = 7,
     workers: int | None = None,
 ) -> Callable[[np.ndarray, np.ndarray], Prediction]:
-    """Return a function that traces what a surface does beyond direct single scattering.
+    """Return a function that predicts what a surface does beyond direct single scattering.
+
+    Multiple scattering is traced from the given points, with their normals; masks come from the horizon march.
 
     The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
     Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
     grid_x, grid_y = np.meshgrid(stack.x, stack.y)
-    offset = np.stack(instrument.sample_origin(grid_x.ravel(), grid_y.ravel())[:2], -1)
+    geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
     size = max(np.ptp(stack.x), np.ptp(stack.y))
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
     reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
-    lift = LIFT_PIXELS * min(pitch(stack.x), pitch(stack.y))
+    lift = LIFT_PIXELS * min(dx, dy)
     branches = max(1, round(n_rays / grid_x.size / 8))
     settings = TraceSettings(rays=8, branches=branches, n_orders=2, seed=seed, workers=workers)
 
@@ -113,12 +116,9 @@ def make_predictor(
         first = Hits.on_mesh(point, normal)
         tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers, first=first, max_lost=MAX_BURIED)
         multiple = tally.probability()[0][1].reshape(-1, *height.shape)
-        triangle = np.zeros(len(point), np.int32)
-        hidden, _ = hidden_form_factor(experiment.intersector, instrument, point, normal, triangle, offset)
-        return Prediction(
-            multiple=smooth_along_surface(multiple, normals),
-            hidden=np.moveaxis(hidden.reshape(-1, *height.shape, 3), -1, 1),
-        )
+        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
+        hidden = np.asarray(hidden_form_factor(height, a, b, geometry, dx, dy))
+        return Prediction(smooth_along_surface(multiple, normals), hidden)
 
     return predict
 

@@ -1,0 +1,284 @@
+"""How true the fitted heights are, how honest their error bars, how long they take: the rows of issue 3.
+
+python benchmarks/reconstruction.py [--shared ../shared] [--output benchmarks/out] [--rows 1,2,4,...] [--tiny]
+
+Every finished case is written at once and not done again (delete the JSON to start afresh). Rows 1 and 9 (sphere A,
+reference program) need the shared data; `--tiny` runs small cases of the other rows through the same code.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from helio_jax import pipeline  # noqa: E402
+from helio_jax.config import SceneFile, load_scene  # noqa: E402
+from helio_jax.formats.matlab import import_micrographs  # noqa: E402
+from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
+from helio_jax.reconstruct.model import Prediction  # noqa: E402
+from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
+from helio_jax.reconstruct.solve import reconstruct_stack  # noqa: E402
+
+Case = dict[str, object]
+SCENES = ROOT / "scenes"
+
+
+class Record:
+    """The cases done so far, in one JSON file."""
+
+    def __init__(self, path: Path, seed: int) -> None:
+        self.path = path
+        names = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba")
+        self.about = {
+            "git": pipeline.git_commit(),
+            "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
+            "versions": {name: pipeline.package_version(name) for name in names},
+            "seed": seed,
+            "rows": json.loads(path.read_text())["rows"] if path.exists() else [],
+        }
+
+    def do(self, row: str, case: str, work: Callable[[], Case], target: str, reached: Callable[[Case], bool | None]):
+        """Run a case unless it is done, print it, and write the file."""
+        rows = self.about["rows"]
+        done = next((r for r in rows if r["row"] == row and r["case"] == case), None)
+        if done is None:
+            found = work()
+            done = {"row": row, "case": case, **found, "target": target, "reached": reached(found)}
+            rows.append(done)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.write_text(json.dumps(self.about, indent=1) + "\n")
+        values = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in done.items())
+        print(values, flush=True)
+
+
+def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case:
+    """Return the numbers of row 1: errors over H (DATA.md), level taken on the flat."""
+    truth = pipeline.true_height(scene, rec)
+    s = pipeline.evaluate(rec, truth)
+    tx, ty = stack.instrument.beam_shift
+    grid_x, grid_y = np.meshgrid(stack.x, stack.y)
+    r = np.hypot(grid_x - truth.height * tx, grid_y - truth.height * ty)
+    error = (rec.height - truth.height - s.level_um) / s.H_um
+    region, ring = r < 1050.0, (r > 1.1 * 960.0) & (r < 1.5 * 960.0)
+    valid = region & rec.is_valid
+    away = region & rec.is_valid & (rec.reason == 0)
+    return {
+        "rms_all": float(np.sqrt(np.mean(error[region] ** 2))),
+        "rms_valid": float(np.sqrt(np.mean(error[valid] ** 2))),
+        "valid": float(np.mean(rec.is_valid[region])),
+        "height": float(s.recovered_height or np.nan),
+        "height_std": float(s.recovered_height_std_um or np.nan) / s.H_um,
+        "p95_valid": float(np.quantile(np.abs(error[away]), 0.95)),
+        "max_valid": float(np.abs(error[away]).max()),
+        "ring_rms": float(np.sqrt(np.mean(error[ring] ** 2))),
+        "ring_mean": float(np.mean(error[ring])),
+        "pull_std": float(s.pull_std or np.nan),
+        "coverage_1": float(s.coverage_1 or np.nan),
+        "coverage_2": float(s.coverage_2 or np.nan),
+        "gain": [round(float(g), 4) for g in rec.gain],
+        "seconds": seconds,
+        "peak_GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        "status": rec.status,
+    }
+
+
+def fit(scene: SceneFile, stack: MicrographStack, **refine: object) -> Case:
+    """Reconstruct with the scene's settings, score."""
+    settings = scene.reconstruct.model_dump()
+    settings["refine"] |= refine
+    start = time.perf_counter()
+    rec = pipeline.reconstruct(stack, settings=ReconstructSettings.model_validate(settings))
+    return score(scene, stack, rec, time.perf_counter() - start)
+
+
+def own(name: str, seed: int, **overrides: object) -> tuple[SceneFile, MicrographStack]:
+    """Return a scene and its simulated counts."""
+    scene = load_scene(SCENES / f"{name}.toml", overrides)
+    return scene, pipeline.record(scene, pipeline.simulate(scene, seed=seed))
+
+
+def height_rows(record: Record, shared: Path | None, seed: int, size: int) -> None:
+    """Rows 1, 2 and 7: reference sphere A at full size, spheres A and B of our own tracer."""
+
+    def limits(rms: float, valid_rms: float, share: float, low: float, high: float):
+        return lambda c: bool(
+            c["rms_all"] <= rms and c["rms_valid"] <= valid_rms and c["valid"] >= share and low <= c["height"] <= high
+        )
+
+    if shared is not None:
+        scene = load_scene(SCENES / "sphere_a_full.toml")
+        stack = import_micrographs(shared / "data" / "sphere_a_simulated.mat", scene.instrument)
+        target = "rms 1.8 %, valid 0.8 % on >= 97 %, height 99-101 %, 150 s"
+        record.do(
+            "1",
+            "reference sphere A, 351 x 304",
+            lambda: fit(scene, stack),
+            target,
+            limits(0.018, 0.008, 0.97, 0.99, 1.01),
+        )
+    pitch = 30.0 * 121 / size
+    raster = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": pitch}
+    for row, name, limit, target in (
+        ("7", "sphere_a", (0.018, 0.008, 0.97, 0.99, 1.01), "as row 1; 45 s"),
+        ("2", "sphere_b", (0.032, 0.012, 0.94, 0.98, 1.02), "rms 3.2 %, valid 1.2 % on >= 94 %, height 98-102 %"),
+    ):
+        record.do(row, f"{name}, {size} x {size}", lambda n=name: fit(*own(n, seed, **raster)), target, limits(*limit))
+
+
+def growth_row(record: Record, seed: int, sizes: tuple[int, ...]) -> None:
+    """Row 8: time against the number of pixels, sphere A."""
+    for n in sizes:
+        raster = {"scan.nx": n, "scan.ny": n, "scan.pixel_size_um": 30.0 * 121 / n}
+        record.do(
+            "8",
+            f"{n} x {n}",
+            lambda r=raster: fit(*own("sphere_a", seed, **r)),
+            "about linear in pixels",
+            lambda c: None,
+        )
+
+
+def pull_row(record: Record, scene_instrument, n_noise: int, size: int) -> None:
+    """Row 4: pulls of repeated noise on a smooth surface made without tracer and render model."""
+
+    def work() -> Case:
+        axis = (np.arange(size) - (size - 1) / 2) * 40.0
+        gx, gy = np.meshgrid(axis, axis)
+        width = 0.12 * size * 40.0
+        height = 60.0 * np.exp(-(gx**2 + gy**2) / (2 * width**2))
+        tx, ty = scene_instrument.beam_shift
+        a, b = -height * gx / width**2, -height * gy / width**2
+        normal = np.stack([-a, -b, 1 - a * tx - b * ty], -1)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        expected = 3.5e4 * np.einsum("kiyx,yxi->kyx", SpotGeometry(scene_instrument).form_factor(height), normal)
+        settings = ReconstructSettings.model_validate({"refine": {"max_rounds": 2, "rays": 100_000}})
+        nothing = lambda h, n: Prediction(np.zeros(expected.shape), np.zeros((len(expected), 3, *h.shape)))  # noqa: E731
+        pulls, inside = [], np.hypot(gx, gy) < 3 * width
+        for seed in range(n_noise):
+            counts = np.random.default_rng(seed).poisson(expected).astype(float)
+            stack = MicrographStack(counts, axis, axis, scene_instrument, variance=expected, n_rays=3.5e4)
+            rec = reconstruct_stack(stack, settings, lambda level: nothing)
+            pulls.append(((rec.height - height) / rec.height_std)[inside & rec.is_valid])
+        one = np.concatenate(pulls)
+        means = np.array([p.mean() for p in pulls])
+        return {
+            "fits": n_noise,
+            "pull_mean": float(one.mean()),
+            "pull_mean_error": float(means.std() / np.sqrt(n_noise)),
+            "pull_std": float(np.sqrt(np.mean(one**2))),
+            "coverage_1": float(np.mean(np.abs(one) < 1)),
+            "coverage_2": float(np.mean(np.abs(one) < 2)),
+        }
+
+    record.do(
+        "4",
+        f"pulls, bump of {size} x {size}",
+        work,
+        "mean 0 +- 0.15, s.d. 0.9-1.15, 63-73 %, 92-98 %",
+        lambda c: bool(abs(c["pull_mean"]) <= 0.15 and 0.9 <= c["pull_std"] <= 1.15),
+    )
+
+
+def ablation_row(record: Record, seed: int, size: int) -> None:
+    """Row 9: each piece of physics switched off on spheres A and B; the change of the RMS over all pixels."""
+    raster = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": 30.0 * 121 / size}
+    n_stages = 3
+    off: dict[str, tuple[dict[str, object], Callable[[Prediction], Prediction]]] = {
+        "all physics": ({}, lambda p: p),
+        "no jumps": ({"jump_limits": (1e9,) * n_stages}, lambda p: p),
+        "no masks": ({}, lambda p: Prediction(p.multiple, 0.0 * p.hidden)),
+        "no multiple scattering": ({}, lambda p: Prediction(0.0 * p.multiple, p.hidden)),
+        "no regulariser": ({"smoothness": 100.0}, lambda p: p),
+    }
+    for name in ("sphere_a", "sphere_b"):
+        for case, (refine, change) in off.items():
+
+            def work(name=name, refine=refine, change=change) -> Case:
+                scene, stack = own(name, seed, **raster)
+                settings = scene.reconstruct.model_dump()
+                settings["refine"] |= {"samples": 0, **refine}
+                chosen = ReconstructSettings.model_validate(settings)
+
+                def make_predict(level):
+                    predict = pipeline.make_predictor(level, chosen.refine.rays, chosen.refine.substrate_um)
+                    return lambda height, normals: change(predict(height, normals))
+
+                start = time.perf_counter()
+                rec = reconstruct_stack(stack, chosen, make_predict)
+                full = score(scene, stack, rec, time.perf_counter() - start)
+                return {key: full[key] for key in ("rms_all", "rms_valid", "height", "seconds")}
+
+            record.do("9", f"{name}, {case}", work, "RMS +10 % on A or B", lambda c: None)
+
+
+def plateau_rows(record: Record, seed: int) -> None:
+    """Rows 5 and 10: a step across the field, and a trench: what is stated, and what is flagged."""
+
+    def step() -> Case:
+        scene, stack = own("step", seed)
+        rec = pipeline.reconstruct(stack, border="free", refine={"albedo_std": 0.05})
+        true = pipeline.true_height(scene, rec).height
+        up = true > 50.0
+        value, std = rec.spread(lambda h: float(np.median(h[up]) - np.median(h[~up])))
+        return {"step_um": value, "std_um": std, "true_um": 100.0, "flagged": float(np.mean(rec.reason == 5))}
+
+    record.do("5", "step of 100 um facing away", step, "std > 20 % of it, floating", lambda c: bool(c["flagged"] > 0.1))
+    for ratio in (0.5, 1.0):
+
+        def trench(ratio=ratio) -> Case:
+            scene, stack = own(
+                "trench", seed, **{"sample.width_um": 240.0, "sample.depth_um": 240.0 * ratio, "scan.ny": 61}
+            )
+            rec = pipeline.reconstruct(stack, "refine")
+            true = pipeline.true_height(scene, rec).height
+            floor = true < -0.9 * 240.0 * ratio
+            depth, std = rec.spread(lambda h: float(np.median(h[~floor]) - np.median(h[floor])))
+            return {"depth_um": depth, "std_um": std, "true_um": 240.0 * ratio, "valid": float(rec.is_valid.mean())}
+
+        def close(c):
+            return bool(abs(c["depth_um"] / c["true_um"] - 1) <= 0.05)
+
+        record.do("10", f"trench, depth/width {ratio:g}", trench, "within 5 %", close)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("HELIO_DATA", ROOT.parent / "shared")))
+    parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
+    parser.add_argument("--rows", default="1,2,4,5,7,8,9,10")
+    parser.add_argument("--tiny", action="store_true")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    wanted = set(args.rows.split(","))
+    record = Record(args.output / ("reconstruction_tiny.json" if args.tiny else "reconstruction.json"), args.seed)
+    instrument = load_scene(SCENES / "sphere_a.toml").instrument
+    if args.tiny:
+        height_rows(record, None, args.seed, 32)
+        pull_row(record, instrument, 3, 32)
+        return
+    shared = args.shared if (args.shared / "data").is_dir() else None
+    if wanted & {"1", "2", "7"}:
+        height_rows(record, shared if "1" in wanted else None, args.seed, 121)
+    if "4" in wanted:
+        pull_row(record, instrument, 40, 48)
+    if wanted & {"5", "10"}:
+        plateau_rows(record, args.seed)
+    if "9" in wanted:
+        ablation_row(record, args.seed, 121)
+    if "8" in wanted:
+        growth_row(record, args.seed, (64, 128, 256))
+
+
+if __name__ == "__main__":
+    main()
