@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from helio_jax.reconstruct.model import Prediction  # noqa: E402
 from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
 from helio_jax.reconstruct.solve import reconstruct_stack  # noqa: E402
 
-Case = dict[str, object]
+Case = dict[str, Any]
 SCENES = ROOT / "scenes"
 
 
@@ -169,6 +170,7 @@ def pull_row(record: Record, scene_instrument, n_noise: int, size: int) -> None:
             counts = np.random.default_rng(seed).poisson(expected).astype(float)
             stack = MicrographStack(counts, axis, axis, scene_instrument, variance=expected, n_rays=3.5e4)
             rec = reconstruct_stack(stack, settings, lambda level: nothing)
+            assert rec.height_std is not None
             pulls.append(((rec.height - height) / rec.height_std)[inside & rec.is_valid])
         one = np.concatenate(pulls)
         means = np.array([p.mean() for p in pulls])

@@ -158,6 +158,10 @@ def reconstruct(
         result = pipeline.reconstruct(read(stack), method, settings=given, report=bar, **_given(border=border))
     write(result, output)
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
+    for name, factor in result.provenance.get("sensitivity", {}).items():
+        print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+    if result.status.startswith("interrupted"):
+        raise KeyboardInterrupt
 
 
 @app.command()

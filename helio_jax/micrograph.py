@@ -106,18 +106,6 @@ class MicrographStack:
         """Counts of order 2 and above [detector, y, x], where the orders are known."""
         return None if self.by_order is None else self.by_order[1:].sum(0)
 
-    def every(self, stride: int) -> "MicrographStack":
-        """Return the stack with every `stride`-th row and column only, the same number left out on both sides.
-
-        A pixel stays what it was: the scattering of one spot, not the mean of several.
-        """
-        rows, columns = (slice(((n - 1) % stride) // 2, None, stride) for n in self.shape[1:])
-        images = ("counts", "variance", "is_observed", "by_order", "effuse", "plate", "masked", "shadowed")
-        taken = {name: v[..., rows, columns] for name in images if (v := getattr(self, name)) is not None}
-        if self.background is not None and self.background.ndim == 3:
-            taken["background"] = self.background[:, rows, columns]
-        return self.replace(x=self.x[columns], y=self.y[rows], **taken)
-
     def replace(self, **changes: Any) -> "MicrographStack":
         """Return a copy with some fields changed (and checked again)."""
         return replace(self, **changes)

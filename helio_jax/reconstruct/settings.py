@@ -38,10 +38,8 @@ class RefineSettings(Settings):
     """Rounds during which gain and offset stay at their prior means, while the prediction is still crude."""
     reweightings: int = Field(default=2, ge=1, le=100)
     """Re-weightings in every later round, with the last limits."""
-    coarsest_pixels: int = Field(default=100, ge=8, le=10_000)
-    """The start is found on every 2nd, 4th, ... row and column while that leaves this many pixels a side."""
-    photometric_rounds: int = Field(default=3, ge=1, le=20)
-    """Photometric solutions on every level, each corrected by a prediction on the last, before the fit."""
+    photometric_rounds: int = Field(default=4, ge=1, le=20)
+    """Photometric solutions, each corrected by a prediction on the last, before the fit."""
     lm_steps: int = Field(default=4, ge=1, le=1000)
     """Levenberg-Marquardt steps per re-weighting."""
     cg_steps: int = Field(default=40, ge=1, le=10_000)

@@ -132,14 +132,6 @@ def _from_solution(stack, settings, height, solution) -> Reconstruction:
     )
 
 
-def _strides(shape: tuple[int, ...], coarsest: int) -> list[int]:
-    """Return the thinning of every level, coarse to fine: powers of two down to `coarsest` pixels a side."""
-    strides = [1]
-    while min(shape[1:]) // (2 * strides[0]) >= coarsest:
-        strides.insert(0, 2 * strides[0])
-    return strides
-
-
 def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     """Return heights and slopes of the photometric solution of albedo 1 that a prediction on a surface corrects."""
     signal, variance = signal_of(stack)
@@ -152,16 +144,6 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     weight = np.ones(stack.shape[1:])
     height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), "weighted", weight)
     return Surface(_limited(_level(height, settings, weight), stack), a, b)
-
-
-def _resampled(surface: Surface, coarse: MicrographStack, fine: MicrographStack) -> Surface:
-    """Return a coarse level's surface on the finer raster: each point continues the plane of its nearest neighbour.
-
-    So kinks and jumps stay between two points and are not smeared.
-    """
-    i, j = (np.abs(c[None, :] - f[:, None]).argmin(1) for c, f in ((coarse.y, fine.y), (coarse.x, fine.x)))
-    height, a, b = (field[np.ix_(i, j)] for field in surface)
-    return Surface(height + a * (fine.x - coarse.x[j])[None, :] + b * (fine.y - coarse.y[i])[:, None], a, b)
 
 
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
@@ -181,26 +163,6 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _multiscale_start(stack, settings, geometry, make_predict) -> "tuple[Surface, Predict]":
-    """Return the corrected photometric solution, found coarse to fine, and the prediction on the full raster."""
-    shift, last = stack.instrument.beam_shift, None
-    surface = Surface(*np.zeros((3, 1, 1)))
-    for stride in _strides(stack.shape, settings.refine.coarsest_pixels):
-        level = stack.every(stride)
-        predict = make_predict(level)
-        if last is None:
-            height, solution = solve_nearfield(level, settings, geometry, settings.rounds)
-            height, normals = _limited(height, level), solution.normals
-        else:
-            surface = _resampled(surface, last, level)
-            height, normals = surface.height, surface.normals(shift)
-        for _ in range(settings.refine.photometric_rounds):
-            surface = _corrected(level, settings, geometry, height, normals, predict)
-            height, normals = surface.height, surface.normals(shift)
-        last = level
-    return surface, predict
-
-
 def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     from helio_jax.reconstruct.refine import fit_heights
 
@@ -208,7 +170,11 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    start, predict = _multiscale_start(stack, settings, geometry, make_predict)
+    predict, shift = make_predict(stack), stack.instrument.beam_shift
+    height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
+    start = _corrected(stack, settings, geometry, _limited(height, stack), solution.normals, predict)
+    for _ in range(settings.refine.photometric_rounds - 1):
+        start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
     signal, variance = signal_of(stack)
     dx, dy = pitch(stack.x), pitch(stack.y)
     fit = fit_heights(signal, variance, geometry, dx, dy, start, settings, predict, report)

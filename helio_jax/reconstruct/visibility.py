@@ -112,9 +112,9 @@ def plan_march(direction: np.ndarray, shape: tuple[int, int], dx: float, dy: flo
 
 
 def hidden_form_factor(
-    height: jax.Array,
-    slope_x: jax.Array,
-    slope_y: jax.Array,
+    height: jax.Array | np.ndarray,
+    slope_x: jax.Array | np.ndarray,
+    slope_y: jax.Array | np.ndarray,
     geometry: SpotGeometry,
     dx: float,
     dy: float,

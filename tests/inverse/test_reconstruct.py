@@ -109,7 +109,7 @@ def test_calibration_undoes_gain_background_and_drift(bshem):
 
 @pytest.mark.slow
 def test_reference_sphere_by_rounds_of_physics(shared):
-    """Binned 3 x 3 reference counts: linear 82-88 %, near field below 6 % RMS, and the fit below that.
+    """Binned 3 x 3 reference counts: linear 82-88 %, near field below 6 % RMS, the fit below 2.5 %, height to 2.5 %.
 
     Rejects a height taken at the raster position instead of the beam frame and a lost near field.
     """
@@ -127,7 +127,7 @@ def test_reference_sphere_by_rounds_of_physics(shared):
         score[method] = pipeline.evaluate(rec, pipeline.true_height(scene, rec))
     assert 0.82 <= score["linear"].recovered_height <= 0.88
     assert score["nearfield"].rms_region <= 0.06 and 0.90 <= score["nearfield"].recovered_height <= 1.03
-    assert score["refine"].rms_region <= score["nearfield"].rms_region
+    assert score["refine"].rms_region <= 0.025 and abs(score["refine"].recovered_height - 1) <= 0.025
 
 
 def test_known_albedo_solution_is_exact_even_with_two_images(bshem):
@@ -155,14 +155,6 @@ def test_prediction_about_a_normal_changes_nothing_there():
     level = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
     is_steep = normals[..., 2] < 0.9
     assert np.all((value(near, level) - value(was, level))[:, is_steep] < 0)
-
-
-def test_every_keeps_pixels_and_their_places(bshem):
-    """Thinning takes whole pixels, symmetrically: rows 0, 2, ... of an odd number of rows."""
-    stack, _, _ = bump_stack(bshem, n=47)
-    thin = stack.every(2)
-    assert thin.shape == (3, 24, 24)
-    assert np.array_equal(thin.counts, stack.counts[:, ::2, ::2]) and np.array_equal(thin.x, stack.x[::2])
 
 
 def test_interrupted_fit_keeps_the_best_so_far(bshem):

@@ -64,8 +64,8 @@ def test_regions_and_floating():
 def test_pulls_of_repeated_noise(bshem):
     """Errors of 4 fits to fresh noise over their stated standard deviation: a root mean square near 1.
 
-    A smooth bump, no masks. The pulls of one fit are strongly correlated, so the limits 0.6 and 1.6 are wide; they reject
-    error bars wrong by a factor of 2. The full study: benchmarks/reconstruction.py.
+    A smooth bump, no masks. The pulls of one fit are strongly correlated, so the limits 0.6 and 1.6 are wide; they
+    reject error bars wrong by a factor of 2. The full study: benchmarks/reconstruction.py.
     """
     from tests.inverse.test_reconstruct import bump_stack
 

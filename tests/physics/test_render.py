@@ -57,7 +57,9 @@ def test_render_is_the_tracers_single_scattering(instrument):
     height, normal = cap(instrument, x, y)
     with jax.enable_x64(True):
         rendered = np.asarray(render_single(height, normal, hidden, geometry))
-        mirrored = np.asarray(render_single(height.T, normal[[1, 0, 2]].swapaxes(1, 2), hidden.swapaxes(2, 3), geometry))
+        mirrored = np.asarray(
+            render_single(height.T, normal[[1, 0, 2]].swapaxes(1, 2), hidden.swapaxes(2, 3), geometry)
+        )
         far = np.asarray(render_single(np.zeros_like(height), normal, hidden, geometry))
     assert np.abs(rendered / traced - 1.0).max() < 1e-9
     assert np.abs(mirrored.swapaxes(1, 2) / traced - 1.0).max() > 0.03
