@@ -98,6 +98,8 @@ def run(
     print("\nfiles:")
     for label, path in result.files.items():
         print(f"  {label:<12} {path}")
+    if result.status.startswith("interrupted"):
+        raise KeyboardInterrupt
 
 
 @app.command()

@@ -26,9 +26,8 @@ def small_scene(tmp_path_factory) -> Path:
     text = text.replace("nx = 121", "nx = 31").replace("ny = 121", "ny = 31")
     text = text.replace("pixel_size_um = 30.0", "pixel_size_um = 117.0")
     path = tmp_path_factory.mktemp("scene") / "small.toml"
-    path.write_text(
-        text.replace('method = "refine"', 'method = "nearfield"') + "\n[reconstruct.refine]\nmax_rounds = 1\n"
-    )
+    text = text.replace("[reconstruct.refine]", "[reconstruct.refine]\nmax_rounds = 1")
+    path.write_text(text.replace('method = "refine"', 'method = "nearfield"'))
     return path
 
 
