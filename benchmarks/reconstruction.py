@@ -169,7 +169,7 @@ def pull_row(record: Record, scene_instrument, n_noise: int, size: int) -> None:
         for seed in range(n_noise):
             counts = np.random.default_rng(seed).poisson(expected).astype(float)
             stack = MicrographStack(counts, axis, axis, scene_instrument, variance=expected, n_rays=3.5e4)
-            rec = reconstruct_stack(stack, settings, lambda level: nothing)
+            rec = reconstruct_stack(stack, settings, lambda n_rays: nothing)
             assert rec.height_std is not None
             pulls.append(((rec.height - height) / rec.height_std)[inside & rec.is_valid])
         one = np.concatenate(pulls)
@@ -212,8 +212,8 @@ def ablation_row(record: Record, seed: int, size: int) -> None:
                 settings["refine"] |= {"samples": 0, **refine}
                 chosen = ReconstructSettings.model_validate(settings)
 
-                def make_predict(level):
-                    predict = pipeline.make_predictor(level, chosen.refine.rays, chosen.refine.substrate_um)
+                def make_predict(n_rays):
+                    predict = pipeline.make_predictor(stack, n_rays, chosen.refine.substrate_um)
                     return lambda height, normals: change(predict(height, normals))
 
                 start = time.perf_counter()

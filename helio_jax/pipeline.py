@@ -34,7 +34,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
-from helio_jax.reconstruct.visibility import hidden_form_factor
+from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres, flat_body, surface_body
@@ -48,6 +48,8 @@ SMOOTH_PIXELS = 1.0
 """Gaussian width over which the traced multiple scattering is averaged [pixels] ..."""
 SMOOTH_BEND = 0.2
 """... and the difference of unit normals at which a neighbour counts less."""
+_SMOOTH_RIDGE = 0.1
+"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
 MAX_BURIED = 0.05
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
 LIFT_PIXELS = 0.1
@@ -117,33 +119,41 @@ def make_predictor(
         tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers, first=first, max_lost=MAX_BURIED)
         multiple = tally.probability()[0][1].reshape(-1, *height.shape)
         a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
-        hidden = np.asarray(hidden_form_factor(height, a, b, geometry, dx, dy))
-        return Prediction(smooth_along_surface(multiple, normals), hidden)
+        about = (geometry, dx, dy)
+        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
+        return Prediction(
+            smooth_along_surface(multiple, normals),
+            hidden,
+            lambda change: np.asarray(hidden_response(height, a, b, *about, change)),
+        )
 
     return predict
 
 
 def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return images [detector, y, x] averaged over neighbours whose unit normals [y, x, 3] are alike.
+    """Return images [detector, y, x] smoothed over neighbours whose unit normals [y, x, 3] are alike.
 
-    A joint bilateral filter: traced noise is averaged, the bend at a sphere's rim stays sharp. Source: Petschnigg
-    et al., ACM Trans. Graph. 23 (2004) 664, eq. 3.
+    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
+    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
+    mean over neighbours on one side would flatten. Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004)
+    664, eq. 3; local planes: Fan and Gijbels, Local Polynomial Modelling (1996), sec. 3.1.
     """
     reach = int(np.ceil(2.5 * SMOOTH_PIXELS))
     margin = ((reach, reach), (reach, reach), (0, 0))
     both = np.concatenate([np.moveaxis(images, 0, -1), normals], -1)
     around = np.pad(both, margin, mode="edge")
     ny, nx = images.shape[1:]
-    total, weights = np.zeros((ny, nx, len(images))), np.zeros((ny, nx))
-    for i in range(2 * reach + 1):
-        for j in range(2 * reach + 1):
-            near = around[i : i + ny, j : j + nx]
-            distance = ((i - reach) ** 2 + (j - reach) ** 2) / SMOOTH_PIXELS**2
+    matrix, right = np.zeros((ny, nx, 3, 3)), np.zeros((ny, nx, 3, len(images)))
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            near = around[reach + i : reach + i + ny, reach + j : reach + j + nx]
             bend = ((near[..., -3:] - normals) ** 2).sum(-1) / SMOOTH_BEND**2
-            weight = np.exp(-0.5 * (distance + bend))
-            total += weight[..., None] * near[..., :-3]
-            weights += weight
-    return np.moveaxis(total / weights[..., None], -1, 0)
+            weight = np.exp(-0.5 * ((i**2 + j**2) / SMOOTH_PIXELS**2 + bend))
+            basis = np.array([1.0, i, j])
+            matrix += weight[..., None, None] * np.outer(basis, basis)
+            right += weight[..., None, None] * basis[:, None] * near[..., None, :-3]
+    matrix += _SMOOTH_RIDGE * np.diag([0.0, 1.0, 1.0])
+    return np.moveaxis(np.linalg.solve(matrix, right)[..., 0, :], -1, 0)
 
 
 def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None) -> MicrographStack:
@@ -179,7 +189,7 @@ def reconstruct(
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
     refine = chosen.refine
-    return reconstruct_stack(one, chosen, lambda level: make_predictor(level, refine.rays, refine.substrate_um), report)
+    return reconstruct_stack(one, chosen, lambda n_rays: make_predictor(one, n_rays, refine.substrate_um), report)
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:

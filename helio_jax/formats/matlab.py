@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
@@ -143,7 +144,7 @@ def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) ->
     fields = {
         "counts": counts,
         "by_order": by_order,
-        "variance": np.maximum(counts, 1.0),
+        "variance": np.maximum(_mean_of_neighbours(counts), 1.0),
         "x": _centred(counts.shape[2], step_x),
         "y": _centred(counts.shape[1], step_y),
         "n_rays": get_number(path, get_table(path, tree, "param"), "rays_per_pixel", low=0.0),
@@ -152,7 +153,7 @@ def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) ->
     }
     notes = {
         "orientation": "columns reversed, rows kept, x pitch divided by cos(incidence)",
-        "variance_from": "Poisson: the count itself, at least 1",
+        "variance_from": "Poisson: mean count of the 8 neighbours, at least 1",
     }
     return fields, notes
 
@@ -266,6 +267,16 @@ def _centred(n: int, step: float) -> np.ndarray:
 def _per_detector(values: list[float], shape: tuple[int, ...]) -> np.ndarray:
     """Spread one value per detector over images of `shape`."""
     return np.broadcast_to(np.asarray(values)[:, None, None], (len(values), *shape)).copy()
+
+
+def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
+    """Return the mean of the 8 neighbours of every pixel [detector, y, x]: its expected count, free of its own noise.
+
+    With weights 1 / count, low counts weigh more and every mean comes out one count too low (at 400 counts that is as
+    much as an offset of -0.25 %). Source: Mighell, ApJ 518 (1999) 380, sec. 2.
+    """
+    padded = np.pad(np.asarray(counts, float), ((0, 0), (1, 1), (1, 1)), mode="reflect")
+    return (9.0 * uniform_filter(padded, (0, 3, 3))[:, 1:-1, 1:-1] - counts) / 8.0
 
 
 def _noise_variance(image: np.ndarray, fast: str) -> float:

@@ -73,7 +73,7 @@ class SpotGeometry:
     def __init__(self, instrument: Instrument, n_rim: int = N_RIM) -> None:
         self.instrument = instrument
         self.rims = rim_table(instrument, n_rim)
-        self._key = (instrument.model_dump_json(), n_rim)
+        self._key = (type(self).__name__, instrument.model_dump_json(), n_rim)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SpotGeometry) and self._key == other._key

@@ -5,7 +5,8 @@ known of the instrument: priors of gain, offset and of the scale of the predicte
 holds all that is constant during one least-squares solve. How it is solved is `refine`'s matter.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,10 +31,12 @@ class Prediction:
     Attributes:
         multiple: detection probability of order 2 and above [detector, y, x].
         hidden: hidden part of the vector form factor [detector, 3, y, x].
+        response: change of `hidden` per change of the heights in a given way [y, x], or None where not known.
     """
 
     multiple: np.ndarray
     hidden: np.ndarray
+    response: Callable[[np.ndarray], np.ndarray] | None = None
 
     def about(self, normals: np.ndarray) -> "Prediction":
         """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
@@ -47,7 +50,7 @@ class Prediction:
         slope = np.where(up < _LEVEL, self.multiple / np.maximum(1.0 - up, 1.0 - _LEVEL), 0.0)
         hidden = self.hidden.copy()
         hidden[:, 2] += slope
-        return Prediction(self.multiple + slope * up, hidden)
+        return replace(self, multiple=self.multiple + slope * up, hidden=hidden)
 
     def doubt(self, normals: np.ndarray, mask_error: float, multiple_error: float) -> np.ndarray:
         """Return the standard deviation to be expected of it [detector, y, x], for unit normals [y, x, 3].
@@ -82,12 +85,20 @@ class Surface(NamedTuple):
 
 
 class Lagged(NamedTuple):
-    """Everything the residuals hold fixed during one least-squares solve."""
+    """Everything the residuals hold fixed during one least-squares solve.
+
+    What is hidden follows the levels of the plateaus: `plateau` [plateau, y, x] are the weights whose sum over the
+    heights is a plateau's level above the ground, `level` [plateau] its value at the prediction and `level_response`
+    [plateau, detector, 3, y, x] the change of `hidden` per um of it.
+    """
 
     data: Any
     inverse_sigma: Any
     multiple: Any
     hidden: Any
+    plateau: Any
+    level: Any
+    level_response: Any
     intact_x: Any
     intact_y: Any
     edge_x: Any
@@ -164,7 +175,9 @@ class Model(eqx.Module):
 
     def counts(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
         """Return the expected data [detector, y, x] in units of the beam."""
-        single = render_single(surface.height, self.normal(surface), lagged.hidden, self.geometry)
+        rise = jnp.einsum("ryx,yx->r", lagged.plateau, surface.height) - lagged.level
+        hidden = lagged.hidden + jnp.tensordot(rise, lagged.level_response, 1)
+        single = render_single(surface.height, self.normal(surface), hidden, self.geometry)
         albedo = smooth_albedo(unknowns.albedo, surface.height.shape, self.albedo_std)
         gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
         offset = (lagged.offset_std * unknowns.offset)[:, None, None]

@@ -131,7 +131,9 @@ def _solve(model: Model, start: Unknowns, lagged: Lagged, max_steps: int, cg_ste
 class Refiner:
     """State of one fit: the data, the current surface and instrument, and the lagged quantities."""
 
-    def __init__(self, signal, variance, geometry, dx, dy, start: Surface, settings: ReconstructSettings) -> None:
+    def __init__(
+        self, signal, variance, geometry, dx, dy, start: Surface, settings: ReconstructSettings, region=None
+    ) -> None:
         s = settings.refine
         self.signal, self.variance, self.settings = signal, variance, s
         self.model = Model(geometry, dx, dy, s.albedo_std)
@@ -145,6 +147,7 @@ class Refiner:
         shape = start.height.shape
         self.whitening = _whitening(shape, dx, dy, self.slope_noise)
         self.border = _border_weight(shape, settings)
+        self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
         self.surface = Surface(*map(np.asarray, start))
         k, n = signal.shape[0], s.albedo_modes
         self.log_gain, self.offset, self.log_multiple, self.albedo = (
@@ -154,23 +157,30 @@ class Refiner:
             np.zeros((n, n)),
         )
         nothing = np.zeros(signal.shape)
-        self.prediction = Prediction(nothing, np.stack([nothing] * 3, 1))
-        self.predicted_normals = np.zeros((*shape, 3))
+        self.prediction, self.predicted_on = Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface
+        self.level_response = np.zeros((len(self.plateau), k, 3, *shape))
         self.residuals = np.zeros(signal.shape)
         self.weight = np.ones(signal.shape)
 
-    def lag(
-        self, prediction: Prediction, limit: float, cut: float, is_instrument_free: bool = True
-    ) -> tuple[Unknowns, Lagged]:
+    def predict(self, predict: Predict) -> None:
+        """Predict masks and multiple scattering on the current surface, and how masks follow the plateaus' levels."""
+        self.predicted_on = self.surface
+        self.prediction = predict(self.surface.height, self.surface.normals(self.shift))
+        if self.prediction.response is not None:
+            for i, weights in enumerate(self.plateau):
+                self.level_response[i] = self.prediction.response((weights > 0).astype(float))
+
+    def lag(self, limit: float, cut: float, is_instrument_free: bool = True) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
         s, m = self.settings, self.model
         height, slope_x, slope_y = self.surface
         normal = np.moveaxis(self.surface.normals(self.shift), -1, 0)
-        doubt = prediction.doubt(self.predicted_normals, s.mask_error, s.multiple_error)
+        predicted_normals = self.predicted_on.normals(self.shift)
+        doubt = self.prediction.doubt(predicted_normals, s.mask_error, s.multiple_error)
         sigma = np.sqrt(self.variance + doubt**2)
         self.sigma = np.where(self.observed, sigma, np.inf)
         self.weight = geman_mcclure(self.residuals, limit)
-        prediction = prediction.about(self.predicted_normals)
+        prediction = self.prediction.about(predicted_normals)
         edges_x = find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut)
         edges_y = find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut)
         self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
@@ -191,6 +201,9 @@ class Refiner:
             inverse_sigma=self.weight / self.sigma,
             multiple=prediction.multiple,
             hidden=prediction.hidden,
+            plateau=self.plateau,
+            level=np.einsum("ryx,yx->r", self.plateau, self.predicted_on.height),
+            level_response=self.level_response,
             intact_x=edges_x.intact,
             intact_y=edges_y.intact,
             edge_x=edges_x.weight,
@@ -218,10 +231,10 @@ class Refiner:
         steepness = 1.0 + self.surface.slope_x**2 + self.surface.slope_y**2
         return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / (self.slope_noise * steepness) ** 2)
 
-    def step(self, prediction: Prediction, limit: float, cut: float, is_instrument_free: bool) -> Solution:
+    def step(self, limit: float, cut: float, is_instrument_free: bool) -> Solution:
         """Solve one weighted least-squares problem from the current surface."""
         s = self.settings
-        found = _solve(self.model, *self.lag(prediction, limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
+        found = _solve(self.model, *self.lag(limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
         self.surface = Surface(*map(np.asarray, found.surface))
         self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
         self.log_multiple = np.asarray(found.unknowns.log_multiple)
@@ -229,6 +242,19 @@ class Refiner:
         difference = np.asarray(found.counts) - np.where(self.observed, self.signal, 0.0)
         self.residuals = difference / self.sigma
         return found
+
+    def misfit(self, limit: float, cut: float) -> float:
+        """Return half the robust chi-square of data and edges, with the data's normalisation."""
+        weight = geman_mcclure(self.residuals, limit)
+        data = 0.5 * limit**2 * np.sum(1.0 - weight) + np.sum(np.log(self.sigma[self.observed]))
+        edges = (
+            find_edges(self.surface.height, slope, pitch, axis, self.slope_noise, cut)
+            for slope, pitch, axis in (
+                (self.surface.slope_x, self.model.dx, 1),
+                (self.surface.slope_y, self.model.dy, 0),
+            )
+        )
+        return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.intact)) for e in edges))
 
 
 def _thinning(shape: tuple[int, int]) -> int:
@@ -239,7 +265,7 @@ def _thinning(shape: tuple[int, int]) -> int:
     return stride
 
 
-def _posterior(refiner: Refiner, settings: ReconstructSettings) -> Posterior | None:
+def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarray | None) -> Posterior | None:
     """Return the posterior at the fit, on a thinned raster where the full one is too large.
 
     There a pixel stands for stride^2 data. A kink lies in one of `stride` edges of each of `stride` parallel paths, so
@@ -258,15 +284,16 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings) -> Posterior | N
         m.dy * stride,
         Surface(*(field[thin] for field in refiner.surface)),
         settings,
+        None if region is None else region[thin],
     )
     for name in ("log_gain", "offset", "log_multiple", "albedo"):
         setattr(part, name, getattr(refiner, name))
     part.residuals = refiner.residuals[:, *thin]
-    part.predicted_normals = refiner.predicted_normals[thin]
     p = refiner.prediction
-    unknowns, lagged = part.lag(
-        Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin]), s.robust_limits[-1], s.jump_limits[-1]
-    )
+    part.predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
+    part.prediction = Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin])
+    part.level_response = refiner.level_response[..., *thin]
+    unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(
         inverse_sigma=lagged.inverse_sigma * stride,
         edge_x=lagged.edge_x * stride**1.5,
@@ -274,6 +301,13 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings) -> Posterior | N
     )
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples)
     return found.on_raster(refiner.signal.shape[1:], stride)
+
+
+def _plateau_weights(region: np.ndarray) -> np.ndarray:
+    """Return the weights [plateau, y, x] whose sum over the heights is a plateau's level above the ground, region 0."""
+    numbers = np.unique(region[region > 0])[:, None, None]
+    ground, plateau = ((region == n).astype(float) for n in (0, numbers))
+    return plateau / plateau.sum((1, 2), keepdims=True) - ground / ground.sum()
 
 
 def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
@@ -286,6 +320,32 @@ def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.
     return weight
 
 
+def misfit_on(
+    signal: np.ndarray,
+    variance: np.ndarray,
+    geometry: SpotGeometry,
+    dx: float,
+    dy: float,
+    surface: Surface,
+    settings: ReconstructSettings,
+    predict: Predict,
+) -> tuple[float, Surface]:
+    """Return half the robust chi-square that is left when a surface's relief is fitted to the data, and that surface.
+
+    Counts data with the logarithm of their assumed deviations, edges and bends; instrument at its prior means.
+    Arguments as those of `fit_heights`.
+    """
+    s = settings.refine
+    with jax.enable_x64(True):
+        refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings)
+        refiner.predict(predict)
+        for _ in range(s.reweightings):
+            found = refiner.step(s.robust_limits[-1], s.jump_limits[-1], False)
+    return refiner.misfit(s.robust_limits[-1], s.jump_limits[-1]) + float(
+        found.cost["bend_x"] + found.cost["bend_y"]
+    ), refiner.surface
+
+
 def fit_heights(
     signal: np.ndarray,
     variance: np.ndarray,
@@ -296,6 +356,7 @@ def fit_heights(
     settings: ReconstructSettings,
     predict: Predict,
     report: Report | None = None,
+    region: np.ndarray | None = None,
 ) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
 
@@ -309,12 +370,13 @@ def fit_heights(
         settings: priors, steps, rounds.
         predict: multiple scattering and hidden form factor on a surface.
         report: called before each outer round.
+        region: plateaus, from `find_plateaus` [y, x], whose masks are to follow their levels.
 
     Source: own derivation; Levenberg-Marquardt of optimistix; lagged robust weights (Geman and McClure, 1987).
     """
     s = settings.refine
     with jax.enable_x64(True):
-        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings)
+        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region)
         changes: list[float] = []
         is_interrupted = False
         said = "start"
@@ -323,11 +385,10 @@ def fit_heights(
             try:
                 if report:
                     report(number, s.max_rounds, said)
-                refiner.predicted_normals = before.normals(refiner.shift)
-                prediction = refiner.prediction = predict(before.height, refiner.predicted_normals)
+                refiner.predict(predict)
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
-                    found = refiner.step(prediction, limit, cut, number >= s.fixed_rounds)
+                    found = refiner.step(limit, cut, number >= s.fixed_rounds)
             except KeyboardInterrupt:
                 if not changes:
                     raise
@@ -338,7 +399,7 @@ def fit_heights(
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um:
                 break
-        posterior = None if is_interrupted else _posterior(refiner, settings)
+        posterior = None if is_interrupted else _posterior(refiner, settings, region)
         return _finish(refiner, changes, is_interrupted, posterior)
 
 

@@ -6,6 +6,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +19,15 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Surface
+from helio_jax.reconstruct.plateaus import find_plateaus, joined, search_levels, unexplained
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.validity import floating, reasons_from_data, reasons_from_fit, regions
 from helio_jax.reconstruction import Reconstruction
+
+MAX_WIDTH = 0.125
+"""Plateaus are searched up to twice this share of the sample distance above and below the ground ..."""
+SEARCH_THRIFT = 8
+"""... with this many times fewer paths per prediction than the fit."""
 
 if TYPE_CHECKING:
     from helio_jax.reconstruct.refine import Fit, Predict, Report
@@ -81,7 +88,7 @@ def _limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
 def reconstruct_stack(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    make_predict: "Callable[[MicrographStack], Predict] | None" = None,
+    make_predict: "Callable[[int], Predict] | None" = None,
     report: "Report | None" = None,
 ) -> Reconstruction:
     """Turn three or more micrographs into heights.
@@ -89,7 +96,7 @@ def reconstruct_stack(
     Args:
         stack: images of one scan; background known or zero.
         settings: method and options.
-        make_predict: for `refine`: from a stack to what a surface on its raster does beyond single scattering.
+        make_predict: for `refine`: from a number of paths to what predicts, with them, all but single scattering.
         report: called before each round of `refine`.
 
     Raises:
@@ -163,21 +170,53 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
-    from helio_jax.reconstruct.refine import fit_heights
+def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "Fit":
+    """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit."""
+    from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
+    signal, variance = signal_of(stack)
+    problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
+    fit = fit_heights(*problem, start, settings, predict, report)
+    region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
+    roughly = make_predict(max(settings.refine.rays // SEARCH_THRIFT, 1000))
+    for is_last in (False, True):
+        single = unexplained(region, fit.residuals)
+        left = single if is_last else joined(single)
+        if fit.is_interrupted or not left.any():
+            break
+        try:
+            moved, numbers = search_levels(
+                left,
+                fit.surface,
+                (pitch(stack.y), pitch(stack.x)),
+                MAX_WIDTH * stack.instrument.sample_distance,
+                lambda surface: misfit_on(*problem, surface, settings, roughly),
+                lambda said: report(0, settings.refine.max_rounds, said) if report else None,
+            )
+            if numbers:
+                is_moved = np.isin(left, numbers)
+                levelled[is_moved] = levelled.max() + left[is_moved]
+                fit = fit_heights(*problem, moved, settings, predict, report, levelled)
+            elif np.unique(left).size == np.unique(single).size:
+                break
+        except KeyboardInterrupt:
+            fit = replace(fit, status=f"interrupted in the search for plateaus; before that: {fit.status}")
+            break
+    return fit
+
+
+def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     if make_predict is None:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    predict, shift = make_predict(stack), stack.instrument.beam_shift
+    predict, shift = make_predict(settings.refine.rays), stack.instrument.beam_shift
     height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
     start = _corrected(stack, settings, geometry, _limited(height, stack), solution.normals, predict)
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
-    signal, variance = signal_of(stack)
-    dx, dy = pitch(stack.x), pitch(stack.y)
-    fit = fit_heights(signal, variance, geometry, dx, dy, start, settings, predict, report)
+    fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+    signal, _ = signal_of(stack)
     posterior = fit.posterior
     is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:

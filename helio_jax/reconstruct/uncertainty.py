@@ -11,6 +11,7 @@ angle, step) gets its error bar from the same samples.
 On rasters above `MAX_PIXELS` every 2nd (4th, ...) row and column stands for the rest, which is stated in the result.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -33,14 +34,39 @@ class Linearised:
     Attributes:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
+        far: derivative with respect to the levels of the plateaus through what they hide [residual, plateau], per um;
+            it adds far @ plateau.T to `surface`.
+        plateau: derivative of the levels with respect to the surface [3 * pixel, plateau].
         names: of the instrument parameters.
         shape: of the raster (y, x).
     """
 
     surface: sparse.csr_matrix
     instrument: np.ndarray
+    far: np.ndarray
+    plateau: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
+
+    def transposed(self, residuals: np.ndarray) -> np.ndarray:
+        """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
+        return self.surface.T @ residuals + self.plateau @ (self.far.T @ residuals)
+
+    def solver(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the function that solves with the information matrix of the surface, for [3 * pixel, ...].
+
+        The sparse part is factorised, the plateaus' part is added by the Woodbury identity.
+        """
+        information = (self.surface.T @ self.surface).tocsc()
+        factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        n = self.far.shape[1]
+        if n == 0:
+            return factor.solve
+        update = np.hstack([self.surface.T @ self.far, self.plateau])
+        middle = np.block([[np.zeros((n, n)), np.eye(n)], [np.eye(n), self.far.T @ self.far]])
+        answer = factor.solve(update)
+        small = np.linalg.inv(middle) + update.T @ answer
+        return lambda right: (free := factor.solve(right)) - answer @ np.linalg.solve(small, update.T @ free)
 
 
 @dataclass(frozen=True)
@@ -107,7 +133,7 @@ class _Rows:
 
 @eqx.filter_jit
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
-    """Return how data residuals and normals of a pixel follow its own height and slopes, and the instrument."""
+    """Return how data residuals and normals of a pixel follow its own height and slopes, the instrument, the levels."""
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
 
@@ -118,7 +144,11 @@ def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lag
     normal = [along(model.normal, d) for d in directions]
     free = {name: getattr(unknowns, name) for name in model.instrument_fields}
     instrument = jax.jacfwd(lambda v: model.data_residuals(surface, unknowns._replace(**v), lagged))(free)
-    return data, normal, instrument
+    rise = jnp.zeros_like(lagged.level)  # all heights raised by the same, as above, raise no plateau above the ground
+    levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
+        rise
+    )
+    return data, normal, instrument, levels
 
 
 def _ends(pixel: np.ndarray, axis: int, n: int) -> list[np.ndarray]:
@@ -134,7 +164,7 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
-    data, normal, found = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    data, normal, found, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
     by_parameter = {name: found[name] for name in model.instrument_fields}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
@@ -161,7 +191,11 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     instrument = np.zeros((rows.n_rows + len(names), len(names)))
     instrument[:n_data] = columns
     instrument[-len(names) :] = np.eye(len(names))
-    return Linearised(matrix, instrument, tuple(names), shape)
+    plateau = np.asarray(lagged.plateau)
+    far, of_surface = np.zeros((len(instrument), len(plateau))), np.zeros((3 * pixel.size, len(plateau)))
+    far[:n_data] = levels.reshape(n_data, len(plateau))
+    of_surface[::3] = plateau.reshape(len(plateau), pixel.size).T
+    return Linearised(matrix, instrument, far, of_surface, tuple(names), shape)
 
 
 def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0) -> Posterior:
@@ -175,17 +209,15 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0) -> Poste
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case.
     """
-    js, jc = linear.surface, linear.instrument
+    jc, solve = linear.instrument, linear.solver()
     n_rows = jc.shape[0]
-    information = (js.T @ js).tocsc()
-    factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    border = js.T @ jc
-    answer = factor.solve(border)
+    border = linear.transposed(jc)
+    answer = solve(border)
     covariance = np.linalg.inv(jc.T @ jc - border.T @ answer)
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((n_rows, n_samples))
-    right_s, right_c = js.T @ noise, jc.T @ noise
-    free = factor.solve(right_s)
+    right_s, right_c = linear.transposed(noise), jc.T @ noise
+    free = solve(right_s)
     instrument = covariance @ (right_c - border.T @ free)
     surface = free - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
@@ -194,7 +226,7 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0) -> Poste
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:
     """Return the posterior covariance of the heights [y * x, y * x], um^2, dense; for rasters of up to 32 x 32."""
-    both = np.hstack([linear.surface.toarray(), linear.instrument])
+    both = np.hstack([linear.surface.toarray() + linear.far @ linear.plateau.T, linear.instrument])
     covariance = np.linalg.inv(both.T @ both)
     n = 3 * linear.shape[0] * linear.shape[1]
     return covariance[:n:3, :n:3]

@@ -141,6 +141,27 @@ def hidden_form_factor(
         return _hidden_form_factor(height, slope_x, slope_y, geometry, float(dx), float(dy), n_slices, float(width))
 
 
+def hidden_response(
+    height: np.ndarray,
+    slope_x: np.ndarray,
+    slope_y: np.ndarray,
+    geometry: SpotGeometry,
+    dx: float,
+    dy: float,
+    change: np.ndarray,
+) -> jax.Array:
+    """Return the derivative of `hidden_form_factor` [detector, 3, y, x] along a change of the heights [y, x]."""
+    with jax.enable_x64(True):
+        return _hidden_response(jnp.asarray(height), slope_x, slope_y, geometry, float(dx), float(dy), change)
+
+
+@partial(jax.jit, static_argnums=(3, 4, 5))
+def _hidden_response(height, slope_x, slope_y, geometry, dx, dy, change):
+    return jax.jvp(
+        lambda h: hidden_form_factor(h, slope_x, slope_y, geometry, dx, dy), (height,), (jnp.asarray(change),)
+    )[1]
+
+
 @partial(jax.jit, static_argnums=(3, 4, 5, 6, 7))
 def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, width):
     instrument, shape = geometry.instrument, height.shape

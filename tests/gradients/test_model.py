@@ -16,7 +16,7 @@ SHAPE, PITCH = (9, 11), 30.0
 
 @pytest.fixture(scope="module")
 def problem(bshem):
-    """A rough surface with a kink, a jump, hidden parts, multiple scattering and a free albedo, and its unknowns."""
+    """A rough surface with a kink, a jump, two plateaus, hidden parts, multiple scattering and free albedo."""
     rng = np.random.default_rng(3)
     geometry = SpotGeometry(bshem)
     height = rng.normal(scale=8.0, size=SHAPE)
@@ -27,12 +27,16 @@ def problem(bshem):
     signal[1, 2, 3] = np.nan
     settings = ReconstructSettings(refine=RefineSettings(albedo_std=0.05, albedo_modes=3))
     surface = Surface(height, *slopes)
-    refiner = Refiner(signal, (0.03 * np.nan_to_num(signal, nan=1.0)) ** 2, geometry, PITCH, PITCH, surface, settings)
+    variance = (0.03 * np.nan_to_num(signal, nan=1.0)) ** 2
+    region = np.zeros(SHAPE, int)
+    region[2:5, 2:5], region[6:8, 5:9] = 1, 3
+    refiner = Refiner(signal, variance, geometry, PITCH, PITCH, surface, settings, region)
     with jax.enable_x64(True):
-        refiner.predicted_normals = surface.normals(bshem.beam_shift)
         hidden = rng.uniform(0, 0.1, (3, 3, *SHAPE)) * geometry.form_factor(height)
-        prediction = Prediction(0.2 * np.nan_to_num(signal), hidden)
-        yield refiner.model, *refiner.lag(prediction, 8.0, 3.0)
+        response = rng.normal(scale=1e-4, size=hidden.shape)
+        prediction = Prediction(0.2 * np.nan_to_num(signal), hidden, lambda change: response * (1.0 + change.mean()))
+        refiner.predict(lambda height, normals: prediction)
+        yield refiner.model, *refiner.lag(8.0, 3.0)
 
 
 def random_direction(unknowns, seed):
@@ -99,7 +103,11 @@ def test_sparse_jacobian_is_the_automatic_one(problem):
         change = jax.jvp(lambda u: model.surface(u, lagged), (unknowns,), (direction,))[1]
     surface = np.stack([np.asarray(part).ravel() for part in change], 1).ravel()
     instrument = np.concatenate([np.asarray(getattr(direction, n)).ravel() for n in model.instrument_fields])
-    ours = linear.surface @ surface + linear.instrument @ instrument
+    levels = linear.plateau.T @ surface
+    assert (
+        linear.far.shape[1] == 2 and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
+    )
+    ours = linear.surface @ surface + linear.far @ levels + linear.instrument @ instrument
     order = ("data", "edge_x", "edge_y", "bend_x", "bend_y", "border", "gain", "offset", "multiple", "albedo")
     theirs = np.concatenate([np.asarray(slope[name]).ravel() for name in order])
     assert set(order) == set(value)

@@ -10,7 +10,7 @@ from helio_jax.reconstruct.uncertainty import Linearised, exact_height_covarianc
 from helio_jax.reconstruct.validity import floating, regions
 
 
-def random_problem(shape=(4, 5), n_parameters=3, seed=0) -> Linearised:
+def random_problem(shape=(4, 5), n_parameters=3, n_plateaus=2, seed=0) -> Linearised:
     rng = np.random.default_rng(seed)
     n = 3 * shape[0] * shape[1]
     matrix = sparse.random(5 * n, n, density=0.1, random_state=1, format="csr") + sparse.vstack(
@@ -19,7 +19,9 @@ def random_problem(shape=(4, 5), n_parameters=3, seed=0) -> Linearised:
     instrument = matrix @ rng.normal(size=(n, n_parameters)) + 0.1 * rng.normal(size=(5 * n, n_parameters))
     rows = sparse.vstack([matrix, sparse.csr_matrix((n_parameters, n))], format="csr")
     names = tuple(f"p[{i}]" for i in range(n_parameters))
-    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), names, shape)
+    far = 0.3 * rng.normal(size=(5 * n + n_parameters, n_plateaus))
+    plateau = rng.normal(size=(n, n_plateaus))
+    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), far, plateau, names, shape)
 
 
 def test_samples_have_the_dense_covariance():
@@ -33,7 +35,8 @@ def test_samples_have_the_dense_covariance():
     assert np.allclose(found.height_std.ravel(), np.sqrt(np.diag(exact)), rtol=0.025)
     sampled = np.cov(found.samples.reshape(20_000, -1).T)
     assert np.abs(sampled - exact).max() < 5 * exact.max() / np.sqrt(20_000)
-    fixed = np.linalg.inv((linear.surface.T @ linear.surface).toarray())[::3, ::3]
+    dense = linear.surface.toarray() + linear.far @ linear.plateau.T
+    fixed = np.linalg.inv(dense.T @ dense)[::3, ::3]
     assert (np.sqrt(np.diag(exact) / np.diag(fixed)) > 1.05).any()
 
 
@@ -41,7 +44,7 @@ def test_response_is_what_a_forced_parameter_does():
     """Minimising with one parameter forced to 1 and the others held moves the heights by `response`, exactly."""
     linear = random_problem()
     found = sample_posterior(linear, 1)
-    dense = linear.surface.toarray()
+    dense = linear.surface.toarray() + linear.far @ linear.plateau.T
     moved = np.linalg.lstsq(dense, -linear.instrument[:, 1], rcond=None)[0]
     assert np.allclose(found.response[1].ravel(), moved[::3], atol=1e-10)
 

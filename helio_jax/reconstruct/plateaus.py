@@ -1,0 +1,192 @@
+"""Plateaus: regions that depth jumps part from the ground, found in the images and set to the level they ask for.
+
+Slopes say nothing about the height of a floor behind a wall that the beam does not see: a least-squares fit bridges the
+wall by slopes that the images contradict. The images show the wall, though: across a mask's edge one detector changes,
+across a wall two or more do. `find_plateaus` parts the image along such lines; `search_levels` tries each
+region at a number of levels, all physics predicted anew, and keeps the one that explains the images best.
+The level is then fitted like every other height, and its error bar says whether masks or the near field fix it.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    binary_erosion,
+    distance_transform_edt,
+    label,
+    maximum_filter,
+    uniform_filter,
+)
+from scipy.optimize import minimize_scalar
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+from helio_jax.reconstruct.edges import along
+from helio_jax.reconstruct.model import Surface
+
+WALL = 25.0
+"""Change across an edge (chi-square without the detector that changes most) from which on it may be a wall: noise alone
+reaches it in fewer than one edge of 250 000."""
+_HALF_LENGTHS = (3, 7)
+"""Pixels to both sides, along the edge, over which its change is averaged: short for corners, long for weak steps."""
+MIN_REGION = 50
+"""Smallest region that is looked for [pixels]."""
+UNEXPLAINED = 2.0
+"""Mean square residual, within a region or along its border, from which on other levels are tried."""
+_LARGEST = 25.0
+"""A datum counts with this square at most."""
+_BAND = 3
+"""Half width of a region's border [pixels]."""
+_LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
+"""Levels that are tried, up and down, in widths of the region."""
+GAIN = 30.0
+"""By how much another level must lower the misfit [half chi-square] to be kept."""
+_LEVEL_STEPS = 8
+"""Evaluations by which the best level is refined."""
+
+Misfit = Callable[[Surface], tuple[float, Surface]]
+"""Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
+
+
+def _change(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
+    """Return the change across every edge, in chi-square without the detector that changes most.
+
+    Two pixels on each side are compared, averaged over 2 half + 1 pixels along the edge.
+    """
+    size = np.ones(3, int)
+    size[2 - axis] = 2 * half + 1
+    mean = uniform_filter(signal, size, mode="nearest")
+    spread = uniform_filter(variance, size, mode="nearest") / (2 * half + 1)
+    n = signal.shape[1 + axis] - 1
+
+    def at(field: np.ndarray, offset: int) -> np.ndarray:
+        return np.take(field, np.clip(np.arange(n) + offset, 0, n), 1 + axis)
+
+    change = 0.5 * (at(mean, 1) + at(mean, 2) - at(mean, 0) - at(mean, -1))
+    square = change**2 / (0.25 * sum(at(spread, i) for i in (-1, 0, 1, 2)))
+    return square.sum(0) - square.max(0)
+
+
+def _crests(strength: np.ndarray, axis: int) -> np.ndarray:
+    """Return the strength of the edges [y, x] that are stronger than the edges before and after them, 0 elsewhere."""
+    size = [1, 1]
+    size[axis] = 3
+    return np.where(strength >= maximum_filter(strength, size), strength, 0.0)
+
+
+def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the number of every pixel's region [y, x], 0 being the largest: the ground.
+
+    Seeds are the connected areas without a strong change; they grow by a minimum spanning forest over the edges, so
+    that their borders lie on the strongest edges between them.
+
+    Args:
+        signal, variance: data [detector, y, x]; NaN where not observed.
+
+    Source: watershed cuts: Cousty, Bertrand, Najman, Couprie, IEEE PAMI 31 (2009) 1362, theorem 14.
+    """
+    shape = signal.shape[1:]
+    data, spread = np.nan_to_num(signal), np.nan_to_num(variance, nan=np.inf)
+    spread = np.where(spread > 0, spread, np.inf)
+    strength = [
+        _crests(np.maximum(*(_change(data, spread, axis, half) for half in _HALF_LENGTHS)), axis) for axis in (0, 1)
+    ]
+    is_calm = np.ones(shape, bool)
+    for axis, change in enumerate(strength):
+        for end in along(is_calm, axis):
+            end &= change <= WALL
+    seed = label(is_calm)[0].ravel()
+    seed[np.bincount(seed)[seed] < MIN_REGION] = 0
+    inside = np.flatnonzero(seed)
+    if inside.size == 0:
+        return np.zeros(shape, int)
+    pixel = np.arange(seed.size).reshape(shape)
+    ends = [along(pixel, axis) for axis in (0, 1)]
+    root, tip = seed.size, seed.size + seed.max() + 1  # nodes: pixels, the root, one for each seed
+    start = np.concatenate([*(a.ravel() for a, _ in ends), inside, np.full(seed.max(), root)])
+    end = np.concatenate([*(b.ravel() for _, b in ends), root + seed[inside], np.arange(root + 1, tip)])
+    # every seed hangs together and on the root by the cheapest links; all else joins by what is left of 1 + strength
+    cost = np.concatenate([*(1.0 + s.ravel() for s in strength), np.full(inside.size, 1e-3), np.full(seed.max(), 1e-6)])
+    tree = minimum_spanning_tree(coo_matrix((cost, (start, end)), shape=(tip, tip)).tocsr()).tocoo()
+    kept = (tree.row != root) & (tree.col != root)
+    links = coo_matrix((tree.data[kept], (tree.row[kept], tree.col[kept])), shape=(tip, tip))
+    found = connected_components(links, directed=False)[1][: seed.size]
+    order = np.argsort(-np.bincount(found), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    return rank[found].reshape(shape)
+
+
+def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """Return the regions with 0 put for those whose images the fit explains [y, x].
+
+    Args:
+        region: from `find_plateaus` [y, x].
+        residuals: of the fit, in standard deviations [detector, y, x].
+    """
+    square = np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST).mean(0)
+    left = region.copy()
+    for number in range(1, int(region.max()) + 1):
+        inside = region == number
+        band = binary_dilation(inside, iterations=_BAND) & ~binary_erosion(inside, iterations=_BAND, border_value=1)
+        if max(square[inside].mean(), square[band].mean()) <= UNEXPLAINED:
+            left[inside] = 0
+    return left
+
+
+def joined(region: np.ndarray) -> np.ndarray:
+    """Return the regions with those that (nearly) touch made one, gaps between them included [y, x].
+
+    Inside a plateau masks may end along strong edges, too.
+    """
+    room = np.pad(region > 0, _BAND, mode="edge")
+    return label(binary_closing(room, np.ones((2 * _BAND + 1,) * 2)))[0][_BAND:-_BAND, _BAND:-_BAND]
+
+
+def search_levels(
+    region: np.ndarray,
+    surface: Surface,
+    pitch: tuple[float, float],
+    max_width: float,
+    misfit: Misfit,
+    report: Callable[[str], None] = lambda said: None,
+) -> tuple[Surface, list[int]]:
+    """Return the surface with all regions at the levels that explain the images best, and the numbers of those moved.
+
+    A moved region starts flat; its own relief is the fit's matter.
+
+    Args:
+        region: number of the region of every pixel, 0: none [y, x].
+        surface: to begin with.
+        pitch: dy, dx, um.
+        max_width: levels up to twice the width of a region are tried, and of this width at most, um.
+        misfit: see `Misfit`.
+        report: called with what is tried next.
+    """
+    best, found = misfit(surface)
+    moved = []
+    for number in np.unique(region[region > 0]):
+        inside = region == number
+        around = binary_dilation(inside, iterations=_BAND) & ~inside
+        ground = float(np.median(found.height[around]))
+        room = np.pad(inside, 1, mode="edge")
+        width = min(2.0 * float(distance_transform_edt(room, sampling=pitch).max()), max_width)
+        tried: dict[float, tuple[float, Surface]] = {}
+
+        def at(level: float, number=number, inside=inside, base=found, tried=tried, ground=ground) -> float:
+            report(f"region {number} of {inside.sum()} pixels: trying the level {level:+.0f} um")
+            values = zip((ground + level, 0.0, 0.0), base, strict=True)
+            tried[level] = misfit(Surface(*(np.where(inside, flat, field) for flat, field in values)))
+            return tried[level][0]
+
+        levels = sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0))
+        i = int(np.argmin([at(level) for level in levels]))
+        bracket = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
+        minimize_scalar(at, bounds=bracket, method="bounded", options={"maxiter": _LEVEL_STEPS})
+        value, better = min(tried.values(), key=lambda entry: entry[0])
+        if value < best - GAIN:
+            best, found = value, better
+            moved.append(int(number))
+    return found, moved
