@@ -1,6 +1,6 @@
 """The forward model of the fit: from whitened unknowns to residuals in standard deviations (JAX, differentiable).
 
-What is known of the surface: the data, the edges between pixels, the bends of the normal, the flat border. What is
+What is known of the surface: the data, the edges between pixels, the flat border. What is
 known of the instrument: priors of gain, offset and of the scale of the predicted multiple scattering. `Lagged`
 holds all that is constant during one least-squares solve. How it is solved is `refine`'s matter.
 """
@@ -103,8 +103,6 @@ class Lagged(NamedTuple):
     intact_y: Any
     edge_x: Any
     edge_y: Any
-    bend_x: Any
-    bend_y: Any
     border: Any
     whitening: Any
     slope_scale_x: Any
@@ -191,15 +189,12 @@ class Model(eqx.Module):
     def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:
         """Return all residuals in standard deviations."""
         surface = self.surface(unknowns, lagged)
-        normal = self.normal(surface)
         return {
             "data": self.data_residuals(surface, unknowns, lagged),
             "edge_x": (jnp.diff(surface.height, axis=1) / self.dx - 0.5 * sum(along(surface.slope_x, 1)))
             * lagged.edge_x,
             "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
             * lagged.edge_y,
-            "bend_x": jnp.diff(normal, n=2, axis=2) * lagged.bend_x,
-            "bend_y": jnp.diff(normal, n=2, axis=1) * lagged.bend_y,
             "border": surface.height * lagged.border,
             "gain": unknowns.log_gain,
             "offset": unknowns.offset,

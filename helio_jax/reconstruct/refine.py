@@ -30,8 +30,6 @@ from helio_jax.reconstruct.uncertainty import MAX_PIXELS, Posterior, linearise, 
 
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
-_EDGE_BENDS = 4.0
-"""Bends of the normal above this many prior deviations are edges: their smoothness weight falls off."""
 
 Predict = Callable[[np.ndarray, np.ndarray], Prediction]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
@@ -174,7 +172,6 @@ class Refiner:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
         s, m = self.settings, self.model
         height, slope_x, slope_y = self.surface
-        normal = np.moveaxis(self.surface.normals(self.shift), -1, 0)
         predicted_normals = self.predicted_on.normals(self.shift)
         doubt = self.prediction.doubt(predicted_normals, s.mask_error, s.multiple_error)
         sigma = np.sqrt(self.variance + doubt**2)
@@ -208,8 +205,6 @@ class Refiner:
             intact_y=edges_y.intact,
             edge_x=edges_x.weight,
             edge_y=edges_y.weight,
-            bend_x=self._bend_weight(normal, 2),
-            bend_y=self._bend_weight(normal, 1),
             border=self.border,
             whitening=self.whitening,
             slope_scale_x=scale_x,
@@ -219,12 +214,6 @@ class Refiner:
             multiple_std=s.multiple_error * np.full(len(self.signal), float(is_instrument_free)),
         )
         return Unknowns(*map(jnp.asarray, unknowns)), Lagged(*map(jnp.asarray, lagged))
-
-    def _bend_weight(self, normal: np.ndarray, axis: int) -> np.ndarray:
-        """Return edge-preserving weights of the second differences of the unit normals [3, y, x] along an axis."""
-        std = self.settings.smoothness * self.slope_noise
-        bend = np.linalg.norm(np.diff(normal, n=2, axis=axis), axis=0)
-        return geman_mcclure(bend, _EDGE_BENDS * std) / std
 
     def _slope_scale(self, edges: Edges, axis: int) -> np.ndarray:
         """Return how far a slope may move from its one-sided difference: what edges and datum leave of it."""
@@ -332,7 +321,7 @@ def misfit_on(
 ) -> tuple[float, Surface]:
     """Return half the robust chi-square that is left when a surface's relief is fitted to the data, and that surface.
 
-    Counts data with the logarithm of their assumed deviations, edges and bends; instrument at its prior means.
+    Counts data, with the logarithm of their assumed deviations, and edges; the instrument is at its prior means.
     Arguments as those of `fit_heights`.
     """
     s = settings.refine
@@ -340,10 +329,8 @@ def misfit_on(
         refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings)
         refiner.predict(predict)
         for _ in range(s.reweightings):
-            found = refiner.step(s.robust_limits[-1], s.jump_limits[-1], False)
-    return refiner.misfit(s.robust_limits[-1], s.jump_limits[-1]) + float(
-        found.cost["bend_x"] + found.cost["bend_y"]
-    ), refiner.surface
+            refiner.step(s.robust_limits[-1], s.jump_limits[-1], False)
+    return refiner.misfit(s.robust_limits[-1], s.jump_limits[-1]), refiner.surface
 
 
 def fit_heights(

@@ -22,8 +22,6 @@ class RefineSettings(Settings):
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
-    smoothness: float = Field(default=0.5, gt=0.0, le=100.0)
-    """Prior deviation of the normals' second difference from pixel to pixel, in units of one pixel's slope noise."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
     """Side of the flat that scatters around the image [um]; default: half an image size beyond each border."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
@@ -32,7 +30,7 @@ class RefineSettings(Settings):
     """Relative error assumed of the predicted multiple scattering."""
     robust_limits: tuple[float, ...] = Field(default=(10.0, 10.0, 8.0), min_length=1, max_length=20)
     """Residuals [standard deviations] at which a datum's weight falls to a half, for each re-weighting of round 1."""
-    jump_limits: tuple[float, ...] = Field(default=(4.0, 3.0, 3.0), min_length=1, max_length=20)
+    jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)
     """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
     fixed_rounds: int = Field(default=1, ge=0, le=50)
     """Rounds during which gain and offset stay at their prior means, while the prediction is still crude."""

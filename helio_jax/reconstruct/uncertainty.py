@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
+from helio_jax.reconstruct.edges import along
 from helio_jax.reconstruct.model import Lagged, Model, Surface, Unknowns
 
 MAX_PIXELS = 30_000
@@ -133,27 +134,21 @@ class _Rows:
 
 @eqx.filter_jit
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
-    """Return how data residuals and normals of a pixel follow its own height and slopes, the instrument, the levels."""
+    """Return how the data residuals follow their pixel's height and slopes, the instrument and the levels."""
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
 
-    def along(function, direction):
+    def derivative(function, direction):
         return jax.jvp(function, (surface,), (direction,))[1]
 
-    data = [along(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
-    normal = [along(model.normal, d) for d in directions]
+    data = [derivative(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
     free = {name: getattr(unknowns, name) for name in model.instrument_fields}
     instrument = jax.jacfwd(lambda v: model.data_residuals(surface, unknowns._replace(**v), lagged))(free)
     rise = jnp.zeros_like(lagged.level)  # all heights raised by the same, as above, raise no plateau above the ground
     levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
         rise
     )
-    return data, normal, instrument, levels
-
-
-def _ends(pixel: np.ndarray, axis: int, n: int) -> list[np.ndarray]:
-    """Return the n + 1 pixels of every run of neighbours along an axis."""
-    return [np.take(pixel, range(i, pixel.shape[axis] - n + i), axis) for i in range(n + 1)]
+    return data, instrument, levels
 
 
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
@@ -164,26 +159,16 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
-    data, normal, found, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    data, found, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
     by_parameter = {name: found[name] for name in model.instrument_fields}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
     for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
-        before, after = _ends(pixel, axis, 1)
+        before, after = along(pixel, axis)
         w = np.asarray(weight)
         rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
-    for axis, weight in ((1, lagged.bend_x), (0, lagged.bend_y)):
-        runs = list(zip(_ends(pixel, axis, 2), (1.0, -2.0, 1.0), strict=True))
-        for i in range(3):
-            rows.add(
-                *(
-                    (p, part, factor * np.asarray(weight) * normal[part][i].ravel()[p])
-                    for p, factor in runs
-                    for part in (1, 2)
-                )
-            )
     rows.add((pixel, 0, np.asarray(lagged.border)))
     names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
     columns = np.concatenate([block.reshape(n_data, -1) for block in by_parameter.values()], 1)
