@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import ValidationError
@@ -31,6 +31,7 @@ from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
 from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.indirect import Radiosity
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
@@ -91,25 +92,50 @@ def make_predictor(
     substrate_um: float | None = None,
     seed: int = 7,
     workers: int | None = None,
+    multiple: Literal["traced", "radiosity"] = "traced",
 ) -> Callable[[np.ndarray, np.ndarray], Prediction]:
     """Return a function that predicts what a surface does beyond direct single scattering.
 
-    Multiple scattering is traced from the given points, with their normals; masks come from the horizon march.
+    Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
+    neither `n_rays` nor `seed`; masks come from the horizon march.
 
     The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
     Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
-    grid_x, grid_y = np.meshgrid(stack.x, stack.y)
     geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
     size = max(np.ptp(stack.x), np.ptp(stack.y))
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
     reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
-    lift = LIFT_PIXELS * min(dx, dy)
+    if multiple == "radiosity":
+        scatter = Radiosity(geometry, stack.x, stack.y, 2.0 * reach)
+    else:
+        scatter = _make_tracer(stack, n_rays, reach, seed, workers)
+
+    def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
+        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
+        about = (geometry, dx, dy)
+        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
+        return Prediction(
+            scatter(height, normals),
+            hidden,
+            lambda change: np.asarray(hidden_response(height, a, b, *about, change)),
+        )
+
+    return predict
+
+
+def _make_tracer(
+    stack: MicrographStack, n_rays: int, reach: float, seed: int, workers: int | None
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a function that traces a surface's multiple scattering; `reach`: half the side of the flat around, um."""
+    instrument = stack.instrument
+    grid_x, grid_y = np.meshgrid(stack.x, stack.y)
+    lift = LIFT_PIXELS * min(pitch(stack.x), pitch(stack.y))
     branches = max(1, round(n_rays / grid_x.size / 8))
     settings = TraceSettings(rays=8, branches=branches, n_orders=2, seed=seed, workers=workers)
 
-    def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
+    def scatter(height: np.ndarray, normals: np.ndarray) -> np.ndarray:
         x, y = instrument.surface_position(grid_x, grid_y, height)
         body = surface_body(x, y, height, reach, level=0.0, beam_shift=instrument.beam_shift)
         experiment = make_experiment(body, instrument, settings)
@@ -117,17 +143,9 @@ def make_predictor(
         point = np.stack([x, y, height], -1).reshape(-1, 3) + lift * normal
         first = Hits.on_mesh(point, normal)
         tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers, first=first, max_lost=MAX_BURIED)
-        multiple = tally.probability()[0][1].reshape(-1, *height.shape)
-        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
-        about = (geometry, dx, dy)
-        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
-        return Prediction(
-            smooth_along_surface(multiple, normals),
-            hidden,
-            lambda change: np.asarray(hidden_response(height, a, b, *about, change)),
-        )
+        return smooth_along_surface(tally.probability()[0][1].reshape(-1, *height.shape), normals)
 
-    return predict
+    return scatter
 
 
 def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -189,7 +207,11 @@ def reconstruct(
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
     refine = chosen.refine
-    return reconstruct_stack(one, chosen, lambda n_rays: make_predictor(one, n_rays, refine.substrate_um), report)
+
+    def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
+        return make_predictor(one, n_rays, refine.substrate_um, multiple=refine.multiple)
+
+    return reconstruct_stack(one, chosen, make_predict, report)
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:

@@ -44,8 +44,11 @@ class RefineSettings(Settings):
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
     samples: int = Field(default=32, ge=0, le=10_000)
     """Samples of the posterior, from which the standard deviation of every height is taken; 0: no error bars."""
+    multiple: Literal["traced", "radiosity"] = "traced"
+    """Model of the multiple scattering: `traced` follows paths; `radiosity` is noise-free but takes one value per pixel
+    (`reconstruct/indirect.py`), so it differs by some per cent beside depth jumps."""
     rays: int = Field(default=1_500_000, ge=1000, le=10**10)
-    """Paths per prediction of the multiple scattering, over the whole image (8 or more per pixel)."""
+    """Paths per traced prediction of the multiple scattering, over the whole image (8 or more per pixel)."""
 
     @model_validator(mode="after")
     def _has_matching_stages(self) -> "RefineSettings":
