@@ -29,6 +29,7 @@ from helio_jax import pipeline  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
 from helio_jax.reconstruct.model import Prediction  # noqa: E402
 from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
 from helio_jax.reconstruct.solve import reconstruct_stack  # noqa: E402
