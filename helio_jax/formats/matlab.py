@@ -276,7 +276,7 @@ def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
     much as an offset of -0.25 %). Source: Mighell, ApJ 518 (1999) 380, sec. 2.
     """
     padded = np.pad(np.asarray(counts, float), ((0, 0), (1, 1), (1, 1)), mode="reflect")
-    return (9.0 * uniform_filter(padded, (0, 3, 3))[:, 1:-1, 1:-1] - counts) / 8.0
+    return (9.0 * np.asarray(uniform_filter(padded, 3, axes=(1, 2)))[:, 1:-1, 1:-1] - counts) / 8.0
 
 
 def _noise_variance(image: np.ndarray, fast: str) -> float:

@@ -13,11 +13,10 @@ import numpy as np
 from scipy.ndimage import (
     binary_closing,
     binary_dilation,
-    binary_erosion,
     distance_transform_edt,
     label,
     maximum_filter,
-    uniform_filter,
+    uniform_filter1d,
 )
 from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_matrix
@@ -34,7 +33,7 @@ _HALF_LENGTHS = (3, 7)
 MIN_REGION = 50
 """Smallest region that is looked for [pixels]."""
 UNEXPLAINED = 2.0
-"""Mean square residual, within a region or along its border, from which on other levels are tried."""
+"""Mean square residual, within a region or along its border, in those of the ground, from which on levels are tried."""
 _LARGEST = 25.0
 """A datum counts with this square at most."""
 _BAND = 3
@@ -55,10 +54,9 @@ def _change(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> n
 
     Two pixels on each side are compared, averaged over 2 half + 1 pixels along the edge.
     """
-    size = np.ones(3, int)
-    size[2 - axis] = 2 * half + 1
-    mean = uniform_filter(signal, size, mode="nearest")
-    spread = uniform_filter(variance, size, mode="nearest") / (2 * half + 1)
+    length = 2 * half + 1
+    mean, spread = (np.asarray(uniform_filter1d(f, length, 2 - axis, mode="nearest")) for f in (signal, variance))
+    spread = spread / length
     n = signal.shape[1 + axis] - 1
 
     def at(field: np.ndarray, offset: int) -> np.ndarray:
@@ -74,6 +72,16 @@ def _crests(strength: np.ndarray, axis: int) -> np.ndarray:
     size = [1, 1]
     size[axis] = 3
     return np.where(strength >= maximum_filter(strength, size), strength, 0.0)
+
+
+def _numbered(mask: np.ndarray) -> np.ndarray:
+    """Return the numbers, from 1, of the connected areas of a mask [y, x]; 0 outside."""
+    return np.asarray(label(mask)[0])  # type: ignore[index]  # SciPy's stubs take the result for a number
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """Return a mask [y, x] grown by `_BAND` pixels."""
+    return np.asarray(binary_dilation(mask, iterations=_BAND))
 
 
 def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -97,7 +105,7 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     for axis, change in enumerate(strength):
         for end in along(is_calm, axis):
             end &= change <= WALL
-    seed = label(is_calm)[0].ravel()
+    seed = _numbered(is_calm).ravel()
     seed[np.bincount(seed)[seed] < MIN_REGION] = 0
     inside = np.flatnonzero(seed)
     if inside.size == 0:
@@ -127,11 +135,12 @@ def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         residuals: of the fit, in standard deviations [detector, y, x].
     """
     square = np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST).mean(0)
+    limit = UNEXPLAINED * square[region == 0].mean()
     left = region.copy()
     for number in range(1, int(region.max()) + 1):
         inside = region == number
-        band = binary_dilation(inside, iterations=_BAND) & ~binary_erosion(inside, iterations=_BAND, border_value=1)
-        if max(square[inside].mean(), square[band].mean()) <= UNEXPLAINED:
+        band = _grown(inside) & _grown(~inside)
+        if max(square[inside].mean(), square[band].mean()) <= limit:
             left[inside] = 0
     return left
 
@@ -142,7 +151,7 @@ def joined(region: np.ndarray) -> np.ndarray:
     Inside a plateau masks may end along strong edges, too.
     """
     room = np.pad(region > 0, _BAND, mode="edge")
-    return label(binary_closing(room, np.ones((2 * _BAND + 1,) * 2)))[0][_BAND:-_BAND, _BAND:-_BAND]
+    return _numbered(np.asarray(binary_closing(room, np.ones((2 * _BAND + 1,) * 2))))[_BAND:-_BAND, _BAND:-_BAND]
 
 
 def search_levels(
@@ -169,10 +178,10 @@ def search_levels(
     moved = []
     for number in np.unique(region[region > 0]):
         inside = region == number
-        around = binary_dilation(inside, iterations=_BAND) & ~inside
+        around = _grown(inside) & ~inside
         ground = float(np.median(found.height[around]))
         room = np.pad(inside, 1, mode="edge")
-        width = min(2.0 * float(distance_transform_edt(room, sampling=pitch).max()), max_width)
+        width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
         tried: dict[float, tuple[float, Surface]] = {}
 
         def at(level: float, number=number, inside=inside, base=found, tried=tried, ground=ground) -> float:

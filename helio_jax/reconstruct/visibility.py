@@ -5,7 +5,8 @@ position and the plate's apertures stand still: the rim, seen from a point, is a
 only the depth d = D - h below it changes. So all pixels share the same vertical slices of an aperture, and marching
 along one is shifting the raster. In a slice of azimuth e everything beyond the distance d / horizon is hidden, the
 horizon being the steepest slope up to the surface ahead or the point's own tangent plane, whichever is higher.
-Nothing is taken to stand outside of the raster; where apertures overlap, each counts the common part.
+Between two pixels the surface is linear, but a depth jump is a wall half-way. Nothing is taken to stand outside of the
+raster; where apertures overlap, each counts the common part.
 Source: own derivation, tests/physics/test_visibility.py; horizons of height fields: Max, Vis. Comput. 4 (1988) 109.
 """
 
@@ -21,6 +22,8 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 
 _OUTSIDE = -1e9
 """Height outside of the raster [um]: hides nothing."""
+_WALL = 5.0
+"""A rise between two pixels of more than this many pitches is a wall, and taken to stand half-way between them."""
 _TAIL = 20.0
 """Widths below the aperture within which a smoothed horizon still counts."""
 
@@ -42,13 +45,17 @@ class March(NamedTuple):
     """Where the ray of one azimuth crosses the grid lines of the raster, by growing distance, static.
 
     `first` and `second` [step, 2] are the raster positions (row, column), relative to the point, between which the
-    height is interpolated, `share` [step] is that of the second; `distance` [step, um] is infinite off the raster.
+    height is interpolated, `share` [step] is that of the second; `distance` [step, um] is infinite off the raster. A
+    wall half-way between two pixels was passed `since_across` [step, um] ago, if it separates those two, or
+    `since_along`, if it runs beside both.
     """
 
     first: np.ndarray
     second: np.ndarray
     share: np.ndarray
     distance: np.ndarray
+    since_across: np.ndarray
+    since_along: np.ndarray
 
 
 def slice_aperture(aperture: Aperture, pinhole: np.ndarray, n_slices: int) -> Slices:
@@ -105,7 +112,8 @@ def plan_march(direction: np.ndarray, shape: tuple[int, int], dx: float, dy: flo
         first = np.stack([distance * step[axis], low], -1)[:, :: 1 - 2 * axis]
         first = np.where(is_inside[:, None], np.rint(first), 0.0).astype(np.int32)
         second = first + np.array([axis, 1 - axis], np.int32)
-        parts.append((first, second, across - low, np.where(is_inside, distance, np.inf)))
+        since = np.abs(across - low - 0.5) / np.abs(step[1 - axis]), np.full(len(low), 0.5 / np.abs(step[axis]))
+        parts.append((first, second, across - low, np.where(is_inside, distance, np.inf), *since))
     joined = March(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     order = np.argsort(joined.distance)
     return March(*(column[order] for column in joined))
@@ -172,15 +180,16 @@ def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, wi
     padded = jnp.pad(height, [(n, n) for n in shape], constant_values=_OUTSIDE)
     depth = instrument.sample_distance - height
     top, bottom = jnp.max(height), jnp.min(height)
+    beyond_a_wall = np.hypot(dx, dy)
 
     def add_slice(total, item):
         piece, march = item
         # a sample at distance R matters where (top - h) / R > (D - h) / far - tail, soonest for h = bottom
         ceiling = instrument.sample_distance - _TAIL * width * piece.far
-        reach = jnp.where(top < ceiling, piece.far * (top - bottom) / (ceiling - bottom), jnp.inf)
-        winner = _find_horizon(*jax.lax.stop_gradient((padded, reach)), march, shape)
+        reach = jnp.where(top < ceiling, piece.far * (top - bottom) / (ceiling - bottom) + beyond_a_wall, jnp.inf)
+        seen = _find_horizon(*jax.lax.stop_gradient((padded, reach)), march, _WALL * max(dx, dy), shape)
         tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
-        horizon = jnp.maximum(_slope_up(padded, height, march, winner), tangent)
+        horizon = jnp.maximum(_slope_up(padded, height, march, seen), tangent)
         return total + _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width), None
 
     def of_aperture(items):
@@ -194,8 +203,19 @@ def _stack(records: list) -> Any:
     return type(records[0])(*(np.stack(column) for column in zip(*records, strict=True)))
 
 
-def _find_horizon(padded: jax.Array, reach: jax.Array, march: March, shape: tuple[int, int]) -> jax.Array:
-    """Return the step of the march at which the surface is seen steepest [y, x]; `reach`: how far to look [um]."""
+class Horizon(NamedTuple):
+    """What a point sees steepest [y, x]: its step of the march, the share of the second pixel, and its distance, um."""
+
+    step: jax.Array
+    share: jax.Array
+    distance: jax.Array
+
+
+def _find_horizon(padded: jax.Array, reach: jax.Array, march: March, tall: float, shape: tuple[int, int]) -> Horizon:
+    """Return where the surface is seen steepest; `reach`: how far to look [um], `tall`: least height of a wall [um].
+
+    A crossing within a wall belongs to the nearer of its two pixels.
+    """
 
     def view(corner):
         return jax.lax.dynamic_slice(padded, (corner[0] + shape[0], corner[1] + shape[1]), shape)
@@ -203,27 +223,34 @@ def _find_horizon(padded: jax.Array, reach: jax.Array, march: March, shape: tupl
     here = padded[shape[0] : 2 * shape[0], shape[1] : 2 * shape[1]]
 
     def visit(s, state):
-        best, winner = state
-        share = march.share[s]
-        there = (1.0 - share) * view(march.first[s]) + share * view(march.second[s])
-        slope = (there - here) / march.distance[s]
-        return jnp.maximum(best, slope), jnp.where(slope > best, s.astype(winner.dtype), winner)
+        best, horizon, before, passed = state
+        first, second, far = view(march.first[s]), view(march.second[s]), march.distance[s]
+        is_across = jnp.abs(second - first) > tall
+        share = jnp.where(is_across, jnp.round(march.share[s]), march.share[s])
+        there = (1.0 - share) * first + share * second
+        wall = far - jnp.where(is_across, march.since_across[s], march.since_along[s])
+        distance = jnp.where(there - before > tall, jnp.maximum(wall, passed), far)
+        slope = (there - here) / distance
+        found = Horizon(s.astype(jnp.int32), share, distance)
+        horizon = Horizon(*(jnp.where(slope > best, new, old) for new, old in zip(found, horizon, strict=True)))
+        return jnp.maximum(best, slope), horizon, there, far
 
-    start = jnp.full(shape, -jnp.inf, padded.dtype), jnp.zeros(shape, jnp.int32)
+    nothing = Horizon(jnp.zeros(shape, jnp.int32), *jnp.ones((2, *shape), padded.dtype))
+    start = jnp.full(shape, -jnp.inf, padded.dtype), nothing, here, jnp.zeros((), padded.dtype)
     n_steps = jnp.searchsorted(march.distance, reach).astype(jnp.int32)
     return jax.lax.fori_loop(jnp.int32(0), n_steps, visit, start)[1]
 
 
-def _slope_up(padded: jax.Array, height: jax.Array, march: March, winner: jax.Array) -> jax.Array:
-    """Return the slope from each point up to the surface at its step `winner` of the march [y, x]."""
+def _slope_up(padded: jax.Array, height: jax.Array, march: March, horizon: Horizon) -> jax.Array:
+    """Return the slope from each point up to its horizon [y, x]."""
     (ny, nx), columns = height.shape, padded.shape[1]
     here = (ny + jnp.arange(ny, dtype=jnp.int32))[:, None] * columns + nx + jnp.arange(nx, dtype=jnp.int32)
 
     def at(corner):
-        return padded.ravel()[here + (corner[:, 0] * columns + corner[:, 1])[winner]]
+        return padded.ravel()[here + (corner[:, 0] * columns + corner[:, 1])[horizon.step]]
 
-    share = march.share[winner]
-    return ((1.0 - share) * at(march.first) + share * at(march.second) - height) / march.distance[winner]
+    first, second, share = at(march.first), at(march.second), horizon.share
+    return ((1.0 - share) * first + share * second - height) / horizon.distance
 
 
 def _hidden_in_slice(horizon, depth, piece: Slices, shift: tuple[float, float], width: float) -> jax.Array:

@@ -62,15 +62,15 @@ def test_straight_wall(axis, share):
     """A long wall hides the part of the ellipse beyond a line: within 4e-3 of Phi (12 slices), 4e-5 (192).
 
     Bias: a slice that the wall's edge enters within is off by its second order, so the error falls as slices^-2. Hidden
-    as a whole: 1e-12, in view as a whole: exactly 0. The wall's far side is its first full-height row of pixels.
+    as a whole: 1e-12, in view as a whole: exactly 0. The wall stands half-way before its first row of pixels.
     Rejected wrong models: the beam shift left out or of the wrong sign (a line moved by (H - h) tan t at the wall),
-    the wall one pixel off (2 %), exchanged pitches, a horizon that forgets the point's own height.
+    the wall half a pixel off (1 %), exchanged pitches, a horizon that forgets the point's own height.
     """
-    instrument, low, ahead, half = make_instrument(), 30.0, 6, 40
+    instrument, low, ahead, half = make_instrument(), 30.0, 12, 60
     geometry, shift = SpotGeometry(instrument), instrument.beam_shift
     aperture, point = instrument.apertures()[axis], instrument.spot_position(low)
     depth = instrument.working_distance - point[2]
-    distance = ahead * PITCH[axis]
+    distance = (ahead - 0.5) * PITCH[axis]
     turn = aperture.rotation - axis * 0.5 * np.pi
     reach = np.hypot(aperture.semi_axes[0] * np.cos(turn), aperture.semi_axes[1] * np.sin(turn))
     offset = (
