@@ -36,6 +36,8 @@ UNEXPLAINED = 2.0
 """Mean square residual, within a region or along its border, in those of the ground, from which on levels are tried."""
 _LARGEST = 25.0
 """A datum counts with this square at most."""
+_UNKNOWN = 1e6
+"""Variance of data that were not observed, in those of the worst ones: finite, for running means."""
 _BAND = 3
 """Half width of a region's border [pixels]."""
 _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
@@ -96,8 +98,11 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     Source: watershed cuts: Cousty, Bertrand, Najman, Couprie, IEEE PAMI 31 (2009) 1362, theorem 14.
     """
     shape = signal.shape[1:]
-    data, spread = np.nan_to_num(signal), np.nan_to_num(variance, nan=np.inf)
-    spread = np.where(spread > 0, spread, np.inf)
+    is_known = np.isfinite(signal) & (variance > 0)
+    if not is_known.any():
+        return np.zeros(shape, int)
+    data = np.where(is_known, signal, 0.0)
+    spread = np.where(is_known, variance, _UNKNOWN * variance[is_known].max())
     strength = [
         _crests(np.maximum(*(_change(data, spread, axis, half) for half in _HALF_LENGTHS)), axis) for axis in (0, 1)
     ]

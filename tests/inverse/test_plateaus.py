@@ -37,9 +37,13 @@ def test_noise_and_tilted_planes_have_no_plateaus():
         assert find_plateaus(signal + np.linspace(0.0, 0.3, SHAPE[1]), variance).max() == 0
 
 
-def test_nothing_observed_is_no_plateau():
+def test_what_was_not_observed_hides_no_plateau():
+    """A lost corner and single lost data beside the floor change nothing; nothing observed is no plateau."""
     signal, variance = images([-0.5, 0.3, 0.2])
-    assert find_plateaus(np.full_like(signal, np.nan), variance).shape == SHAPE
+    signal[:, :8, :8] = np.nan
+    signal[1, 20, 45:48] = variance[2, 5, 30] = np.nan
+    assert np.mean((find_plateaus(signal, variance) == 1) == INSIDE) > 0.995
+    assert find_plateaus(np.full_like(signal, np.nan), variance).max() == 0
 
 
 def test_only_unexplained_regions_are_moved():
