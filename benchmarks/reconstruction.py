@@ -1,6 +1,6 @@
 """How true the fitted heights are, how honest their error bars, how long they take: the rows of issue 3.
 
-python benchmarks/reconstruction.py [--shared ../shared] [--output benchmarks/out] [--rows 1,2,3,...] [--tiny]
+python benchmarks/reconstruction.py [--shared ../shared] [--output benchmarks/out] [--rows 1,2,...] [--fits N] [--tiny]
 
 Every finished case is written at once and not done again (delete the JSON to start afresh). Rows 1 and 9 (sphere A,
 reference program) need the shared data; `--tiny` runs small cases of the other rows through the same code.
@@ -285,6 +285,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
     parser.add_argument("--rows", default="1,2,3,4,5,7,8,9,10")
     parser.add_argument("--tiny", action="store_true")
+    parser.add_argument("--fits", type=int, default=200, help="realisations of each case of row 4")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     wanted = set(args.rows.split(","))
@@ -300,7 +301,7 @@ def main() -> None:
     if "3" in wanted:
         efficiency_row(record, instrument, 50, 48)
     if "4" in wanted:
-        coverage_row(record, instrument, 200, 40)
+        coverage_row(record, instrument, args.fits, 40)
     if "5" in wanted:
         step_row(record, args.seed)
     if "10" in wanted:

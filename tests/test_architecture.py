@@ -35,8 +35,8 @@ DOORS = {
     "pooch": {"formats/fetch.py"},
     "matplotlib": {"evaluate/figures.py"},
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
-    "optimistix": {"reconstruct/refine.py"},
-    "lineax": {"reconstruct/refine.py"},
+    "optimistix": {"reconstruct/refiner.py"},
+    "lineax": {"reconstruct/refiner.py"},
     "rich": {"__main__.py"},
     "typer": {"__main__.py"},
 }

@@ -30,7 +30,8 @@ SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 
 if TYPE_CHECKING:
-    from helio_jax.reconstruct.refine import Fit, Predict, Report
+    from helio_jax.reconstruct.refine import Fit, Report
+    from helio_jax.reconstruct.refiner import Predict
 
 
 def _level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:

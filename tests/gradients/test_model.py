@@ -7,7 +7,7 @@ import pytest
 
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction, Surface
-from helio_jax.reconstruct.refine import Refiner
+from helio_jax.reconstruct.refiner import Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
 from helio_jax.reconstruct.uncertainty import linearise
 
