@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HEIGHT_MAP, COUNT_MAP, FRACTION_MAP, ERROR_MAP = "viridis", "gray", "magma", "RdBu_r"
-REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222")
+REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
 PANEL_SCORES = (
     "recovered_height", "rms_region", "rms_image", "rms_valid", "ring_error", "shape_error", "slope_rms",

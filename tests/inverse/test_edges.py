@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from helio_jax.reconstruct.edges import find_edges, kink_size, one_sided, to_pixels
+from helio_jax.reconstruct.validity import depth_jumps
 
 NOISE, PITCH = 0.05, 10.0
 
@@ -65,3 +66,17 @@ def test_to_pixels_is_the_adjoint_of_summing_ends():
     rng = np.random.default_rng(1)
     edge, field = rng.normal(size=(4, 6)), rng.normal(size=(4, 7))
     assert np.sum(to_pixels(edge, 1) * field) == pytest.approx(np.sum(edge * (field[:, 1:] + field[:, :-1])))
+
+
+def test_only_cut_edges_with_a_step_are_depth_jumps():
+    """Cut by noise (a twentieth of a pitch) and intact with a step: no jumps. Exchanged axes or pitches show."""
+    height = np.zeros((4, 5))
+    height[:, 3:] = 8.0
+    height[0, 1:] += 1.0
+    intact = np.ones((4, 4))
+    intact[0, 0] = intact[1, 2] = intact[2, 2] = 0.0
+    found = depth_jumps(height, np.zeros((4, 5)), intact, 20.0, 1)
+    assert np.argwhere(found).tolist() == [[1, 2], [2, 2]]
+    turned = depth_jumps(height.T, np.zeros((5, 4)), intact.T, 20.0, 0)
+    assert np.array_equal(turned, found.T)
+    assert not depth_jumps(height, np.full((4, 5), 0.4), intact, 20.0, 1)[1, 2]

@@ -9,6 +9,7 @@ from sphere_case import CAP, TAN, make_case
 from helio_jax.errors import InputFileError
 from helio_jax.evaluate import figures
 from helio_jax.evaluate.metrics import evaluate_height
+from helio_jax.reconstruction import REASONS
 
 PNG = b"\x89PNG"
 
@@ -156,3 +157,8 @@ def test_figures_are_written_by_suffix(case, tmp_path):
     with pytest.raises(InputFileError, match="suffix must be one of png, pdf, svg"):
         figures.save_figure(fig, tmp_path / "m.exe")
     assert [p.name for p in tmp_path.iterdir()] == ["m.png"]
+
+
+def test_every_reason_has_a_colour_of_its_own():
+    """Catches a reason added without a colour: the map then shows others in its neighbours' colours."""
+    assert len(set(figures.REASON_COLORS)) == len(REASONS)
