@@ -20,6 +20,8 @@ from helio_jax.reconstruct.edges import along, one_sided
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.render import render_single, unit_normal
 
+SLOPE_STD = 30.0
+"""Prior deviation of the slopes: holds those that neither datum nor edge fixes."""
 _LEVEL = 0.9
 """Facets whose unit normal has a larger vertical part count as level."""
 
@@ -196,6 +198,8 @@ class Model(eqx.Module):
             "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
             * lagged.edge_y,
             "border": surface.height * lagged.border,
+            "slope_x": surface.slope_x / SLOPE_STD,
+            "slope_y": surface.slope_y / SLOPE_STD,
             "gain": unknowns.log_gain,
             "offset": unknowns.offset,
             "multiple": unknowns.log_multiple,

@@ -25,6 +25,9 @@ from helio_jax.reconstruct.settings import ReconstructSettings
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
 
+_HELD = 1e-5
+"""Least prior weight of a height, 1/um: holds a pixel that all edges part from the rest."""
+
 Predict = Callable[[np.ndarray, np.ndarray], Prediction]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Prediction."""
 
@@ -63,7 +66,7 @@ def _plateau_weights(region: np.ndarray) -> np.ndarray:
 
 def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
     """Return the prior weight of each height: the outermost ring is flat, or just the mean height is held."""
-    weight = np.zeros(shape)
+    weight = np.full(shape, _HELD)
     if settings.border == "flat":
         weight[border_mask(shape, 1.0 / max(shape))] = 1.0 / settings.border_std_um
     else:

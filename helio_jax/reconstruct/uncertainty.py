@@ -22,7 +22,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
-from helio_jax.reconstruct.model import Lagged, Model, Surface, Unknowns
+from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Surface, Unknowns
 
 MAX_PIXELS = 30_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -170,6 +170,8 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
         w = np.asarray(weight)
         rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
     rows.add((pixel, 0, np.asarray(lagged.border)))
+    for part in (1, 2):
+        rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
     names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
     columns = np.concatenate([block.reshape(n_data, -1) for block in by_parameter.values()], 1)
     matrix = rows.stack(n_more=len(names))

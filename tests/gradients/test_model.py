@@ -108,7 +108,7 @@ def test_sparse_jacobian_is_the_automatic_one(problem):
         linear.far.shape[1] == 2 and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
     )
     ours = linear.surface @ surface + linear.far @ levels + linear.instrument @ instrument
-    order = ("data", "edge_x", "edge_y", "border", "gain", "offset", "multiple", "albedo")
+    order = ("data", "edge_x", "edge_y", "border", "slope_x", "slope_y", "gain", "offset", "multiple", "albedo")
     theirs = np.concatenate([np.asarray(slope[name]).ravel() for name in order])
     assert set(order) == set(value)
     assert np.allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())

@@ -6,7 +6,11 @@ import pytest
 from scipy import sparse
 
 from helio_jax import pipeline
-from helio_jax.reconstruct.uncertainty import Linearised, exact_height_covariance, sample_posterior
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.model import Surface
+from helio_jax.reconstruct.refiner import Refiner
+from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruct.uncertainty import Linearised, exact_height_covariance, linearise, sample_posterior
 from helio_jax.reconstruct.validity import floating, regions
 
 
@@ -88,3 +92,24 @@ def test_pulls_of_repeated_noise(bshem):
         assert value == pytest.approx(60.0, abs=5 * std) and 0 < std < 20
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.6
     assert jax.config.read("jax_enable_x64") is False
+
+
+def test_a_pixel_that_nothing_fixes_has_a_large_deviation(bshem):
+    """All four edges cut and no datum left: an error bar of millimetres, no singular matrix."""
+    shape = (5, 6)
+    geometry = SpotGeometry(bshem)
+    signal = geometry.form_factor(np.zeros(shape))[:, 2]
+    surface, settings = Surface(*np.zeros((3, *shape))), ReconstructSettings()
+    refiner = Refiner(signal, (0.03 * signal) ** 2, geometry, 30.0, 30.0, surface, settings)
+    with jax.enable_x64(True):
+        unknowns, lagged = refiner.lag(8.0, 4.0)
+        cut = {
+            "edge_x": lagged.edge_x.at[2, 2:4].set(0.0),
+            "edge_y": lagged.edge_y.at[1:3, 3].set(0.0),
+            "inverse_sigma": lagged.inverse_sigma.at[:, 2, 3].set(0.0),
+        }
+        found = sample_posterior(linearise(refiner.model, unknowns, lagged._replace(**cut)), 200)
+    assert found.height_std[2, 3] > 1e4
+    others = np.ones(shape, bool)
+    others[2, 3] = False
+    assert found.height_std[others].max() < 10.0
