@@ -228,7 +228,8 @@ def _find_horizon(padded: jax.Array, reach: jax.Array, march: March, tall: float
         is_across = jnp.abs(second - first) > tall
         share = jnp.where(is_across, jnp.round(march.share[s]), march.share[s])
         there = (1.0 - share) * first + share * second
-        wall = far - jnp.where(is_across, march.since_across[s], march.since_along[s])
+        across, beside = far - march.since_across[s], far - march.since_along[s]
+        wall = jnp.where(is_across & (across > passed), across, beside)
         distance = jnp.where(there - before > tall, jnp.maximum(wall, passed), far)
         slope = (there - here) / distance
         found = Horizon(s.astype(jnp.int32), share, distance)

@@ -9,7 +9,7 @@ import pytest
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.visibility import hidden_form_factor
+from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.scene.surfaces import first_hit_spheres, surface_body
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.masks import hidden_form_factor as hidden_by_rays
@@ -180,3 +180,22 @@ def test_sphere_a_against_rays(bshem):
     mirrored = SpotGeometry(bshem.model_copy(update={"beam": beam}))
     assert rms(difference(hidden_form_factor(height, slope_x, slope_y, mirrored, dx, dy))) > 1e-2
     assert rms(difference(np.zeros_like(rays))) > 1e-2
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 180.0, 270.0])
+def test_a_ray_along_a_wall_stays_finite(azimuth_deg):
+    """Detectors along the grid lines and a pit with straight walls: a ray runs beside a wall, and out over its end.
+
+    Catches a wall sought behind the point, at the distance 0.
+    """
+    detector = Detector(name="d", center_um=(2300.0, 0.0), axes_um=(1300.0, 900.0))
+    instrument = Instrument(beam=Beam(incidence_deg=0.0), plate=Plate(working_distance_um=4000.0), detector=(detector,))
+    height = np.zeros((31, 31))
+    height[10:20, 8:24] = -160.0
+    turned = np.rot90(height, round(azimuth_deg / 90.0))
+    flat = np.zeros_like(height)
+    hidden = np.asarray(hidden_form_factor(turned, flat, flat, SpotGeometry(instrument), 20.0, 20.0, n_slices=11))
+    assert np.all(np.isfinite(hidden)) and hidden[0, 2].max() > 0.0
+    change = (turned < -1.0).astype(float)
+    response = hidden_response(turned, flat, flat, SpotGeometry(instrument), 20.0, 20.0, change)
+    assert np.all(np.isfinite(np.asarray(response)))
