@@ -87,15 +87,14 @@ def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case
     error = (rec.height - truth.height - s.level_um) / s.H_um
     region, ring = r < 1050.0, (r > 1.1 * 960.0) & (r < 1.5 * 960.0)
     valid = region & rec.is_valid
-    away = region & rec.is_valid & (rec.reason == 0)
     return {
         "rms_all": float(np.sqrt(np.mean(error[region] ** 2))),
         "rms_valid": float(np.sqrt(np.mean(error[valid] ** 2))),
         "valid": float(np.mean(rec.is_valid[region])),
         "height": float(s.recovered_height or np.nan),
         "height_std": float(s.recovered_height_std_um or np.nan) / s.H_um,
-        "p95_valid": float(np.quantile(np.abs(error[away]), 0.95)),
-        "max_valid": float(np.abs(error[away]).max()),
+        "p95_valid": float(np.quantile(np.abs(error[valid]), 0.95)),
+        "max_valid": float(np.abs(error[valid]).max()),
         "ring_rms": float(np.sqrt(np.mean(error[ring] ** 2))),
         "ring_mean": float(np.mean(error[ring])),
         "pull_std": float(s.pull_std or np.nan),
@@ -108,12 +107,17 @@ def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case
     }
 
 
-def fit(scene: SceneFile, stack: MicrographStack, **refine: object) -> Case:
-    """Reconstruct with the scene's settings, score."""
+def settings_of(scene: SceneFile, refine: dict[str, object]) -> ReconstructSettings:
+    """Return a scene's settings with some of the fit's replaced."""
     settings = scene.reconstruct.model_dump()
     settings["refine"] |= refine
+    return ReconstructSettings.model_validate(settings)
+
+
+def fit(scene: SceneFile, stack: MicrographStack, **refine: object) -> Case:
+    """Reconstruct with the scene's settings, score."""
     start = time.perf_counter()
-    rec = pipeline.reconstruct(stack, settings=ReconstructSettings.model_validate(settings))
+    rec = pipeline.reconstruct(stack, settings=settings_of(scene, refine))
     return score(scene, stack, rec, time.perf_counter() - start)
 
 
@@ -174,9 +178,7 @@ class FarField(SpotGeometry):
 
 def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Prediction], Prediction], **refine: object):
     """Return the reconstruction and its time in seconds, with what is predicted changed."""
-    settings = scene.reconstruct.model_dump()
-    settings["refine"] |= refine
-    chosen = ReconstructSettings.model_validate(settings)
+    chosen = settings_of(scene, refine)
 
     def make_predict(n_rays: int):
         predict = pipeline.make_predictor(stack, n_rays, chosen.refine.substrate_um)

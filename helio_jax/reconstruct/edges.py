@@ -3,7 +3,7 @@
 The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the
 mean of the two slopes (trapezoid rule), but for a kink somewhere between the two positions, which makes that
 rule uncertain, and for a depth jump, across which it means nothing. All of it is decided on the current surface and
-then held fixed: the weights of the next least-squares solve. Works in NumPy; `one_sided` also on JAX arrays.
+then held fixed: the weights of the next least-squares solve. Works in NumPy; what takes `Any` also on JAX arrays.
 """
 
 from dataclasses import dataclass
@@ -30,6 +30,14 @@ def along(field: Any, axis: int) -> tuple[Any, Any]:
     return (field[:, :-1], field[:, 1:]) if axis == 1 else (field[:-1], field[1:])
 
 
+def ranked(region: np.ndarray) -> np.ndarray:
+    """Return the regions' numbers [pixel] anew, by falling size: the largest is 0."""
+    order = np.argsort(-np.bincount(region), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    return rank[region]
+
+
 def to_pixels(edge: Any, axis: int) -> Any:
     """Return for every pixel the sum over its two edges along `axis`; the adjoint of summing an edge's two ends."""
     pad = [(0, 0), (0, 0)]
@@ -41,6 +49,12 @@ def to_pixels(edge: Any, axis: int) -> Any:
 def one_sided(slope: Any, intact: Any, axis: int) -> Any:
     """Return pixel slopes [y, x]: means of the edges' slopes, weighted by how intact they are, never across a jump."""
     return to_pixels(intact * slope, axis) / (to_pixels(intact, axis) + _NO_EDGE)
+
+
+def trapezoid_gap(height: Any, slope: Any, pitch: float, axis: int) -> Any:
+    """Return by how much every edge's slope, (height change) / pitch, exceeds the mean slope of its two ends."""
+    before, after = along(height, axis)
+    return (after - before) / pitch - 0.5 * sum(along(slope, axis))
 
 
 def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
@@ -95,5 +109,5 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
     before, after = along(slope, axis)
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
     doubt = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
-    misfit = (np.diff(height, axis=axis) / pitch - 0.5 * (before + after)) / doubt
+    misfit = trapezoid_gap(height, slope, pitch, axis) / doubt
     return Edges(doubt, geman_mcclure(misfit, cut) ** 2)

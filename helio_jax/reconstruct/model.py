@@ -1,8 +1,8 @@
 """The forward model of the fit: from whitened unknowns to residuals in standard deviations (JAX, differentiable).
 
-What is known of the surface: the data, the edges between pixels, the flat border. What is
-known of the instrument: priors of gain, offset and of the scale of the predicted multiple scattering. `Lagged`
-holds all that is constant during one least-squares solve. How it is solved is `refine`'s matter.
+What is known of the surface: the data, the edges between pixels, the flat border. What is known of the instrument:
+priors of gain, offset and of the scale of the predicted multiple scattering. `Lagged` holds all that is constant
+during one least-squares solve. How it is solved is `refiner`'s matter.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import numpy as np
 from jax.scipy.fft import idctn
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from helio_jax.reconstruct.edges import along, one_sided
+from helio_jax.reconstruct.edges import one_sided, trapezoid_gap
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.render import render_single, unit_normal
 
@@ -193,10 +193,8 @@ class Model(eqx.Module):
         surface = self.surface(unknowns, lagged)
         return {
             "data": self.data_residuals(surface, unknowns, lagged),
-            "edge_x": (jnp.diff(surface.height, axis=1) / self.dx - 0.5 * sum(along(surface.slope_x, 1)))
-            * lagged.edge_x,
-            "edge_y": (jnp.diff(surface.height, axis=0) / self.dy - 0.5 * sum(along(surface.slope_y, 0)))
-            * lagged.edge_y,
+            "edge_x": trapezoid_gap(surface.height, surface.slope_x, self.dx, 1) * lagged.edge_x,
+            "edge_y": trapezoid_gap(surface.height, surface.slope_y, self.dy, 0) * lagged.edge_y,
             "border": surface.height * lagged.border,
             "slope_x": surface.slope_x / SLOPE_STD,
             "slope_y": surface.slope_y / SLOPE_STD,

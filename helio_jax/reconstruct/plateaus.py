@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-from helio_jax.reconstruct.edges import along
+from helio_jax.reconstruct.edges import along, ranked
 from helio_jax.reconstruct.model import Surface
 
 WALL = 25.0
@@ -125,11 +125,7 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     tree = minimum_spanning_tree(coo_matrix((cost, (start, end)), shape=(tip, tip)).tocsr()).tocoo()
     kept = (tree.row != root) & (tree.col != root)
     links = coo_matrix((tree.data[kept], (tree.row[kept], tree.col[kept])), shape=(tip, tip))
-    found = connected_components(links, directed=False)[1][: seed.size]
-    order = np.argsort(-np.bincount(found), kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(order.size)
-    return rank[found].reshape(shape)
+    return ranked(connected_components(links, directed=False)[1][: seed.size]).reshape(shape)
 
 
 def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:

@@ -38,7 +38,6 @@ class Fit:
         changes: root mean square height change of every round [um].
         contraction: ratio of the last two changes, or None.
         status: a sentence: how the fit ended.
-        is_converged: whether it reached its tolerance.
         is_interrupted: whether it was stopped from the keyboard.
     """
 
@@ -55,7 +54,6 @@ class Fit:
     changes: tuple[float, ...]
     contraction: float | None
     status: str
-    is_converged: bool
     is_interrupted: bool = False
 
 
@@ -92,8 +90,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         setattr(part, name, getattr(refiner, name))
     part.residuals = refiner.residuals[:, *thin]
     p = refiner.prediction
-    part.predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
-    part.prediction = Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin])
+    predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
+    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin]), predicted_on)
     part.level_response = refiner.level_response[..., *thin]
     unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(
@@ -189,13 +187,12 @@ def fit_heights(
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s, surface = refiner.settings, refiner.surface
     contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
-    is_converged = changes[-1] < s.tolerance_um and not is_interrupted
     last = (
         f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {s.tolerance_um:g} um)"
     )
     if is_interrupted:
         status = f"interrupted: best so far; {last}"
-    elif is_converged:
+    elif changes[-1] < s.tolerance_um:
         status = f"converged: {last}"
     elif contraction is not None and contraction > 1.0:
         status = f"diverging: {last}, {contraction:.2f} times the round before; raise mask_error or use nearfield"
@@ -215,6 +212,5 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         changes=tuple(changes),
         contraction=contraction,
         status=status,
-        is_converged=is_converged,
         is_interrupted=is_interrupted,
     )

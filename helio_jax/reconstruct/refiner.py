@@ -75,12 +75,11 @@ def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.
 
 
 class Solution(NamedTuple):
-    """One solve: unknowns, surface, expected data, steps taken, and the cost of every kind of residual."""
+    """One solve: unknowns, surface, expected data, and the cost of every kind of residual."""
 
     unknowns: Unknowns
     surface: Surface
     counts: jax.Array
-    n_steps: jax.Array
     cost: dict[str, jax.Array]
 
 
@@ -98,7 +97,7 @@ def _solve(model: Model, start: Unknowns, lagged: Lagged, max_steps: int, cg_ste
     surface = model.surface(found.value, lagged)
     counts = model.counts(surface, found.value, lagged)
     cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(found.value, lagged).items()}
-    return Solution(found.value, surface, counts, found.stats["num_steps"], cost)
+    return Solution(found.value, surface, counts, cost)
 
 
 class Refiner:
@@ -112,6 +111,7 @@ class Refiner:
         self.model = Model(geometry, dx, dy, s.albedo_std)
         self.shift = geometry.instrument.beam_shift
         self.observed = np.isfinite(signal)
+        self.data = np.where(self.observed, signal, 0.0)
         self.mean_signal = np.array(
             [np.median(d[o]) if o.any() else 1.0 for d, o in zip(signal, self.observed, strict=True)]
         )
@@ -130,31 +130,40 @@ class Refiner:
             np.zeros((n, n)),
         )
         nothing = np.zeros(signal.shape)
-        self.prediction, self.predicted_on = Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface
+        self.adopt(Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface)
         self.level_response = np.zeros((len(self.plateau), k, 3, *shape))
         self.residuals = np.zeros(signal.shape)
         self.weight = np.ones(signal.shape)
 
     def predict(self, predict: Predict) -> None:
         """Predict masks and multiple scattering on the current surface, and how masks follow the plateaus' levels."""
-        self.predicted_on = self.surface
-        self.prediction = predict(self.surface.height, self.surface.normals(self.shift))
+        self.adopt(predict(self.surface.height, self.surface.normals(self.shift)), self.surface)
         if self.prediction.response is not None:
             for i, weights in enumerate(self.plateau):
                 self.level_response[i] = self.prediction.response((weights > 0).astype(float))
+
+    def adopt(self, prediction: Prediction, surface: Surface) -> None:
+        """Take a prediction, made on a surface, for all solves until the next one."""
+        s, normals = self.settings, surface.normals(self.shift)
+        self.prediction, self.predicted_on = prediction, surface
+        self.near = prediction.about(normals)
+        doubt = prediction.doubt(normals, s.mask_error, s.multiple_error)
+        self.sigma = np.where(self.observed, np.sqrt(self.variance + doubt**2), np.inf)
+
+    def edges(self, cut: float) -> tuple[Edges, Edges]:
+        """Return the edges of the current surface along x and along y."""
+        (height, slope_x, slope_y), m = self.surface, self.model
+        return (
+            find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut),
+            find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut),
+        )
 
     def lag(self, limit: float, cut: float, is_instrument_free: bool = True) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
         s, m = self.settings, self.model
         height, slope_x, slope_y = self.surface
-        predicted_normals = self.predicted_on.normals(self.shift)
-        doubt = self.prediction.doubt(predicted_normals, s.mask_error, s.multiple_error)
-        sigma = np.sqrt(self.variance + doubt**2)
-        self.sigma = np.where(self.observed, sigma, np.inf)
         self.weight = geman_mcclure(self.residuals, limit)
-        prediction = self.prediction.about(predicted_normals)
-        edges_x = find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut)
-        edges_y = find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut)
+        edges_x, edges_y = self.edges(cut)
         self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
         scale_x, scale_y = (self._slope_scale(e, axis) for e, axis in ((edges_x, 1), (edges_y, 0)))
         base_x = one_sided(np.diff(height, axis=1) / m.dx, edges_x.intact, 1)
@@ -169,10 +178,10 @@ class Refiner:
             self.albedo,
         )
         lagged = Lagged(
-            data=np.where(self.observed, self.signal, 0.0),
+            data=self.data,
             inverse_sigma=self.weight / self.sigma,
-            multiple=prediction.multiple,
-            hidden=prediction.hidden,
+            multiple=self.near.multiple,
+            hidden=self.near.hidden,
             plateau=self.plateau,
             level=np.einsum("ryx,yx->r", self.plateau, self.predicted_on.height),
             level_response=self.level_response,
@@ -203,19 +212,11 @@ class Refiner:
         self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
         self.log_multiple = np.asarray(found.unknowns.log_multiple)
         self.albedo = np.asarray(found.unknowns.albedo)
-        difference = np.asarray(found.counts) - np.where(self.observed, self.signal, 0.0)
-        self.residuals = difference / self.sigma
+        self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found
 
     def misfit(self, limit: float, cut: float) -> float:
         """Return half the robust chi-square of data and edges, with the data's normalisation."""
         weight = geman_mcclure(self.residuals, limit)
         data = 0.5 * limit**2 * np.sum(1.0 - weight) + np.sum(np.log(self.sigma[self.observed]))
-        edges = (
-            find_edges(self.surface.height, slope, pitch, axis, self.slope_noise, cut)
-            for slope, pitch, axis in (
-                (self.surface.slope_x, self.model.dx, 1),
-                (self.surface.slope_y, self.model.dy, 0),
-            )
-        )
-        return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.intact)) for e in edges))
+        return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.intact)) for e in self.edges(cut)))

@@ -217,12 +217,11 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
     fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
-    signal, _ = signal_of(stack)
     posterior = fit.posterior
     is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:
         is_floating = floating(fit.surface.height, posterior.samples, regions(fit.intact_x, fit.intact_y))
-    worst = fit.weight.min(0, where=np.isfinite(signal), initial=1.0)
+    worst = fit.weight.min(0, where=stack.is_observed, initial=1.0)
     height, slope_x, slope_y = fit.surface
     jumps = (
         depth_jumps(height, slope_x, fit.intact_x, pitch(stack.x), 1),

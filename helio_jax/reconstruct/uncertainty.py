@@ -154,7 +154,7 @@ def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lag
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     """Return the Jacobian of `model.residuals` at the fit, in terms of the surface itself instead of its whitened form.
 
-    tests/inverse/test_uncertainty.py compares it with the automatic Jacobian of the residuals.
+    tests/gradients/test_model.py compares it with the automatic Jacobian of the residuals.
     """
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape

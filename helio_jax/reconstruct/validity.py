@@ -5,7 +5,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.edges import along
+from helio_jax.reconstruct.edges import along, ranked, trapezoid_gap
 from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of
 from helio_jax.reconstruction import REASONS
 
@@ -44,15 +44,13 @@ def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
     """
     shape = (intact_x.shape[0], intact_y.shape[1])
     pixel = np.arange(shape[0] * shape[1]).reshape(shape)
-    joined_x, joined_y = intact_x >= INTACT, intact_y >= INTACT
-    start = np.concatenate([pixel[:, :-1][joined_x], pixel[:-1][joined_y]])
-    end = np.concatenate([pixel[:, 1:][joined_x], pixel[1:][joined_y]])
+    is_joined = intact_y >= INTACT, intact_x >= INTACT
+    start, end = (
+        np.concatenate([ends[kept] for ends, kept in zip(side, is_joined, strict=True)])
+        for side in zip(along(pixel, 0), along(pixel, 1), strict=True)
+    )
     graph = coo_matrix((np.ones(start.size), (start, end)), shape=(pixel.size, pixel.size))
-    labels = connected_components(graph, directed=False)[1]
-    order = np.argsort(-np.bincount(labels), kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(order.size)
-    return rank[labels].reshape(shape)
+    return ranked(connected_components(graph, directed=False)[1]).reshape(shape)
 
 
 def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray) -> np.ndarray:
@@ -81,8 +79,7 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch
         intact: what is left of the edges.
         pitch: um.
     """
-    step = np.diff(height, axis=axis) / pitch - 0.5 * sum(along(slope, axis))
-    return (intact < INTACT) & (np.abs(step) > SMALLEST_JUMP)
+    return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
 
 
 def reasons_from_fit(

@@ -5,13 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.reconstruct import indirect
 from helio_jax.reconstruct.beamframe import normal_of_slopes
-from helio_jax.reconstruct.formfactor import SpotGeometry
+from tests.derivatives import adjoint_products, taylor_remainders
 
 
-def test_taylor_and_adjoint(monkeypatch):
+def test_taylor_and_adjoint(geometry, monkeypatch):
     """The Taylor remainder falls with slope 2.0 +- 0.05 over 2 decades of step, and <J v, w> = <v, J' w> to 1e-10.
 
     A rough surface with a step of 6 pitches, so that levels, strips cut at levels and the flat outside take part.
@@ -20,33 +19,23 @@ def test_taylor_and_adjoint(monkeypatch):
     """
     monkeypatch.setattr(indirect, "TOLERANCE", 1e-14)
     rng = np.random.default_rng(3)
-    detectors = tuple(
-        Detector(name=f"{i}", center_um=center, axes_um=(1300.0, 900.0), rotation_deg=turn)
-        for i, (center, turn) in enumerate((((2300.0, 100.0), 20.0), ((-1100.0, 2000.0), -40.0)))
-    )
-    plate = Plate(working_distance_um=4000.0, sample_distance_um=4400.0)
-    instrument = Instrument(beam=Beam(incidence_deg=25.0, azimuth_deg=35.0), plate=plate, detector=detectors)
     x, y = 12.0 * np.arange(10), 9.0 * np.arange(9)
     height = 4.0 * rng.normal(size=(9, 10)) + 40.0
     height[:, 5:] += 70.0
-    raw = np.stack(normal_of_slopes(*(0.3 * rng.normal(size=(2, 9, 10))), instrument.beam_shift), -1)
+    raw = np.stack(normal_of_slopes(*(0.3 * rng.normal(size=(2, 9, 10))), geometry.instrument.beam_shift), -1)
     start = height, raw / np.linalg.norm(raw, axis=-1, keepdims=True)
-    model = indirect.Radiosity(SpotGeometry(instrument), x, y)
+    model = indirect.Radiosity(geometry, x, y)
     plan = model.plan(*start)
     direction = rng.normal(size=height.shape), 0.05 * rng.normal(size=raw.shape)
 
-    def value_at(*surface):
+    def value_at(surface):
         return model.multiple(*surface, plan)
 
     with jax.enable_x64(True):
         start, v = (tuple(map(jnp.asarray, arrays)) for arrays in (start, direction))
-        value, slope = jax.jvp(value_at, start, v)
         steps = 10.0 ** np.arange(-1.5, -3.6, -0.5)
-        moved = [value_at(*(a + s * b for a, b in zip(start, v, strict=True))) for s in steps]
-        rest = [float(jnp.linalg.norm(m - value - s * slope)) for m, s in zip(moved, steps, strict=True)]
-        w = jnp.asarray(rng.normal(size=value.shape))
-        back = jax.vjp(value_at, *start)[1](w)
-        forth, to_and_fro = float(jnp.sum(slope * w)), float(sum(jnp.sum(a * b) for a, b in zip(v, back, strict=True)))
+        rest = taylor_remainders(value_at, start, v, steps)
+        forth, to_and_fro = adjoint_products(value_at, start, v, lambda f: jnp.asarray(rng.normal(size=f.shape)))
     orders = np.diff(np.log10(rest)) / np.diff(np.log10(steps))
     assert np.all(np.abs(orders - 2.0) < 0.05), orders
     assert forth == pytest.approx(to_and_fro, rel=1e-10)

@@ -10,6 +10,7 @@ from helio_jax.reconstruct.model import Prediction, Surface
 from helio_jax.reconstruct.refiner import Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
 from helio_jax.reconstruct.uncertainty import linearise
+from tests.derivatives import adjoint_products, taylor_remainders
 
 SHAPE, PITCH = (9, 11), 30.0
 
@@ -45,22 +46,13 @@ def random_direction(unknowns, seed):
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), unknowns)
 
 
-def dot(a, b):
-    return sum(float(jnp.sum(x * y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-
-
 def test_taylor_remainder_falls_with_the_square(problem):
     """Slope 2.0 +- 0.05 over three decades of the step. Catches a wrong or missing term of any derivative (slope 1)."""
     model, unknowns, lagged = problem
     with jax.enable_x64(True):
         direction = random_direction(unknowns, 1)
-        value, slope = jax.jvp(lambda u: model.residuals(u, lagged), (unknowns,), (direction,))
         steps = np.logspace(-1, -4, 7)
-        rest = []
-        for step in steps:
-            moved = model.residuals(jax.tree.map(lambda u, d, s=step: u + s * d, unknowns, direction), lagged)
-            gap = jax.tree.map(lambda m, v, j, s=step: m - v - s * j, moved, value, slope)
-            rest.append(np.sqrt(dot(gap, gap)))
+        rest = taylor_remainders(lambda u: model.residuals(u, lagged), unknowns, direction, steps)
     order = np.polyfit(np.log(steps), np.log(rest), 1)[0]
     assert order == pytest.approx(2.0, abs=0.05)
 
@@ -69,11 +61,9 @@ def test_adjoint(problem):
     """<J v, w> = <v, J' w> to 1e-11."""
     model, unknowns, lagged = problem
     with jax.enable_x64(True):
-        direction = random_direction(unknowns, 2)
-        value, slope = jax.jvp(lambda u: model.residuals(u, lagged), (unknowns,), (direction,))
-        weight = random_direction(value, 3)
-        (back,) = jax.vjp(lambda u: model.residuals(u, lagged), unknowns)[1](weight)
-        assert dot(slope, weight) == pytest.approx(dot(direction, back), rel=1e-11)
+        direction, weigh = random_direction(unknowns, 2), lambda value: random_direction(value, 3)
+        forth, back = adjoint_products(lambda u: model.residuals(u, lagged), unknowns, direction, weigh)
+    assert forth == pytest.approx(back, rel=1e-11)
 
 
 def test_gradient_is_cheap(problem):

@@ -51,9 +51,7 @@ def beyond_line(instrument: Instrument, k: int, height: float, across: np.ndarra
 
 
 def relative_error(ours: np.ndarray, exact: np.ndarray, whole: np.ndarray) -> float:
-    e = float(np.linalg.norm(ours - exact) / np.linalg.norm(whole))
-    print("ERR", e)
-    return e
+    return float(np.linalg.norm(ours - exact) / np.linalg.norm(whole))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.8, 1.0])

@@ -1,0 +1,18 @@
+"""What the derivative tests share."""
+
+import pytest
+
+from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.reconstruct.formfactor import SpotGeometry
+
+
+@pytest.fixture(scope="module")
+def geometry() -> SpotGeometry:
+    """Oblique beam along an odd azimuth, two turned ellipses."""
+    ellipses = (((2300.0, 100.0), 20.0), ((-1100.0, 2000.0), -40.0))
+    detectors = tuple(
+        Detector(name=f"{i}", center_um=center, axes_um=(1300.0, 900.0), rotation_deg=turn)
+        for i, (center, turn) in enumerate(ellipses)
+    )
+    plate = Plate(working_distance_um=4000.0, sample_distance_um=4400.0)
+    return SpotGeometry(Instrument(beam=Beam(incidence_deg=25.0, azimuth_deg=35.0), plate=plate, detector=detectors))
