@@ -311,7 +311,7 @@ def main() -> None:
     if "9" in wanted:
         ablation_row(record, args.seed, 121)
     if "8" in wanted:
-        growth_row(record, args.seed, (64, 128, 256))
+        growth_row(record, args.seed, (64, 128, 256, 512))
 
 
 if __name__ == "__main__":

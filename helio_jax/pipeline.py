@@ -38,7 +38,7 @@ from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
-from helio_jax.scene.surfaces import first_hit_spheres, flat_body, surface_body
+from helio_jax.scene.surfaces import behind_rims, first_hit_spheres, flat_body, surface_body
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
 from helio_jax.trace.settings import TraceSettings
@@ -137,7 +137,8 @@ def _make_tracer(
 
     def scatter(height: np.ndarray, normals: np.ndarray) -> np.ndarray:
         x, y = instrument.surface_position(grid_x, grid_y, height)
-        body = surface_body(x, y, height, reach, level=0.0, beam_shift=instrument.beam_shift)
+        sheet = behind_rims(x, y, height, normals, instrument.beam_shift)
+        body = surface_body(*sheet, reach, level=0.0, beam_shift=instrument.beam_shift)
         experiment = make_experiment(body, instrument, settings)
         normal = normals.reshape(-1, 3)
         point = np.stack([x, y, height], -1).reshape(-1, 3) + lift * normal
