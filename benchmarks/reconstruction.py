@@ -29,6 +29,7 @@ from helio_jax import pipeline  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.predict import make_predictor  # noqa: E402
 from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
 from helio_jax.reconstruct.model import Prediction  # noqa: E402
 from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
@@ -181,7 +182,7 @@ def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Predicti
     chosen = settings_of(scene, refine)
 
     def make_predict(n_rays: int):
-        predict = pipeline.make_predictor(stack, n_rays, chosen.refine.substrate_um)
+        predict = make_predictor(stack, n_rays, chosen.refine.substrate_um)
         return lambda height, normals: change(predict(height, normals))
 
     start = time.perf_counter()

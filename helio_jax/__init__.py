@@ -15,7 +15,8 @@ folder per verb. Which file does what:
   -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
 * `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
 * `formats/` `hdf5` (NeXus), `matlab` (import), `safe` (untrusted files).
-* `config` (scene files), `pipeline` (the only place that joins the stages), `__main__` (command line).
+* `config` (scene files), `predict` (tracer and masks for the fit), `pipeline` (joins the stages), `__main__` (command
+  line).
 
 Public names are loaded on first use, so that `import helio_jax` is instant.
 """

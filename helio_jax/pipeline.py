@@ -11,12 +11,11 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from helio_jax.arrays import pitch
 from helio_jax.config import SceneFile, load_scene, resolved
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.figures import panel, save_figure
@@ -27,34 +26,22 @@ from helio_jax.formats.hdf5 import read, write
 from helio_jax.formats.safe import atomic_path
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.predict import make_predictor
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
-from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.indirect import Radiosity
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
-from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
-from helio_jax.scene.surfaces import behind_rims, first_hit_spheres, flat_body, surface_body
-from helio_jax.trace.intersect import MISS, Hits, Intersector
+from helio_jax.scene.surfaces import first_hit_spheres, flat_body
+from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
 from helio_jax.trace.settings import TraceSettings
 
 SUBSTRATE_RATIO = 1.35
 """Where a scene does not say: the substrate begins at this many radii of the scored region."""
-SMOOTH_PIXELS = 1.0
-"""Gaussian width over which the traced multiple scattering is averaged [pixels] ..."""
-SMOOTH_BEND = 0.2
-"""... and the difference of unit normals at which a neighbour counts less."""
-_SMOOTH_RIDGE = 0.1
-"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
-MAX_BURIED = 0.05
-"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
-LIFT_PIXELS = 0.1
-"""How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
 
 
 def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> MicrographStack:
@@ -84,95 +71,6 @@ def _changed(settings, changes: dict[str, Any]):
 def record(scene: SceneFile, stack: MicrographStack) -> MicrographStack:
     """Return the stack as the scene's experiment would record it: with counting noise, if the scene asks for it."""
     return add_noise(stack, scene.noise) if scene.noise.enabled and stack.noise == "expected" else stack
-
-
-def make_predictor(
-    stack: MicrographStack,
-    n_rays: int,
-    substrate_um: float | None = None,
-    seed: int = 7,
-    workers: int | None = None,
-    multiple: Literal["traced", "radiosity"] = "traced",
-) -> Callable[[np.ndarray, np.ndarray], Prediction]:
-    """Return a function that predicts what a surface does beyond direct single scattering.
-
-    Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
-    neither `n_rays` nor `seed`; masks come from the horizon march.
-
-    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
-    Seeds are fixed, so that successive predictions differ by the surface, not by noise.
-    """
-    instrument = stack.instrument
-    geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
-    size = max(np.ptp(stack.x), np.ptp(stack.y))
-    border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
-    reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
-    if multiple == "radiosity":
-        scatter = Radiosity(geometry, stack.x, stack.y, 2.0 * reach)
-    else:
-        scatter = _make_tracer(stack, n_rays, reach, seed, workers)
-
-    def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
-        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
-        about = (geometry, dx, dy)
-        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
-        return Prediction(
-            scatter(height, normals),
-            hidden,
-            lambda change: np.asarray(hidden_response(height, a, b, *about, change)),
-        )
-
-    return predict
-
-
-def _make_tracer(
-    stack: MicrographStack, n_rays: int, reach: float, seed: int, workers: int | None
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return a function that traces a surface's multiple scattering; `reach`: half the side of the flat around, um."""
-    instrument = stack.instrument
-    grid_x, grid_y = np.meshgrid(stack.x, stack.y)
-    lift = LIFT_PIXELS * min(pitch(stack.x), pitch(stack.y))
-    branches = max(1, round(n_rays / grid_x.size / 8))
-    settings = TraceSettings(rays=8, branches=branches, n_orders=2, seed=seed, workers=workers)
-
-    def scatter(height: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        x, y = instrument.surface_position(grid_x, grid_y, height)
-        sheet = behind_rims(x, y, height, normals, instrument.beam_shift)
-        body = surface_body(*sheet, reach, level=0.0, beam_shift=instrument.beam_shift)
-        experiment = make_experiment(body, instrument, settings)
-        normal = normals.reshape(-1, 3)
-        point = np.stack([x, y, height], -1).reshape(-1, 3) + lift * normal
-        first = Hits.on_mesh(point, normal)
-        tally = trace_pixels(experiment, grid_x.ravel(), grid_y.ravel(), workers, first=first, max_lost=MAX_BURIED)
-        return smooth_along_surface(tally.probability()[0][1].reshape(-1, *height.shape), normals)
-
-    return scatter
-
-
-def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return images [detector, y, x] smoothed over neighbours whose unit normals [y, x, 3] are alike.
-
-    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
-    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
-    mean over neighbours on one side would flatten. Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004)
-    664, eq. 3; local planes: Fan and Gijbels, Local Polynomial Modelling (1996), sec. 3.1.
-    """
-    reach = int(np.ceil(2.5 * SMOOTH_PIXELS))
-    margin = ((reach, reach), (reach, reach), (0, 0))
-    both = np.concatenate([np.moveaxis(images, 0, -1), normals], -1)
-    around = np.pad(both, margin, mode="edge")
-    ny, nx = images.shape[1:]
-    matrix, right = np.zeros((ny, nx, 3, 3)), np.zeros((ny, nx, 3, len(images)))
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            near = around[reach + i : reach + i + ny, reach + j : reach + j + nx]
-            bend = ((near[..., -3:] - normals) ** 2).sum(-1) / SMOOTH_BEND**2
-            weight = np.exp(-0.5 * ((i**2 + j**2) / SMOOTH_PIXELS**2 + bend))
-            basis = np.array([1.0, i, j])
-            matrix += weight[..., None, None] * np.outer(basis, basis)
-            right += weight[..., None, None] * basis[:, None] * near[..., None, :-3]
-    matrix += _SMOOTH_RIDGE * np.diag([0.0, 1.0, 1.0])
-    return np.moveaxis(np.linalg.solve(matrix, right)[..., 0, :], -1, 0)
 
 
 def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None) -> MicrographStack:

@@ -1,7 +1,7 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > pipeline, study > config > explain > stages > scene > nouns > settings, arrays, errors.
+__main__ > pipeline, study > predict > config > explain > stages > scene > nouns > settings, arrays, errors.
 """
 
 import ast
@@ -22,6 +22,7 @@ LEVELS = [
     {"trace", "prepare", "reconstruct", "evaluate", "formats"},
     {"explain"},
     {"config"},
+    {"predict"},
     {"pipeline", "study"},
     {"__main__", "__init__"},
 ]
@@ -131,7 +132,7 @@ def find_cycle(graph: dict[str, set[str]]) -> list[str]:
 
 def truth_imports(source: str) -> list[str]:
     """Return what a file of `reconstruct` imports that knows the truth: scorer, scene, tracer, or what joins them."""
-    forbidden = {"evaluate", "scene", "trace", "config", "pipeline", "study"}
+    forbidden = {"evaluate", "scene", "trace", "config", "predict", "pipeline", "study"}
     return [n for n in imports(source) if n.startswith("helio_jax.") and n.split(".")[1] in forbidden]
 
 

@@ -1,8 +1,8 @@
 """The forward model of the fit: from whitened unknowns to residuals in standard deviations (JAX, differentiable).
 
-What is known of the surface: the data, the edges between pixels, the flat border. What is known of the instrument:
-priors of gain, offset and of the scale of the predicted multiple scattering. `Lagged` holds all that is constant
-during one least-squares solve. How it is solved is `refiner`'s matter.
+What is known of the surface: the data, the edges between pixels, the flat border. What is known of the rest: priors of
+gain, offset, the scale of the predicted multiple scattering, and of where the side that the beam does not see stands.
+`Lagged` holds all that is constant during one least-squares solve. How it is solved is `refiner`'s matter.
 """
 
 from collections.abc import Callable
@@ -34,11 +34,14 @@ class Prediction:
         multiple: detection probability of order 2 and above [detector, y, x].
         hidden: hidden part of the vector form factor [detector, 3, y, x].
         response: change of `hidden` per change of the heights in a given way [y, x], or None where not known.
+        unseen: change of the probabilities by one standard deviation of where the side of the sample that the beam does
+            not see stands [detector, y, x], or None where not known. It errs as one: no number of pixels averages it.
     """
 
     multiple: np.ndarray
     hidden: np.ndarray
     response: Callable[[np.ndarray], np.ndarray] | None = None
+    unseen: np.ndarray | None = None
 
     def about(self, normals: np.ndarray) -> "Prediction":
         """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
@@ -98,6 +101,7 @@ class Lagged(NamedTuple):
     inverse_sigma: Any
     multiple: Any
     hidden: Any
+    unseen: Any
     plateau: Any
     level: Any
     level_response: Any
@@ -115,7 +119,8 @@ class Lagged(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; albedo modes.
+    """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; one for the unseen
+    side; albedo modes.
 
     All but the surface in prior deviations.
     """
@@ -126,6 +131,7 @@ class Unknowns(NamedTuple):
     log_gain: Any
     offset: Any
     log_multiple: Any
+    unseen: Any
     albedo: Any
 
 
@@ -166,7 +172,7 @@ class Model(eqx.Module):
     @property
     def instrument_fields(self) -> tuple[str, ...]:
         """Names of the unknowns that are not the surface."""
-        always = ("log_gain", "offset", "log_multiple")
+        always = ("log_gain", "offset", "log_multiple", "unseen")
         return (*always, "albedo") if self.albedo_std > 0 else always
 
     def normal(self, surface: Surface) -> jax.Array:
@@ -182,7 +188,7 @@ class Model(eqx.Module):
         gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
         offset = (lagged.offset_std * unknowns.offset)[:, None, None]
         multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
-        return gain * (albedo * single + multiple) + offset
+        return gain * (albedo * single + multiple + unknowns.unseen * lagged.unseen) + offset
 
     def data_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
         """Return (model - data) / standard deviation, robustly weighted [detector, y, x]."""
@@ -201,5 +207,6 @@ class Model(eqx.Module):
             "gain": unknowns.log_gain,
             "offset": unknowns.offset,
             "multiple": unknowns.log_multiple,
+            "unseen": unknowns.unseen,
             "albedo": unknowns.albedo,
         }

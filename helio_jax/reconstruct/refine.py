@@ -86,12 +86,13 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         settings,
         None if region is None else region[thin],
     )
-    for name in ("log_gain", "offset", "log_multiple", "albedo"):
+    for name in ("log_gain", "offset", "log_multiple", "unseen", "albedo"):
         setattr(part, name, getattr(refiner, name))
     part.residuals = refiner.residuals[:, *thin]
     p = refiner.prediction
     predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
-    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin]), predicted_on)
+    unseen = None if p.unseen is None else p.unseen[:, *thin]
+    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin], unseen=unseen), predicted_on)
     part.level_response = refiner.level_response[..., *thin]
     unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(

@@ -123,12 +123,8 @@ class Refiner:
         self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
         self.surface = Surface(*map(np.asarray, start))
         k, n = signal.shape[0], s.albedo_modes
-        self.log_gain, self.offset, self.log_multiple, self.albedo = (
-            np.zeros(k),
-            np.zeros(k),
-            np.zeros(k),
-            np.zeros((n, n)),
-        )
+        self.log_gain, self.offset, self.log_multiple = np.zeros((3, k))
+        self.unseen, self.albedo = np.zeros(()), np.zeros((n, n))
         nothing = np.zeros(signal.shape)
         self.adopt(Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface)
         self.level_response = np.zeros((len(self.plateau), k, 3, *shape))
@@ -160,7 +156,7 @@ class Refiner:
 
     def lag(self, limit: float, cut: float, is_instrument_free: bool = True) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
-        s, m = self.settings, self.model
+        s, m, p = self.settings, self.model, self.near
         height, slope_x, slope_y = self.surface
         self.weight = geman_mcclure(self.residuals, limit)
         edges_x, edges_y = self.edges(cut)
@@ -175,13 +171,15 @@ class Refiner:
             self.log_gain,
             self.offset,
             self.log_multiple,
+            self.unseen,
             self.albedo,
         )
         lagged = Lagged(
             data=self.data,
             inverse_sigma=self.weight / self.sigma,
-            multiple=self.near.multiple,
-            hidden=self.near.hidden,
+            multiple=p.multiple,
+            hidden=p.hidden,
+            unseen=np.zeros(self.data.shape) if p.unseen is None else p.unseen * float(is_instrument_free),
             plateau=self.plateau,
             level=np.einsum("ryx,yx->r", self.plateau, self.predicted_on.height),
             level_response=self.level_response,
@@ -210,7 +208,7 @@ class Refiner:
         found = _solve(self.model, *self.lag(limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
         self.surface = Surface(*map(np.asarray, found.surface))
         self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
-        self.log_multiple = np.asarray(found.unknowns.log_multiple)
+        self.log_multiple, self.unseen = np.asarray(found.unknowns.log_multiple), np.asarray(found.unknowns.unseen)
         self.albedo = np.asarray(found.unknowns.albedo)
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found

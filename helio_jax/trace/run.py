@@ -34,13 +34,13 @@ Progress = Callable[[int, int], None]
 """Called with (blocks done, blocks in all)."""
 
 
-def make_experiment(body: Body, instrument: Instrument, settings: TraceSettings) -> Experiment:
+def make_experiment(body: Body | Intersector, instrument: Instrument, settings: TraceSettings) -> Experiment:
     """Prepare the shared state of a run. The expected estimator rounds the rays up to a multiple of 8."""
     is_expected = settings.estimator == "expected"
     n_replicates = N_REPLICATES if is_expected else 0
     n_rays = -(-settings.rays // N_REPLICATES) * N_REPLICATES if is_expected else settings.rays
     return Experiment(
-        intersector=Intersector(body),
+        intersector=body if isinstance(body, Intersector) else Intersector(body),
         instrument=instrument,
         apertures=ApertureTable(instrument),
         sampling=Sampling.make(n_rays, settings.branches if is_expected else 1, n_replicates, settings.seed),

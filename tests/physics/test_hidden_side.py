@@ -7,6 +7,7 @@ import pytest
 
 from helio_jax import pipeline
 from helio_jax.config import load_scene
+from helio_jax.predict import make_predictor
 from helio_jax.scene.surfaces import behind_rims, first_hit_spheres
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,7 +45,7 @@ def test_ground_around_a_sphere(name):
     spheres = scene.sample.build().spheres
     beam = stack.instrument.beam_shift
     height, normals = first_hit_spheres(*np.meshgrid(stack.x, stack.y), spheres, beam)
-    predict = pipeline.make_predictor(stack, 2_000_000, scene.reconstruct.refine.substrate_um)
+    predict = make_predictor(stack, 2_000_000, scene.reconstruct.refine.substrate_um)
     predicted = predict(height, normals).multiple
     assert stack.by_order is not None and stack.n_rays is not None
     true = stack.by_order[1:].sum(0) / stack.n_rays

@@ -9,7 +9,7 @@ import pytest
 from helio_jax.config import load_scene
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
-from helio_jax.pipeline import make_predictor, smooth_along_surface
+from helio_jax.predict import make_predictor, smooth_along_surface
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.indirect import Radiosity, transfer
 from helio_jax.trace.intersect import Intersector

@@ -1,0 +1,173 @@
+"""What a surface does beyond direct single scattering, for the fit: the tracer and the horizon march joined.
+
+`make_predictor` gives the callable that `reconstruct` asks for. Masks come from the horizon march, which takes what
+lies behind a rim for a sheet along the beam; multiple scattering is traced (or computed by radiosity). The side that
+the beam does not see may stand anywhere between that sheet and below the rim: both terms are predicted at two places
+(`UNSEEN_SHARES`), their mean is expected, and half their difference is one unknown of the fit.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.beamframe import slopes_of_normal
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.indirect import Radiosity
+from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
+from helio_jax.scene.surfaces import behind_rims, surface_body
+from helio_jax.trace import masks
+from helio_jax.trace.intersect import Hits, Intersector
+from helio_jax.trace.run import make_experiment, trace_pixels
+from helio_jax.trace.settings import TraceSettings
+
+SMOOTH_PIXELS = 1.0
+"""Gaussian width over which the traced multiple scattering is averaged [pixels] ..."""
+SMOOTH_BEND = 0.2
+"""... and the difference of unit normals at which a neighbour counts less."""
+_SMOOTH_RIDGE = 0.1
+"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
+UNSEEN_SHARES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
+"""Where the unseen side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
+Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
+RAYS = 8
+"""Paths per pixel and branch."""
+MAX_BURIED = 0.05
+"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
+LIFT_PIXELS = 0.1
+"""How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
+
+
+def make_predictor(
+    stack: MicrographStack,
+    n_rays: int,
+    substrate_um: float | None = None,
+    seed: int = 7,
+    workers: int | None = None,
+    multiple: Literal["traced", "radiosity"] = "traced",
+) -> Callable[[np.ndarray, np.ndarray], Prediction]:
+    """Return a function that predicts masks and multiple scattering of a surface.
+
+    Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
+    neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
+
+    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
+    Seeds are fixed, so that successive predictions differ by the surface, not by noise.
+    """
+    instrument = stack.instrument
+    geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
+    size = max(np.ptp(stack.x), np.ptp(stack.y))
+    border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
+    reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
+    raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach)
+    radiosity = Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
+
+    def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
+        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
+        about = (geometry, dx, dy)
+        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
+
+        def response(change: np.ndarray) -> np.ndarray:
+            return np.asarray(hidden_response(height, a, b, *about, change))
+
+        if radiosity is not None:
+            return Prediction(radiosity(height, normals), hidden, response)
+        sides = raster.sides(height, normals)
+        branches = max(1, round(n_rays / height.size / RAYS / len(sides)))
+        settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
+        traced = [smooth_along_surface(side.multiple(settings), normals) for side in sides]
+        if len(sides) == 1:
+            return Prediction(traced[0], hidden, response)
+        is_masked = np.any(hidden != 0.0, axis=(0, 1))
+        sheet = raster.side(height, normals, 0.0).hidden(is_masked)
+        freed = [side.hidden(is_masked) - sheet for side in sides]
+        either = [m - np.einsum("kiyx,yxi->kyx", h, normals) for m, h in zip(traced, freed, strict=True)]
+        return Prediction(
+            np.mean(traced, axis=0), hidden + np.mean(freed, axis=0), response, 0.5 * np.subtract(*either)
+        )
+
+    return predict
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A surface whose unseen side stands at one place: a point for every pixel, and the mesh through them."""
+
+    raster: "_Raster"
+    points: Hits
+    intersector: Intersector
+
+    def multiple(self, settings: TraceSettings) -> np.ndarray:
+        """Return the traced multiple scattering [detector, y, x]."""
+        r = self.raster
+        experiment = make_experiment(self.intersector, r.instrument, settings)
+        x, y = r.x.ravel(), r.y.ravel()
+        tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
+        return tally.probability()[0][1].reshape(-1, *r.x.shape)
+
+    def hidden(self, is_wanted: np.ndarray) -> np.ndarray:
+        """Return the hidden vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
+        r, p = self.raster, self.points.take(is_wanted.ravel())
+        offset = np.stack(r.instrument.sample_origin(r.x[is_wanted], r.y[is_wanted])[:2], -1)
+        found, _ = masks.hidden_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)
+        out = np.zeros((len(found), 3, *is_wanted.shape))
+        out[:, :, is_wanted] = np.moveaxis(found, -1, 1)
+        return out
+
+
+@dataclass(frozen=True)
+class _Raster:
+    """Beam positions [y, x], how far off the surface points are put, and half the side of the flat around [um]."""
+
+    instrument: Instrument
+    x: np.ndarray
+    y: np.ndarray
+    lift: float
+    reach: float
+
+    def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> _Side:
+        """Return the surface with its unseen side at a share of the way back."""
+        shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
+        at = *self.instrument.surface_position(self.x, self.y, height), height
+        sheet = behind_rims(*at, normals, shift, share)
+        body = surface_body(*sheet, self.reach, level=0.0, beam_shift=shift)
+        point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
+        return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
+
+    def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
+        """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
+        at = *self.instrument.surface_position(self.x, self.y, height), height
+        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0)[0], at[0])
+        return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]
+
+
+def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return images [detector, y, x] smoothed over neighbours whose unit normals [y, x, 3] are alike.
+
+    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
+    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
+    mean over neighbours on one side would flatten. Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004)
+    664, eq. 3; local planes: Fan and Gijbels, Local Polynomial Modelling (1996), sec. 3.1.
+    """
+    reach = int(np.ceil(2.5 * SMOOTH_PIXELS))
+    margin = ((reach, reach), (reach, reach), (0, 0))
+    both = np.concatenate([np.moveaxis(images, 0, -1), normals], -1)
+    around = np.pad(both, margin, mode="edge")
+    ny, nx = images.shape[1:]
+    matrix, right = np.zeros((ny, nx, 3, 3)), np.zeros((ny, nx, 3, len(images)))
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            near = around[reach + i : reach + i + ny, reach + j : reach + j + nx]
+            bend = ((near[..., -3:] - normals) ** 2).sum(-1) / SMOOTH_BEND**2
+            weight = np.exp(-0.5 * ((i**2 + j**2) / SMOOTH_PIXELS**2 + bend))
+            basis = np.array([1.0, i, j])
+            matrix += weight[..., None, None] * np.outer(basis, basis)
+            right += weight[..., None, None] * basis[:, None] * near[..., None, :-3]
+    matrix += _SMOOTH_RIDGE * np.diag([0.0, 1.0, 1.0])
+    return np.moveaxis(np.linalg.solve(matrix, right)[..., 0, :], -1, 0)
