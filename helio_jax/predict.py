@@ -23,21 +23,18 @@ from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.scene.surfaces import behind_rims, surface_body
 from helio_jax.trace import masks
+from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 
-SMOOTH_PIXELS = 1.0
-"""Gaussian width over which the traced multiple scattering is averaged [pixels] ..."""
-SMOOTH_BEND = 0.2
-"""... and the difference of unit normals at which a neighbour counts less."""
-_SMOOTH_RIDGE = 0.1
-"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
 UNSEEN_SHARES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
 """Where the unseen side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
 Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
 RAYS = 8
 """Paths per pixel and branch."""
+SMOOTH_PATHS = 40
+"""The traced image is averaged over neighbours until this many paths count in every pixel."""
 MAX_BURIED = 0.05
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
 LIFT_PIXELS = 0.1
@@ -81,7 +78,8 @@ def make_predictor(
         sides = raster.sides(height, normals)
         branches = max(1, round(n_rays / height.size / RAYS / len(sides)))
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
-        traced = [smooth_along_surface(side.multiple(settings), normals) for side in sides]
+        passes = passes_for(RAYS * branches, SMOOTH_PATHS)
+        traced = [smooth_along_surface(side.multiple(settings), normals, passes) for side in sides]
         if len(sides) == 1:
             return Prediction(traced[0], hidden, response)
         is_masked = np.any(hidden != 0.0, axis=(0, 1))
@@ -145,29 +143,3 @@ class _Raster:
         at = *self.instrument.surface_position(self.x, self.y, height), height
         is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0)[0], at[0])
         return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]
-
-
-def smooth_along_surface(images: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return images [detector, y, x] smoothed over neighbours whose unit normals [y, x, 3] are alike.
-
-    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
-    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
-    mean over neighbours on one side would flatten. Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004)
-    664, eq. 3; local planes: Fan and Gijbels, Local Polynomial Modelling (1996), sec. 3.1.
-    """
-    reach = int(np.ceil(2.5 * SMOOTH_PIXELS))
-    margin = ((reach, reach), (reach, reach), (0, 0))
-    both = np.concatenate([np.moveaxis(images, 0, -1), normals], -1)
-    around = np.pad(both, margin, mode="edge")
-    ny, nx = images.shape[1:]
-    matrix, right = np.zeros((ny, nx, 3, 3)), np.zeros((ny, nx, 3, len(images)))
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            near = around[reach + i : reach + i + ny, reach + j : reach + j + nx]
-            bend = ((near[..., -3:] - normals) ** 2).sum(-1) / SMOOTH_BEND**2
-            weight = np.exp(-0.5 * ((i**2 + j**2) / SMOOTH_PIXELS**2 + bend))
-            basis = np.array([1.0, i, j])
-            matrix += weight[..., None, None] * np.outer(basis, basis)
-            right += weight[..., None, None] * basis[:, None] * near[..., None, :-3]
-    matrix += _SMOOTH_RIDGE * np.diag([0.0, 1.0, 1.0])
-    return np.moveaxis(np.linalg.solve(matrix, right)[..., 0, :], -1, 0)

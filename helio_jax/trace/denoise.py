@@ -1,0 +1,75 @@
+"""Averaging of traced images over neighbouring pixels, without smearing the edges of the surface."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+SMOOTH_PIXELS = 1.0
+"""Gaussian width of one pass [pixels] ..."""
+SMOOTH_BEND = 0.2
+"""... and the difference of unit normals at which a neighbour counts less."""
+_REACH = math.ceil(2.5 * SMOOTH_PIXELS)
+_RIDGE = 0.1
+"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
+
+
+def smooth_along_surface(images: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
+    """Return images [image, y, x] averaged over neighbours whose unit normals [y, x, 3] are alike.
+
+    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
+    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
+    mean over neighbours on one side would flatten. Every further pass takes neighbours twice as far apart, so the
+    Gaussian variance of `passes` passes is (4^passes - 1) / 3 squared pixels.
+
+    Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004) 664, eq. 3; passes: Dammertz, Sewtz, Hanika and
+        Lensch, High Performance Graphics 2010, sec. 3; local planes: Fan and Gijbels, Local Polynomial Modelling
+        (1996), sec. 3.1.
+    """
+    smooth = np.ascontiguousarray(np.moveaxis(images, 0, -1), np.float64)
+    for number in range(passes):
+        smooth = _fit_planes(smooth, np.ascontiguousarray(normals, np.float64), 2**number)
+    return np.moveaxis(smooth, -1, 0)
+
+
+def passes_for(paths: float, wanted: float) -> int:
+    """Return how many passes average at least `wanted` paths, of which every pixel has `paths`."""
+    passes = 1
+    while paths * (4**passes - 1) / 3 < wanted:
+        passes += 1
+    return passes
+
+
+@njit(cache=True, nogil=True)
+def _fit_planes(images, normals, spacing):
+    """Return the value at the pixel of the plane fitted around every pixel [y, x, image]."""
+    ny, nx, n_images = images.shape
+    out = np.empty_like(images)
+    for row in range(ny):
+        matrix, right = np.empty((3, 3)), np.empty((3, n_images))
+        for column in range(nx):
+            matrix[:] = 0.0
+            matrix[1, 1] = matrix[2, 2] = _RIDGE
+            right[:] = 0.0
+            for i in range(-_REACH, _REACH + 1):
+                y = min(max(row + i * spacing, 0), ny - 1)
+                for j in range(-_REACH, _REACH + 1):
+                    x = min(max(column + j * spacing, 0), nx - 1)
+                    bend = 0.0
+                    for a in range(3):
+                        bend += (normals[y, x, a] - normals[row, column, a]) ** 2
+                    weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + bend / SMOOTH_BEND**2))
+                    matrix[0, 0] += weight
+                    matrix[0, 1] += weight * i
+                    matrix[0, 2] += weight * j
+                    matrix[1, 1] += weight * i * i
+                    matrix[1, 2] += weight * i * j
+                    matrix[2, 2] += weight * j * j
+                    for k in range(n_images):
+                        value = weight * images[y, x, k]
+                        right[0, k] += value
+                        right[1, k] += value * i
+                        right[2, k] += value * j
+            matrix[1, 0], matrix[2, 0], matrix[2, 1] = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+            out[row, column] = np.linalg.solve(matrix, right)[0]
+    return out
