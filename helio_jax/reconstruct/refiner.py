@@ -25,6 +25,8 @@ from helio_jax.reconstruct.settings import ReconstructSettings
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
 
+_NOISY = 3.0
+"""Deviation that slopes are credited with at most, in those of a pixel with median noise."""
 _HELD = 1e-5
 """Least prior weight of a height, 1/um: holds a pixel that all edges part from the rest."""
 
@@ -98,6 +100,11 @@ def _solve(model: Model, start: Unknowns, lagged: Lagged, max_steps: int, cg_ste
     counts = model.counts(surface, found.value, lagged)
     cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(found.value, lagged).items()}
     return Solution(found.value, surface, counts, cost)
+
+
+@eqx.filter_jit
+def _noise_change(model: Model, surface: Surface, hidden, inverse_sigma, largest) -> jax.Array:
+    return model.noise_change(Surface(*map(jnp.asarray, surface)), hidden, inverse_sigma, largest)
 
 
 class Refiner:
@@ -174,12 +181,15 @@ class Refiner:
             self.unseen,
             self.albedo,
         )
+        inverse_sigma = self.weight / self.sigma
+        largest = _NOISY * self.slope_noise * self._steepness()
         lagged = Lagged(
             data=self.data,
-            inverse_sigma=self.weight / self.sigma,
+            inverse_sigma=inverse_sigma,
             multiple=p.multiple,
             hidden=p.hidden,
             unseen=np.zeros(self.data.shape) if p.unseen is None else p.unseen * float(is_instrument_free),
+            noise_change=_noise_change(m, self.surface, p.hidden, inverse_sigma, largest),
             plateau=self.plateau,
             level=np.einsum("ryx,yx->r", self.plateau, self.predicted_on.height),
             level_response=self.level_response,
@@ -199,8 +209,12 @@ class Refiner:
 
     def _slope_scale(self, edges: Edges, axis: int) -> np.ndarray:
         """Return how far a slope may move from its one-sided difference: what edges and datum leave of it."""
-        steepness = 1.0 + self.surface.slope_x**2 + self.surface.slope_y**2
-        return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / (self.slope_noise * steepness) ** 2)
+        free = self.slope_noise * self._steepness()
+        return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / free**2)
+
+    def _steepness(self) -> np.ndarray:
+        """Return by how much more the slopes of a facet follow its normal than those of a level one [y, x]."""
+        return 1.0 + self.surface.slope_x**2 + self.surface.slope_y**2
 
     def step(self, limit: float, cut: float, is_instrument_free: bool) -> Solution:
         """Solve one weighted least-squares problem from the current surface."""

@@ -20,7 +20,9 @@ RIM_PITCHES = 5.0
 _STEEP = 0.5
 """Vertical part of the unit normal below which a point is a wall's, not the ground at its foot."""
 _LEE_PIXELS = 2.0
-"""Gaussian width over which heights are averaged to tell the lee of a rim, where they fall down the beam [pixels]."""
+"""The lee of a rim is where the heights, averaged with this Gaussian width [pixels], fall down the beam ..."""
+_LEE_COSINE = 0.25
+"""... at an angle to its azimuth whose cosine is at least this: a wall along the beam hides nothing."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +263,9 @@ def behind_rims(
         for axis, at, shift in zip((1, 0), (x, y), beam_shift, strict=True)
     )
     slope_x, slope_y = (gaussian_filter(z, _LEE_PIXELS, order) for order in ((0, 1), (1, 0)))
-    is_lee = slope_x / pitch_x * beam_shift[0] + slope_y / pitch_y * beam_shift[1] < 0.0
+    downhill = -slope_x / pitch_x, -slope_y / pitch_y
+    along_beam = downhill[0] * beam_shift[0] + downhill[1] * beam_shift[1]
+    is_lee = along_beam > _LEE_COSINE * np.hypot(*downhill) * np.hypot(*beam_shift)
     fall = maximum_filter(z, size=3) - z
     is_foot = (fall > RIM_PITCHES * max(pitch_x, pitch_y)) & is_lee & (normals[..., 2] >= _STEEP)
     drop = np.where(is_foot, fall, 0.0)

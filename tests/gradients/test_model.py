@@ -35,7 +35,8 @@ def problem(bshem):
     with jax.enable_x64(True):
         hidden = rng.uniform(0, 0.1, (3, 3, *SHAPE)) * geometry.form_factor(height)
         response = rng.normal(scale=1e-4, size=hidden.shape)
-        prediction = Prediction(0.2 * np.nan_to_num(signal), hidden, lambda change: response * (1.0 + change.mean()))
+        multiple, unseen = 0.2 * np.nan_to_num(signal), 0.05 * np.nan_to_num(signal)
+        prediction = Prediction(multiple, hidden, lambda change: response * (1.0 + change.mean()), unseen)
         refiner.predict(lambda height, normals: prediction)
         yield refiner.model, *refiner.lag(8.0, 3.0)
 
@@ -98,7 +99,8 @@ def test_sparse_jacobian_is_the_automatic_one(problem):
         linear.far.shape[1] == 2 and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
     )
     ours = linear.surface @ surface + linear.far @ levels + linear.instrument @ instrument
-    order = ("data", "edge_x", "edge_y", "border", "slope_x", "slope_y", "gain", "offset", "multiple", "albedo")
+    order = ["data", "edge_x", "edge_y", "border", "slope_x", "slope_y"]
+    order += ["gain", "offset", "multiple", "unseen", "albedo"]
     theirs = np.concatenate([np.asarray(slope[name]).ravel() for name in order])
     assert set(order) == set(value)
     assert np.allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())

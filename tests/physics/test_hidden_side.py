@@ -1,4 +1,4 @@
-"""What the beam cannot see still scatters: the predicted multiple scattering around an overhanging sphere."""
+"""What the beam cannot see still scatters and hides: multiple scattering and masks around an overhanging sphere."""
 
 from pathlib import Path
 
@@ -8,47 +8,98 @@ import pytest
 from helio_jax import pipeline
 from helio_jax.config import load_scene
 from helio_jax.predict import make_predictor
+from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.scene.surfaces import behind_rims, first_hit_spheres
 
 ROOT = Path(__file__).resolve().parents[2]
 TAN30 = np.tan(np.deg2rad(30.0))
 
 
-def test_foot_of_a_rim_moves_half_way_back():
-    """A mesa of 100 um: the first ground point in its lee moves 50 um * tan t up the beam, all others stay.
+@pytest.mark.parametrize("is_along_y", [False, True])
+def test_foot_of_a_rim_moves_back(is_along_y):
+    """A mesa of 100 um in a beam along x or y: the ground in its lee moves 30 um * tan t up the beam, in its plane.
 
-    Catches: the wrong side of the mesa, moves across the beam, moves on a slope that leave its plane.
+    Only what touches the mesa moves, and nothing on its windward side or beside its walls along the beam. Catches: the
+    wrong side, a move across the beam, a slope that is left, a beam along y taken for one along x.
     """
-    grid_x, grid_y = np.meshgrid(10.0 * np.arange(9), 10.0 * np.arange(5))
-    tilt = -0.1
-    z = np.where((grid_x > 15) & (grid_x < 45), 100.0, tilt * grid_x)
+    grid_x, grid_y = np.meshgrid(10.0 * np.arange(20), 10.0 * np.arange(13))
+    tilt, share = -0.1, 0.3
+    is_mesa = (grid_x > 15) & (grid_x < 105) & (grid_y > 35) & (grid_y < 85)
+    z = np.where(is_mesa, 100.0, tilt * grid_x)
     normals = np.broadcast_to(np.array([-tilt, 0.0, 1.0]) / np.hypot(tilt, 1.0), (*z.shape, 3))
-    x = grid_x - z * TAN30
-    moved = behind_rims(x, grid_y, z, normals, (TAN30, 0.0))
-    back = np.zeros_like(z)
-    back[:, 5] = 0.5 * (100.0 - z[0, 5]) * TAN30
-    np.testing.assert_allclose(moved[0], x - back)
-    np.testing.assert_allclose(moved[1], grid_y)
+    at = grid_x - z * TAN30, grid_y, z
+    if is_along_y:
+        turned = behind_rims(at[1].T, at[0].T, z.T, normals[..., [1, 0, 2]].transpose(1, 0, 2), (0.0, TAN30), share)
+        moved = turned[1].T, turned[0].T, turned[2].T
+    else:
+        moved = behind_rims(*at, normals, (TAN30, 0.0), share)
+    back = at[0] - moved[0]
+    np.testing.assert_allclose(back[4:9, 11], share * (100.0 - z[4:9, 11]) * TAN30)
+    np.testing.assert_allclose(moved[1], at[1])
     np.testing.assert_allclose(moved[2], z - tilt * back)
+    assert not back[is_mesa].any() and not back[:, :2].any() and not back[:, 12:].any()
+    assert not back[[0, 1, 2, 10, 11, 12]].any() and not back[:, 4:8].any()
 
 
-@pytest.mark.parametrize("name", ["sphere_a", "sphere_b"])
-def test_ground_around_a_sphere(name):
+@pytest.fixture(scope="module", params=["sphere_a", "sphere_b"])
+def case(request):
+    """A sphere at 45 um pitch: normals, true single and multiple scattering, what is predicted at the true surface."""
+    overrides = {"scan.nx": 81, "scan.ny": 81, "scan.pixel_size_um": 45.0}
+    scene = load_scene(ROOT / "scenes" / f"{request.param}.toml", overrides)
+    stack = pipeline.simulate(scene, seed=3)
+    height, normals = first_hit_spheres(
+        *np.meshgrid(stack.x, stack.y), scene.sample.build().spheres, stack.instrument.beam_shift
+    )
+    predicted = make_predictor(stack, 4_000_000, scene.reconstruct.refine.substrate_um)(height, normals)
+    phi = SpotGeometry(stack.instrument).form_factor(height)
+    free, hidden = (np.einsum("kiyx,yxi->kyx", f, normals) for f in (phi, predicted.hidden))
+    assert stack.by_order is not None and stack.n_rays is not None
+    single, multiple = (part / stack.n_rays for part in (stack.by_order[0], stack.by_order[1:].sum(0)))
+    return normals, single, multiple, free, hidden, predicted
+
+
+def test_ground_around_a_sphere(case):
     """The mean multiple scattering of the ground around a sphere is within 2 % of that of the true sphere.
 
     Errors of both means are below 0.3 %. Rejects the sheet along the beam from the rim to the ground, which sends the
-    detectors 2.3-3.3 % (A) and 5.8 % (B) too much. A wall straight below the rim it cannot tell apart (B: 2.1 % too
-    little in one detector).
+    detectors too much, and a wall straight below the rim, which sends them too little, on both spheres.
     """
-    scene = load_scene(ROOT / "scenes" / f"{name}.toml", {"scan.nx": 81, "scan.ny": 81, "scan.pixel_size_um": 45.0})
-    stack = pipeline.simulate(scene, seed=3)
-    spheres = scene.sample.build().spheres
-    beam = stack.instrument.beam_shift
-    height, normals = first_hit_spheres(*np.meshgrid(stack.x, stack.y), spheres, beam)
-    predict = make_predictor(stack, 2_000_000, scene.reconstruct.refine.substrate_um)
-    predicted = predict(height, normals).multiple
-    assert stack.by_order is not None and stack.n_rays is not None
-    true = stack.by_order[1:].sum(0) / stack.n_rays
+    normals, _, true, *_, predicted = case
     ground = normals[..., 2] > 0.999999
-    ratio = predicted[:, ground].sum(1) / true[:, ground].sum(1)
+    ratio = predicted.multiple[:, ground].sum(1) / true[:, ground].sum(1)
     assert np.all(np.abs(ratio - 1.0) < 0.02), ratio
+
+
+def lee_of(normals):
+    """Return the ground up to 5 pixels down the beam from the sphere [y, x]."""
+    ground = normals[..., 2] > 0.999999
+    behind = np.zeros_like(ground)
+    for n in range(1, 6):
+        behind[:, n:] |= ~ground[:, :-n]
+    return ground & behind
+
+
+def test_lee_of_a_sphere(case):
+    """In the lee the true multiple scattering is what is predicted, to within two deviations of the unseen side.
+
+    Means over 5 pixels behind the rim, of each detector; 2 % for the noise. Measured: at most 2.6 % off. Rejects the
+    sheet along the beam (10-42 % too much), a wall straight below the rim (6-15 % too little) and a sheet that is moved
+    only where its rim is met along the beam (5-28 % too much).
+    """
+    normals, _, true, *_, predicted = case
+    lee = lee_of(normals)
+    error = predicted.multiple[:, lee].mean(1) - true[:, lee].mean(1)
+    allowed = 2.0 * np.abs(predicted.unseen[:, lee].mean(1)) + 0.02 * true[:, lee].mean(1)
+    assert np.all(np.abs(error) < allowed)
+
+
+def test_masks_in_the_lee(case):
+    """In the lee the mean predicted single scattering is within 0.8 % of the flat's signal of the true one.
+
+    Measured: 0.6 %. Rejects on B the masks of the sheet along the beam (1.5 % too dark for two detectors); on A, whose
+    lee is shallower, they are 0.5 % off.
+    """
+    normals, single, _, free, hidden, _ = case
+    lee = lee_of(normals)
+    error = (free - hidden - single)[:, lee].mean(1) / np.median(single)
+    assert np.all(np.abs(error) < 0.008), error

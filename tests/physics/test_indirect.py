@@ -9,9 +9,10 @@ import pytest
 from helio_jax.config import load_scene
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor, smooth_along_surface
+from helio_jax.predict import make_predictor
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.indirect import Radiosity, transfer
+from helio_jax.trace.denoise import smooth_along_surface
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import first_hits
 
