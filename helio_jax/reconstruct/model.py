@@ -201,9 +201,9 @@ class Model(eqx.Module):
     ) -> jax.Array:
         """Return by how much the noise of the fitted slopes changes the mean signal of their facets [detector, y, x].
 
-        A facet's signal is curved in its slopes: that of noisy slopes is too low in the mean, by tr(c'' V) / 2. With two
-        slopes more in every pixel the gains would make up for it, however many pixels there are. V is the covariance
-        that the facet's own data leave, times `GRADIENT`.
+        A facet's signal is curved in its slopes: that of noisy slopes is too low in the mean, by tr(c'' V) / 2. With
+        two slopes more in every pixel the gains would make up for it, however many pixels there are. V is the
+        covariance that the facet's own data leave, times `GRADIENT`.
 
         Args:
             surface: the fitted one.
@@ -233,13 +233,25 @@ class Model(eqx.Module):
         """Return (model - data) / standard deviation, robustly weighted [detector, y, x]."""
         return (self.counts(surface, unknowns, lagged) - lagged.data) * lagged.inverse_sigma
 
+    def edge_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> tuple[jax.Array, jax.Array]:
+        """Return the edges' residuals [y, x - 1], [y - 1, x].
+
+        They count in units of the slope noise that the data's noise makes, which falls with the gain: else a larger
+        gain would explain the noise by smaller slopes, which the edges would prefer, however many pixels there are.
+        """
+        scale = jnp.exp(jnp.mean(lagged.gain_std * unknowns.log_gain))
+        gap_x = trapezoid_gap(surface.height, surface.slope_x, self.dx, 1)
+        gap_y = trapezoid_gap(surface.height, surface.slope_y, self.dy, 0)
+        return gap_x * lagged.edge_x * scale, gap_y * lagged.edge_y * scale
+
     def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:
         """Return all residuals in standard deviations."""
         surface = self.surface(unknowns, lagged)
+        edge_x, edge_y = self.edge_residuals(surface, unknowns, lagged)
         return {
             "data": self.data_residuals(surface, unknowns, lagged),
-            "edge_x": trapezoid_gap(surface.height, surface.slope_x, self.dx, 1) * lagged.edge_x,
-            "edge_y": trapezoid_gap(surface.height, surface.slope_y, self.dy, 0) * lagged.edge_y,
+            "edge_x": edge_x,
+            "edge_y": edge_y,
             "border": surface.height * lagged.border,
             "slope_x": surface.slope_x / SLOPE_STD,
             "slope_y": surface.slope_y / SLOPE_STD,

@@ -134,7 +134,10 @@ class _Rows:
 
 @eqx.filter_jit
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
-    """Return how the data residuals follow their pixel's height and slopes, the instrument and the levels."""
+    """Return how the data residuals follow their pixel's height and slopes, the instrument and the levels.
+
+    And how the edges follow the instrument.
+    """
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
 
@@ -143,12 +146,15 @@ def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lag
 
     data = [derivative(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
     free = {name: getattr(unknowns, name) for name in model.instrument_fields}
-    instrument = jax.jacfwd(lambda v: model.data_residuals(surface, unknowns._replace(**v), lagged))(free)
+    instrument, edges = (
+        jax.jacfwd(lambda v, f=f: f(surface, unknowns._replace(**v), lagged))(free)
+        for f in (model.data_residuals, model.edge_residuals)
+    )
     rise = jnp.zeros_like(lagged.level)  # all heights raised by the same, as above, raise no plateau above the ground
     levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
         rise
     )
-    return data, instrument, levels
+    return data, instrument, edges, levels
 
 
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
@@ -159,24 +165,31 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
-    data, found, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
     by_parameter = {name: found[name] for name in model.instrument_fields}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
+    scale = np.exp(np.mean(lagged.gain_std * unknowns.log_gain))
     for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
         before, after = along(pixel, axis)
-        w = np.asarray(weight)
+        w = scale * np.asarray(weight)
         rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
     rows.add((pixel, 0, np.asarray(lagged.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
     names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
-    columns = np.concatenate([block.reshape(n_data, -1) for block in by_parameter.values()], 1)
+
+    def of_instrument(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
+        return np.concatenate([blocks[name].reshape(n, -1) for name in by_parameter], 1)
+
+    of_x, of_y = of_edges
+    parts = (found, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size)
+    columns = np.concatenate([of_instrument(blocks, n) for blocks, n in parts])
     matrix = rows.stack(n_more=len(names))
     instrument = np.zeros((rows.n_rows + len(names), len(names)))
-    instrument[:n_data] = columns
+    instrument[: len(columns)] = columns
     instrument[-len(names) :] = np.eye(len(names))
     plateau = np.asarray(lagged.plateau)
     far, of_surface = np.zeros((len(instrument), len(plateau))), np.zeros((3 * pixel.size, len(plateau)))
