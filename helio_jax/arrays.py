@@ -19,6 +19,9 @@ import numpy as np
 
 from helio_jax.errors import HelioError
 
+WALL_PITCHES = 5.0
+"""A rise between two neighbouring pixels of a beam-frame raster of more than this many pitches is a wall."""
+
 
 def as_float_array(name: str, value: Any, shape: tuple[int | None, ...], error: type[HelioError]) -> np.ndarray:
     """Return `value` as a float64 array of `shape` (None: any length).

@@ -97,8 +97,8 @@ class Lagged(NamedTuple):
 
     What is hidden follows the levels of the plateaus: `plateau` [plateau, y, x] are the weights whose sum over the
     heights is a plateau's level above the ground, `level` [plateau] its value at the prediction and `level_response`
-    [plateau, detector, 3, y, x] the change of `hidden` per um of it. `noise_change` is from
-    `Model.noise_change`.
+    [plateau, detector, 3, y, x] the change of `hidden` per um of it. `noise_change` is
+    from `Model.noise_change`.
     """
 
     data: Any

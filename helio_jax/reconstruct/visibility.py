@@ -5,7 +5,7 @@ position and the plate's apertures stand still: the rim, seen from a point, is a
 only the depth d = D - h below it changes. So all pixels share the same vertical slices of an aperture, and marching
 along one is shifting the raster. In a slice of azimuth e everything beyond the distance d / horizon is hidden, the
 horizon being the steepest slope up to the surface ahead or the point's own tangent plane, whichever is higher.
-Between two pixels the surface is linear, but a depth jump is a wall half-way. Nothing is taken to stand outside of the
+Between two pixels the surface is linear, but a wall stands half-way. Nothing is taken to stand outside of the
 raster; where apertures overlap, each counts the common part.
 Source: own derivation, tests/physics/test_visibility.py; horizons of height fields: Max, Vis. Comput. 4 (1988) 109.
 """
@@ -17,13 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.arrays import WALL_PITCHES
 from helio_jax.instrument import Aperture
 from helio_jax.reconstruct.formfactor import SpotGeometry
 
 _OUTSIDE = -1e9
 """Height outside of the raster [um]: hides nothing."""
-_WALL = 5.0
-"""A rise between two pixels of more than this many pitches is a wall, and taken to stand half-way between them."""
 _TAIL = 20.0
 """Widths below the aperture within which a smoothed horizon still counts."""
 
@@ -187,7 +186,7 @@ def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, wi
         # a sample at distance R matters where (top - h) / R > (D - h) / far - tail, soonest for h = bottom
         ceiling = instrument.sample_distance - _TAIL * width * piece.far
         reach = jnp.where(top < ceiling, piece.far * (top - bottom) / (ceiling - bottom) + beyond_a_wall, jnp.inf)
-        seen = _find_horizon(*jax.lax.stop_gradient((padded, reach)), march, _WALL * max(dx, dy), shape)
+        seen = _find_horizon(*jax.lax.stop_gradient((padded, reach)), march, WALL_PITCHES * max(dx, dy), shape)
         tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
         horizon = jnp.maximum(_slope_up(padded, height, march, seen), tangent)
         return total + _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width), None

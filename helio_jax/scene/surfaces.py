@@ -10,13 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array
+from helio_jax.arrays import WALL_PITCHES, as_float_array
 from helio_jax.errors import SceneError
 
 WALL_SEGMENTS = 1440
 """Segments of a moat's outer wall: the polygon lies at most 2.4e-6 of its radius inside the circle."""
-RIM_PITCHES = 5.0
-"""Fall of a beam-frame grid's heights to a neighbour in the lee, in pitches, from which that is the foot of a rim."""
 _STEEP = 0.5
 """Vertical part of the unit normal below which a point is a wall's, not the ground at its foot."""
 _LEE_PIXELS = 2.0
@@ -262,12 +260,12 @@ def behind_rims(
         np.abs(np.diff(at + z * shift, axis=axis)).mean()
         for axis, at, shift in zip((1, 0), (x, y), beam_shift, strict=True)
     )
-    slope_x, slope_y = (gaussian_filter(z, _LEE_PIXELS, order) for order in ((0, 1), (1, 0)))
+    slope_x, slope_y = np.gradient(gaussian_filter(z, _LEE_PIXELS))[::-1]
     downhill = -slope_x / pitch_x, -slope_y / pitch_y
     along_beam = downhill[0] * beam_shift[0] + downhill[1] * beam_shift[1]
     is_lee = along_beam > _LEE_COSINE * np.hypot(*downhill) * np.hypot(*beam_shift)
     fall = maximum_filter(z, size=3) - z
-    is_foot = (fall > RIM_PITCHES * max(pitch_x, pitch_y)) & is_lee & (normals[..., 2] >= _STEEP)
+    is_foot = (fall > WALL_PITCHES * max(pitch_x, pitch_y)) & is_lee & (normals[..., 2] >= _STEEP)
     drop = np.where(is_foot, fall, 0.0)
     back_x, back_y = (share * drop * shift for shift in beam_shift)
     rise = (normals[..., 0] * back_x + normals[..., 1] * back_y) / np.maximum(normals[..., 2], _STEEP)
