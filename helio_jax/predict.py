@@ -82,16 +82,15 @@ def make_predictor(
         branches = max(1, round(n_rays / height.size / RAYS / len(sides)))
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes = passes_for(RAYS * branches, SMOOTH_PATHS)
-        traced = [smooth_along_surface(side.multiple(settings), normals, passes) for side in sides]
+        traced = [smooth_along_surface(side.multiple(settings), calm_normals, passes) for side in sides]
         if len(sides) == 1:
-            return Prediction(traced[0], hidden, response)
+            return Prediction(traced[0], hidden, response, normals=calm_normals)
         is_masked = np.any(hidden != 0.0, axis=(0, 1))
         sheet = raster.side(calm, calm_normals, 0.0).hidden(is_masked)
         freed = [side.hidden(is_masked) - sheet for side in sides]
         either = [m - np.einsum("kiyx,yxi->kyx", h, normals) for m, h in zip(traced, freed, strict=True)]
-        return Prediction(
-            np.mean(traced, axis=0), hidden + np.mean(freed, axis=0), response, 0.5 * np.subtract(*either)
-        )
+        multiple, unseen = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
+        return Prediction(multiple, hidden + np.mean(freed, axis=0), response, unseen, calm_normals)
 
     return predict
 

@@ -39,22 +39,24 @@ class Prediction:
         response: change of `hidden` per change of the heights in a given way [y, x], or None where not known.
         unseen: change of the probabilities by one standard deviation of where the side of the sample that the beam does
             not see stands [detector, y, x], or None where not known. It errs as one: no number of pixels averages it.
+        normals: unit normals [y, x, 3] that `multiple` is for, where they are not the surface's own.
     """
 
     multiple: np.ndarray
     hidden: np.ndarray
     response: Callable[[np.ndarray], np.ndarray] | None = None
     unseen: np.ndarray | None = None
+    normals: np.ndarray | None = None
 
     def about(self, normals: np.ndarray) -> "Prediction":
-        """Return it as a linear model of the own normal, about the unit normals [y, x, 3] it was made for.
+        """Return it as a linear model of the own normal, about the surface's unit normals [y, x, 3] or its own ones.
 
         A facet whose normal has the vertical part n_z sees the ground around it with the view factor (1 - n_z) / 2, so
         what the ground sends it changes by -M / (1 - n_z) per unit of n_z. This goes where `hidden` goes and changes
         nothing at the facet's own normal: it only makes the rounds converge faster beside steep walls, where slope and
         multiple scattering depend on one another. Level facets get no correction. Source: own derivation.
         """
-        up = normals[..., 2]
+        up = (normals if self.normals is None else self.normals)[..., 2]
         slope = np.where(up < _LEVEL, self.multiple / np.maximum(1.0 - up, 1.0 - _LEVEL), 0.0)
         hidden = self.hidden.copy()
         hidden[:, 2] += slope

@@ -92,7 +92,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     p = refiner.prediction
     predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
     unseen = None if p.unseen is None else p.unseen[:, *thin]
-    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin], unseen=unseen), predicted_on)
+    normals = None if p.normals is None else p.normals[thin]
+    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin], None, unseen, normals), predicted_on)
     part.level_response = refiner.level_response[..., *thin]
     unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(
