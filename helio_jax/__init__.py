@@ -9,7 +9,8 @@ folder per verb. Which file does what:
 
 * `scene/` what is imaged: `sample` (kinds of samples), `surfaces` (their geometry), `scan` (raster), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
-  `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `run` (threads).
+  `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `denoise`, `run`
+  (threads).
 * `prepare/` `noise` (counting noise), `calibrate` (first background and gain of a measured scan).
 * `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
   -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
