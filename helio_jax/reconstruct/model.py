@@ -48,6 +48,12 @@ class Prediction:
     unseen: np.ndarray | None = None
     normals: np.ndarray | None = None
 
+    def thinned(self, thin: tuple[slice, ...]) -> "Prediction":
+        """Return it on some rows and columns, without how `hidden` responds."""
+        unseen = None if self.unseen is None else self.unseen[:, *thin]
+        normals = None if self.normals is None else self.normals[thin]
+        return Prediction(self.multiple[:, *thin], self.hidden[:, :, *thin], None, unseen, normals)
+
     def about(self, normals: np.ndarray) -> "Prediction":
         """Return it as a linear model of the own normal, about the surface's unit normals [y, x, 3] or its own ones.
 
@@ -125,6 +131,10 @@ class Lagged(NamedTuple):
     multiple_std: Any
 
 
+INSTRUMENT = "log_gain", "offset", "log_multiple", "unseen", "albedo"
+"""Names of the unknowns that are not the surface, as the last fields of `Unknowns`."""
+
+
 class Unknowns(NamedTuple):
     """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; one for the unseen
     side; albedo modes.
@@ -178,9 +188,8 @@ class Model(eqx.Module):
 
     @property
     def instrument_fields(self) -> tuple[str, ...]:
-        """Names of the unknowns that are not the surface."""
-        always = ("log_gain", "offset", "log_multiple", "unseen")
-        return (*always, "albedo") if self.albedo_std > 0 else always
+        """Names of the unknowns that are not the surface and not fixed."""
+        return tuple(name for name in INSTRUMENT if name != "albedo" or self.albedo_std > 0)
 
     def normal(self, surface: Surface) -> jax.Array:
         """Return the unit normals [3, y, x]."""
@@ -235,13 +244,17 @@ class Model(eqx.Module):
         """Return (model - data) / standard deviation, robustly weighted [detector, y, x]."""
         return (self.counts(surface, unknowns, lagged) - lagged.data) * lagged.inverse_sigma
 
-    def edge_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> tuple[jax.Array, jax.Array]:
-        """Return the edges' residuals [y, x - 1], [y - 1, x].
+    def edge_scale(self, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return the factor of the edges' weights: the mean gain.
 
-        They count in units of the slope noise that the data's noise makes, which falls with the gain: else a larger
+        Edges count in units of the slope noise that the data's noise makes, which falls with the gain: else a larger
         gain would explain the noise by smaller slopes, which the edges would prefer, however many pixels there are.
         """
-        scale = jnp.exp(jnp.mean(lagged.gain_std * unknowns.log_gain))
+        return jnp.exp(jnp.mean(lagged.gain_std * unknowns.log_gain))
+
+    def edge_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> tuple[jax.Array, jax.Array]:
+        """Return the edges' residuals [y, x - 1], [y - 1, x]."""
+        scale = self.edge_scale(unknowns, lagged)
         gap_x = trapezoid_gap(surface.height, surface.slope_x, self.dx, 1)
         gap_y = trapezoid_gap(surface.height, surface.slope_y, self.dy, 0)
         return gap_x * lagged.edge_x * scale, gap_y * lagged.edge_y * scale

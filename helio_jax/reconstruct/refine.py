@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Prediction, Surface, smooth_albedo
+from helio_jax.reconstruct.model import INSTRUMENT, Surface, smooth_albedo
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, Posterior, linearise, sample_posterior
@@ -86,14 +86,11 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         settings,
         None if region is None else region[thin],
     )
-    for name in ("log_gain", "offset", "log_multiple", "unseen", "albedo"):
+    for name in INSTRUMENT:
         setattr(part, name, getattr(refiner, name))
     part.residuals = refiner.residuals[:, *thin]
-    p = refiner.prediction
     predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
-    unseen = None if p.unseen is None else p.unseen[:, *thin]
-    normals = None if p.normals is None else p.normals[thin]
-    part.adopt(Prediction(p.multiple[:, *thin], p.hidden[:, :, *thin], None, unseen, normals), predicted_on)
+    part.adopt(refiner.prediction.thinned(thin), predicted_on)
     part.level_response = refiner.level_response[..., *thin]
     unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(

@@ -19,7 +19,7 @@ from scipy.fft import dctn
 
 from helio_jax.arrays import border_mask
 from helio_jax.reconstruct.edges import Edges, find_edges, geman_mcclure, one_sided, to_pixels
-from helio_jax.reconstruct.model import Lagged, Model, Prediction, Surface, Unknowns
+from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.settings import ReconstructSettings
 
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
@@ -175,11 +175,7 @@ class Refiner:
             dctn(height, norm="ortho") / self.whitening,
             (slope_x - base_x) / scale_x,
             (slope_y - base_y) / scale_y,
-            self.log_gain,
-            self.offset,
-            self.log_multiple,
-            self.unseen,
-            self.albedo,
+            *(getattr(self, name) for name in INSTRUMENT),
         )
         inverse_sigma = self.weight / self.sigma
         largest = _NOISY * self.slope_noise * self._steepness()
@@ -221,9 +217,8 @@ class Refiner:
         s = self.settings
         found = _solve(self.model, *self.lag(limit, cut, is_instrument_free), s.lm_steps, s.cg_steps)
         self.surface = Surface(*map(np.asarray, found.surface))
-        self.log_gain, self.offset = np.asarray(found.unknowns.log_gain), np.asarray(found.unknowns.offset)
-        self.log_multiple, self.unseen = np.asarray(found.unknowns.log_multiple), np.asarray(found.unknowns.unseen)
-        self.albedo = np.asarray(found.unknowns.albedo)
+        for name in INSTRUMENT:
+            setattr(self, name, np.asarray(getattr(found.unknowns, name)))
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found
 

@@ -134,9 +134,9 @@ class _Rows:
 
 @eqx.filter_jit
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
-    """Return how the data residuals follow their pixel's height and slopes, the instrument and the levels.
+    """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
 
-    And how the edges follow the instrument.
+    In this order: data by surface field, data by instrument, edges by instrument, data by level.
     """
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
@@ -171,7 +171,7 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
-    scale = np.exp(np.mean(lagged.gain_std * unknowns.log_gain))
+    scale = np.asarray(model.edge_scale(unknowns, lagged))
     for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
         before, after = along(pixel, axis)
         w = scale * np.asarray(weight)
