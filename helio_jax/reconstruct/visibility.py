@@ -17,12 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helio_jax.arrays import WALL_PITCHES
 from helio_jax.instrument import Aperture
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.horizon import OUTSIDE, March, at_horizon, find_horizons, plan_march
 
-_OUTSIDE = -1e9
-"""Height outside of the raster [um]: hides nothing."""
 _TAIL = 20.0
 """Widths below the aperture within which a smoothed horizon still counts."""
 
@@ -38,23 +36,6 @@ class Slices(NamedTuple):
     near: np.ndarray
     far: np.ndarray
     weight: np.ndarray
-
-
-class March(NamedTuple):
-    """Where the ray of one azimuth crosses the grid lines of the raster, by growing distance, static.
-
-    `first` and `second` [step, 2] are the raster positions (row, column), relative to the point, between which the
-    height is interpolated, `share` [step] is that of the second; `distance` [step, um] is infinite off the raster. A
-    wall half-way between two pixels was passed `since_across` [step, um] ago, if it separates those two, or
-    `since_along`, if it runs beside both.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    share: np.ndarray
-    distance: np.ndarray
-    since_across: np.ndarray
-    since_along: np.ndarray
 
 
 def slice_aperture(aperture: Aperture, pinhole: np.ndarray, n_slices: int) -> Slices:
@@ -90,34 +71,6 @@ def slice_aperture(aperture: Aperture, pinhole: np.ndarray, n_slices: int) -> Sl
     return Slices(ray / scale[:, None], near * scale, far * scale, weight * np.prod(aperture.semi_axes) / scale**2)
 
 
-def plan_march(direction: np.ndarray, shape: tuple[int, int], dx: float, dy: float) -> March:
-    """Return the crossings of a ray with all grid lines, where the surface is linear between two pixels.
-
-    True of a triangulated and of a bilinear surface; what they do between the lines is where they differ.
-
-    Args:
-        direction: azimuth (x, y), unit.
-        shape: of the raster (y, x).
-        dx, dy: its pitch, um.
-    """
-    step = direction[::-1] / (dy, dx)  # (rows, columns) per um
-    step = np.where(np.abs(step) < 1e-12, 1e-12, step)
-    parts = []
-    for axis in (0, 1):
-        distance = np.arange(1, shape[axis]) / np.abs(step[axis])
-        across = distance * step[1 - axis]
-        low = np.floor(across)
-        is_inside = np.abs(across) <= shape[1 - axis] - 1
-        first = np.stack([distance * step[axis], low], -1)[:, :: 1 - 2 * axis]
-        first = np.where(is_inside[:, None], np.rint(first), 0.0).astype(np.int32)
-        second = first + np.array([axis, 1 - axis], np.int32)
-        since = np.abs(across - low - 0.5) / np.abs(step[1 - axis]), np.full(len(low), 0.5 / np.abs(step[axis]))
-        parts.append((first, second, across - low, np.where(is_inside, distance, np.inf), *since))
-    joined = March(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    order = np.argsort(joined.distance)
-    return March(*(column[order] for column in joined))
-
-
 def hidden_form_factor(
     height: jax.Array | np.ndarray,
     slope_x: jax.Array | np.ndarray,
@@ -133,8 +86,7 @@ def hidden_form_factor(
 
     P = n . (Phi - hidden), as with `trace.masks.hidden_form_factor`; exactly 0 where the whole aperture is in view.
     Valid for heights below the plate. Differentiable in heights (the point's and the blocking ones) and slopes; where
-    two samples are seen under the same slope, the nearer one takes the derivative. Costs two shifts of the raster per
-    slice and grid line within reach of the mask.
+    two samples are seen under the same slope, the nearer one takes the derivative.
 
     Args:
         height: beam-frame heights [y, x], um.
@@ -176,25 +128,29 @@ def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, wi
     slices = _stack([slice_aperture(a, pinhole, n_slices) for a in instrument.apertures()])
     marches = _stack([_stack([plan_march(e, shape, dx, dy) for e in row]) for row in slices.direction])
     as_input = partial(jax.tree.map, lambda a: jnp.asarray(a, height.dtype if a.dtype.kind == "f" else a.dtype))
-    padded = jnp.pad(height, [(n, n) for n in shape], constant_values=_OUTSIDE)
+    padded = jnp.pad(height, [(n, n) for n in shape], constant_values=OUTSIDE)
     depth = instrument.sample_distance - height
-    top, bottom = jnp.max(height), jnp.min(height)
-    beyond_a_wall = np.hypot(dx, dy)
+
+    def choose(bits: Any) -> np.ndarray:
+        heights = np.ascontiguousarray(bits).view(np.float64)[..., 0]
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), marches)
+        found = find_horizons(heights, instrument.sample_distance, slices.far.ravel(), _TAIL * width, flat, dx, dy)
+        return found.reshape(*slices.far.shape, *shape)
+
+    # as bits, for a callback's own thread would round them to float32
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(height).astype(jnp.float64), jnp.uint32)
+    chosen = jax.pure_callback(choose, jax.ShapeDtypeStruct((*slices.far.shape, *shape), jnp.int32), bits)
 
     def add_slice(total, item):
-        piece, march = item
-        # a sample at distance R matters where (top - h) / R > (D - h) / far - tail, soonest for h = bottom
-        ceiling = instrument.sample_distance - _TAIL * width * piece.far
-        reach = jnp.where(top < ceiling, piece.far * (top - bottom) / (ceiling - bottom) + beyond_a_wall, jnp.inf)
-        seen = _find_horizon(*jax.lax.stop_gradient((padded, reach)), march, WALL_PITCHES * max(dx, dy), shape)
+        piece, march, found = item
         tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
-        horizon = jnp.maximum(_slope_up(padded, height, march, seen), tangent)
+        horizon = jnp.maximum(_slope_up(padded, height, march, found), tangent)
         return total + _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width), None
 
     def of_aperture(items):
         return jax.lax.scan(add_slice, jnp.zeros((3, *shape), height.dtype), items)[0]
 
-    return jax.lax.map(of_aperture, (as_input(slices), as_input(marches)))
+    return jax.lax.map(of_aperture, (as_input(slices), as_input(marches), chosen))
 
 
 def _stack(records: list) -> Any:
@@ -202,55 +158,16 @@ def _stack(records: list) -> Any:
     return type(records[0])(*(np.stack(column) for column in zip(*records, strict=True)))
 
 
-class Horizon(NamedTuple):
-    """What a point sees steepest [y, x]: its step of the march, the share of the second pixel, and its distance, um."""
-
-    step: jax.Array
-    share: jax.Array
-    distance: jax.Array
-
-
-def _find_horizon(padded: jax.Array, reach: jax.Array, march: March, tall: float, shape: tuple[int, int]) -> Horizon:
-    """Return where the surface is seen steepest; `reach`: how far to look [um], `tall`: least height of a wall [um].
-
-    A crossing within a wall belongs to the nearer of its two pixels.
-    """
-
-    def view(corner):
-        return jax.lax.dynamic_slice(padded, (corner[0] + shape[0], corner[1] + shape[1]), shape)
-
-    here = padded[shape[0] : 2 * shape[0], shape[1] : 2 * shape[1]]
-
-    def visit(s, state):
-        best, horizon, before, passed = state
-        first, second, far = view(march.first[s]), view(march.second[s]), march.distance[s]
-        is_across = jnp.abs(second - first) > tall
-        share = jnp.where(is_across, jnp.round(march.share[s]), march.share[s])
-        there = (1.0 - share) * first + share * second
-        across, beside = far - march.since_across[s], far - march.since_along[s]
-        wall = jnp.where(is_across & (across > passed), across, beside)
-        distance = jnp.where(there - before > tall, jnp.maximum(wall, passed), far)
-        slope = (there - here) / distance
-        found = Horizon(s.astype(jnp.int32), share, distance)
-        horizon = Horizon(*(jnp.where(slope > best, new, old) for new, old in zip(found, horizon, strict=True)))
-        return jnp.maximum(best, slope), horizon, there, far
-
-    nothing = Horizon(jnp.zeros(shape, jnp.int32), *jnp.ones((2, *shape), padded.dtype))
-    start = jnp.full(shape, -jnp.inf, padded.dtype), nothing, here, jnp.zeros((), padded.dtype)
-    n_steps = jnp.searchsorted(march.distance, reach).astype(jnp.int32)
-    return jax.lax.fori_loop(jnp.int32(0), n_steps, visit, start)[1]
-
-
-def _slope_up(padded: jax.Array, height: jax.Array, march: March, horizon: Horizon) -> jax.Array:
+def _slope_up(padded: jax.Array, height: jax.Array, march: March, found: jax.Array) -> jax.Array:
     """Return the slope from each point up to its horizon [y, x]."""
     (ny, nx), columns = height.shape, padded.shape[1]
     here = (ny + jnp.arange(ny, dtype=jnp.int32))[:, None] * columns + nx + jnp.arange(nx, dtype=jnp.int32)
+    step, share, distance = at_horizon(march, found)
 
     def at(corner):
-        return padded.ravel()[here + (corner[:, 0] * columns + corner[:, 1])[horizon.step]]
+        return padded.ravel()[here + (corner[:, 0] * columns + corner[:, 1])[step]]
 
-    first, second, share = at(march.first), at(march.second), horizon.share
-    return ((1.0 - share) * first + share * second - height) / horizon.distance
+    return ((1.0 - share) * at(march.first) + share * at(march.second) - height) / distance
 
 
 def _hidden_in_slice(horizon, depth, piece: Slices, shift: tuple[float, float], width: float) -> jax.Array:
