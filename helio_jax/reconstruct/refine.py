@@ -16,7 +16,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import INSTRUMENT, Surface, smooth_albedo
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.uncertainty import MAX_PIXELS, Posterior, linearise, sample_posterior
+from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
@@ -33,6 +33,7 @@ class Fit:
         gain, offset: per detector, data = gain * model + offset.
         residuals: (model - data) / standard deviation [detector, y, x].
         weight: what robust weighting left of each datum [detector, y, x].
+        model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].
         intact_x, intact_y: what is left of the edges between pixels [y, x - 1], [y - 1, x]; 0 at a jump.
         posterior: error bars, or None where none were asked for.
         changes: root mean square height change of every round [um].
@@ -48,6 +49,7 @@ class Fit:
     offset: np.ndarray
     residuals: np.ndarray
     weight: np.ndarray
+    model_share: np.ndarray
     intact_x: np.ndarray
     intact_y: np.ndarray
     posterior: Posterior | None
@@ -98,7 +100,9 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         edge_x=lagged.edge_x * stride**1.5,
         edge_y=lagged.edge_y * stride**1.5,
     )
-    found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples)
+    length = s.error_reach * float(np.ptp(refiner.surface.height))
+    error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
+    found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
     return found.on_raster(refiner.signal.shape[1:], stride)
 
 
@@ -205,6 +209,7 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         offset=s.offset_std * refiner.mean_signal * refiner.offset,
         residuals=refiner.residuals,
         weight=refiner.weight,
+        model_share=refiner.model_share,
         intact_x=refiner.intact_x,
         intact_y=refiner.intact_y,
         posterior=posterior,

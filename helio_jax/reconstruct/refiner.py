@@ -153,6 +153,11 @@ class Refiner:
         doubt = prediction.doubt(normals, s.mask_error, s.multiple_error)
         self.sigma = np.where(self.observed, np.sqrt(self.variance + doubt**2), np.inf)
 
+    @property
+    def model_share(self) -> np.ndarray:
+        """Share of the prediction's assumed error in the assumed variance of every datum; 0 where not observed."""
+        return np.where(self.observed, np.maximum(1.0 - self.variance / self.sigma**2, 0.0), 0.0)
+
     def edges(self, cut: float) -> tuple[Edges, Edges]:
         """Return the edges of the current surface along x and along y."""
         (height, slope_x, slope_y), m = self.surface, self.model

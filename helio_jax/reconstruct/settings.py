@@ -28,6 +28,8 @@ class RefineSettings(Settings):
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)
     """Relative error assumed of the predicted multiple scattering."""
+    error_reach: float = Field(default=0.06, ge=0.0, le=1.0)
+    """Error bars: how far those two errors agree, as a share of the range of heights, for they come from its walls."""
     robust_limits: tuple[float, ...] = Field(default=(10.0, 10.0, 8.0), min_length=1, max_length=20)
     """Residuals [standard deviations] at which a datum's weight falls to a half, for each re-weighting of round 1."""
     jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)

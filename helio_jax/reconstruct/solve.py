@@ -21,7 +21,7 @@ from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, search_levels, unexplained
 from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions
+from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
 from helio_jax.reconstruction import Reconstruction
 
 MAX_WIDTH = 0.125
@@ -227,7 +227,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         depth_jumps(height, slope_x, fit.intact_x, pitch(stack.x), 1),
         depth_jumps(height, slope_y, fit.intact_y, pitch(stack.y), 0),
     )
-    reason = reasons_from_fit(reasons_from_data(stack), worst, *jumps, is_floating)
+    n_telling = telling(fit.model_share, stack.is_observed)
+    reason = reasons_from_fit(reasons_from_data(stack), worst, n_telling, *jumps, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,

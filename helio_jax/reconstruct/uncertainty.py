@@ -5,8 +5,9 @@ two slopes of every pixel, coupled to neighbours only) and the few instrument pa
 modes, or whatever is added later). The information of the surface, A = J_s' J_s, is sparse and factorised once; it
 is bordered by B = J_s' J_c. The Schur complement S = J_c' J_c - B' A^-1 B is the instrument's marginal information, and
 -A^-1 B is what the surface does when an instrument parameter is forced: the sensitivity to calibration. A sample of
-the joint posterior is the answer to standard normal noise in every residual, so each derived number (area,
-angle, step) gets its error bar from the same samples.
+the joint posterior is the answer to noise in every residual, so each derived number (area, angle, step) gets its error
+bar from the same samples. Noise of the counts is independent; what is assumed of errors in the predicted masks and
+multiple scattering agrees between neighbours (`ModelError`), so that no number of pixels averages it away.
 
 On rasters above `MAX_PIXELS` every 2nd (4th, ...) row and column stands for the rest, which is stated in the result.
 """
@@ -19,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
+from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
@@ -52,6 +54,10 @@ class Linearised:
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
         return self.surface.T @ residuals + self.plateau @ (self.far.T @ residuals)
+
+    def apply(self, surface: np.ndarray) -> np.ndarray:
+        """Return the surface's whole derivative times changes of the surface [3 * pixel, ...]."""
+        return self.surface @ surface + self.far @ (self.plateau.T @ surface)
 
     def solver(self) -> Callable[[np.ndarray], np.ndarray]:
         """Return the function that solves with the information matrix of the surface, for [3 * pixel, ...].
@@ -105,6 +111,58 @@ class Posterior:
         ]
         full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
         return replace(self, samples=full(self.samples), response=full(self.response), stride=stride)
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """What is assumed of errors in the predicted data: Gaussian averages of independent ones.
+
+    Attributes:
+        share: of the variance assumed of every datum [detector, y, x].
+        length: standard deviation of the Gaussian average along y and x, in pixels of the full raster.
+        stride: thinning of the raster; each datum then stands for stride x stride ones.
+    """
+
+    share: np.ndarray
+    length: tuple[float, float]
+    stride: int = 1
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of the mean error of a datum's pixels, in deviations assumed of it [detector, y, x]."""
+        apart = np.subtract.outer(np.arange(self.stride), np.arange(self.stride))
+        agreement = [np.mean(np.exp(-0.25 * (apart / max(n, 1e-3)) ** 2)) for n in self.length]
+        return self.stride * np.sqrt(self.share * np.prod(agreement))
+
+    def average(self, white: np.ndarray) -> np.ndarray:
+        """Return errors of variance 1 that agree between neighbours, from white noise; its own transpose."""
+        lengths = [n / self.stride for n in self.length]
+        smooth = gaussian_filter(white, lengths, axes=(-2, -1))
+        return smooth / np.prod([_left_of_white(n) for n in lengths])
+
+    def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
+        """Return errors of the data [detector * y * x, sample], in deviations assumed of them.
+
+        `white` is the counts' noise; what the model has of the variance is taken from it.
+        """
+        n, shape = white.shape[1], self.share.shape
+        model = self.deviation * self.average(rng.standard_normal((n, *shape)))
+        counts = np.sqrt(1.0 - self.share) * white.T.reshape(n, *shape)
+        return (model + counts).reshape(n, -1).T
+
+    def covariance(self, influence: np.ndarray) -> np.ndarray:
+        """Return the covariance of the sums of such errors weighted by `influence` [detector * y * x, parameter]."""
+        images = influence.T.reshape(-1, *self.share.shape)
+        model, counts = self.average(self.deviation * images), np.sqrt(1.0 - self.share) * images
+        both = np.concatenate([model, counts], axis=1)
+        return np.einsum("pkyx,qkyx->pq", both, both)
+
+
+def _left_of_white(length: float) -> float:
+    """Return the standard deviation that a Gaussian average over `length` pixels leaves of white noise."""
+    impulse = np.zeros(2 * int(4.0 * length + 1.0) + 1)
+    impulse[impulse.size // 2] = 1.0
+    return float(np.sqrt(np.sum(gaussian_filter(impulse, length) ** 2)))
 
 
 class _Rows:
@@ -198,28 +256,37 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     return Linearised(matrix, instrument, far, of_surface, tuple(names), shape)
 
 
-def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0) -> Posterior:
+def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
+    With a `ModelError` the fit is still the one that takes all errors of the data for independent, as it was done; its
+    spread is that of data whose errors are not.
+
     Args:
-        linear: residuals at the fit, from `linearise`.
+        linear: residuals at the fit, from `linearise`, those of the data first.
         n_samples: samples.
         seed: of the noise.
+        error: what is assumed of the predicted data.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
-        Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case.
+        Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
+        takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
     """
     jc, solve = linear.instrument, linear.solver()
-    n_rows = jc.shape[0]
     border = linear.transposed(jc)
     answer = solve(border)
-    covariance = np.linalg.inv(jc.T @ jc - border.T @ answer)
+    influence = (jc - linear.apply(answer)) @ np.linalg.inv(jc.T @ jc - border.T @ answer)
     rng = np.random.default_rng(seed)
-    noise = rng.standard_normal((n_rows, n_samples))
-    right_s, right_c = linear.transposed(noise), jc.T @ noise
-    free = solve(right_s)
-    instrument = covariance @ (right_c - border.T @ free)
-    surface = free - answer @ instrument
+    noise = rng.standard_normal((jc.shape[0], n_samples))
+    n_data = 0
+    covariance = np.zeros((jc.shape[1],) * 2)
+    if error is not None:
+        n_data = error.share.size
+        noise[:n_data] = error.draw(rng, noise[:n_data])
+        covariance = error.covariance(influence[:n_data])
+    covariance = covariance + influence[n_data:].T @ influence[n_data:]
+    instrument = influence.T @ noise
+    surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
     return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
 

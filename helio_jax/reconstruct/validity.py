@@ -17,6 +17,8 @@ SMALLEST_JUMP = 0.1
 """Misfit of a cut edge, in pitches, below which it is no depth jump: noise cuts one edge in some hundreds."""
 TRUSTED = 0.5
 """A pixel with a datum of less robust weight than this is not explained by the model."""
+VEILED = 5.0
+"""A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
 FLOATING = 0.2
 """A region is floating when its level is uncertain by more than this share of its step to the ground."""
 MIN_REGION = 16
@@ -82,14 +84,32 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch
     return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
 
 
+def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+    """Return how many data tell of every pixel's facet [y, x].
+
+    Args:
+        model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].
+        is_observed: whether there is a datum [detector, y, x].
+    """
+    return np.sum(is_observed & (model_share < 1.0 - VEILED**-2), axis=0)
+
+
 def reasons_from_fit(
-    reason: np.ndarray, weight: np.ndarray, jump_x: np.ndarray, jump_y: np.ndarray, is_floating: np.ndarray
+    reason: np.ndarray,
+    weight: np.ndarray,
+    n_telling: np.ndarray,
+    jump_x: np.ndarray,
+    jump_y: np.ndarray,
+    is_floating: np.ndarray,
 ) -> np.ndarray:
     """Add what the fit knows to the reasons from the data [y, x].
+
+    A facet has two slopes: with fewer than two data that tell of it, it is masked.
 
     Args:
         reason: from `reasons_from_data` [y, x].
         weight: robust weight left of the worst datum [y, x].
+        n_telling: from `telling` [y, x].
         jump_x, jump_y: from `depth_jumps` [y, x - 1], [y - 1, x].
         is_floating: from `floating` [y, x].
     """
@@ -99,5 +119,6 @@ def reasons_from_fit(
             end |= jump
     out = reason.copy()
     out[(out == 0) & (at_jump | (weight < TRUSTED))] = _JUMP
+    out[(out == 0) & (n_telling < MIN_IMAGES - 1)] = _MASKED
     out[(out == 0) & is_floating] = _FLOATING
     return out
