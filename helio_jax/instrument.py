@@ -37,9 +37,9 @@ class Plate(Settings):
 
     kind: Literal["transparent"] = "transparent"
     """`transparent`: atoms that miss every aperture pass through and are gone."""
-    working_distance_um: float = Field(gt=0.0, le=1e6)
+    working_distance_um: float = Field(gt=0.0, le=1e7)
     """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
-    sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e6)
+    sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e7)
     """Distance D from the plate to the sample's reference plane (its substrate); default W [um]."""
 
 

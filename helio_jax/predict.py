@@ -56,14 +56,14 @@ def make_predictor(
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
 
-    The surface is continued by a flat at z = 0 of side `substrate_um`, or for half an image size beyond each border.
+    The surface is continued by a flat at z = 0 of side `substrate_um`, or as far beyond each border as the plate is away:
+    steep facets see most of what is near their horizon.
     Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
     geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
-    size = max(np.ptp(stack.x), np.ptp(stack.y))
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
-    reach = border + 0.5 * size if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
+    reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
     raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach)
     radiosity = Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
 
