@@ -81,14 +81,14 @@ def closed_forms(scale: int) -> list[Row]:
         n = 4000 // scale
         r, turn = RADIUS * np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
         point = np.stack([r * np.cos(turn), r * np.sin(turn), np.zeros(n)], -1)
-        rays = max(int(1.2e6 * (1.0 / exact - 1.0) / n) + 1, 64) if scale == 1 else 64
+        rays = max(int(3.4e6 * (1.0 / exact - 1.0) / n) + 1, 64) if scale == 1 else 64
         up = np.tile([0.0, 0.0, 1.0], (n, 1))
         tally = analog(tube, above(ratio * RADIUS, RADIUS), Hits.on_mesh(point, up), rays)
         share = tally.hits.sum((0, 1)) / rays
         rows.append(judged(f"Clausing tube, length / radius {ratio}", share.mean(), exact, share.std() / np.sqrt(n)))
     open_share, n_orders = 0.1, 8
     body, height, radius = cavity(open_share, 400)
-    n, rays = 100, 100_000 // scale
+    n, rays = 100, 150_000 // scale
     start = Hits.on_mesh(np.tile([0.0, 0.0, -RADIUS], (n, 1)), np.tile([0.0, 0.0, 1.0], (n, 1)))
     # the plate of the tracer lies above z = 0, so the cavity is lifted
     lift = np.array([0.0, 0.0, 2.0 * RADIUS])

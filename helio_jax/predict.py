@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from helio_jax.arrays import pitch
+from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
@@ -56,8 +57,8 @@ def make_predictor(
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
 
-    The surface is continued by a flat at z = 0 of side `substrate_um`, or as far beyond each border as the plate is away:
-    steep facets see most of what is near their horizon.
+    The surface is continued by a flat at z = 0 of side `substrate_um`, or as far beyond each border as the plate is
+    away: steep facets see most of what is near their horizon.
     Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
     instrument = stack.instrument
@@ -120,7 +121,13 @@ class _Side:
         r = self.raster
         experiment = make_experiment(self.intersector, r.instrument, settings)
         x, y = r.x.ravel(), r.y.ravel()
-        tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
+        try:
+            tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
+        except GuardError as e:
+            raise GuardError(
+                f"the surface of the fit is too rough or steep to trace multiple scattering from ({e.args[0].split(';')[0]}"
+                "): check background and gains, or use method = 'nearfield'"
+            ) from e
         return tally.probability()[0][1].reshape(-1, *r.x.shape)
 
     def hidden(self, is_wanted: np.ndarray) -> np.ndarray:

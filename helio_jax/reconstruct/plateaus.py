@@ -22,6 +22,7 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+from helio_jax.errors import GuardError
 from helio_jax.reconstruct.edges import along, ranked
 from helio_jax.reconstruct.model import Surface
 
@@ -188,7 +189,11 @@ def search_levels(
         def at(level: float, number=number, inside=inside, base=found, tried=tried, ground=ground) -> float:
             report(f"region {number} of {inside.sum()} pixels: trying the level {level:+.0f} um")
             values = zip((ground + level, 0.0, 0.0), base, strict=True)
-            tried[level] = misfit(Surface(*(np.where(inside, flat, field) for flat, field in values)))
+            trial = Surface(*(np.where(inside, flat, field) for flat, field in values))
+            try:
+                tried[level] = misfit(trial)
+            except GuardError:  # no level of a wall that nothing can be predicted of
+                tried[level] = np.inf, trial
             return tried[level][0]
 
         levels = sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0))

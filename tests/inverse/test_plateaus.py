@@ -5,6 +5,7 @@ import pytest
 
 from helio_jax import pipeline
 from helio_jax.config import load_scene
+from helio_jax.errors import GuardError
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import GAIN, find_plateaus, joined, search_levels, unexplained
 
@@ -75,6 +76,20 @@ def test_search_finds_the_level_of_least_misfit(best):
     assert np.median(found.height[INSIDE]) - 7.0 == pytest.approx(best, abs=3.0)
     assert np.all(found.slope_x[~INSIDE] == 0.1) and np.all(found.slope_x[INSIDE] == 0.0)
     assert np.all(found.height[~INSIDE] == 7.0)
+
+
+def test_a_level_that_cannot_be_predicted_is_passed_over():
+    """A trial above the ground fails: the search goes on below it. Catches a search that ends the whole fit."""
+
+    def misfit(surface):
+        level = surface.height[INSIDE].mean()
+        if level > 0.0:
+            raise GuardError("too steep")
+        return 1e4 + 0.3 * (level + 120.0) ** 2, surface
+
+    ground = Surface(*np.zeros((3, *SHAPE)))
+    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
+    assert moved == [1] and np.median(found.height[INSIDE]) == pytest.approx(-120.0, abs=3.0)
 
 
 def test_a_level_that_gains_little_is_not_taken():
