@@ -12,6 +12,7 @@ import platform
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -234,8 +235,8 @@ def scales(rays: int) -> list[Row]:
         detectors = tuple(
             d.model_copy(
                 update={
-                    "center_um": tuple(scale * c for c in d.center_um),
-                    "axes_um": tuple(scale * c for c in d.axes_um),
+                    "center_um": tuple(scale * np.array(d.center_um, float)),
+                    "axes_um": tuple(scale * np.array(d.axes_um, float)),
                 }
             )
             for d in base.detector
@@ -279,7 +280,8 @@ def bounce_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
         settings = TraceSettings(rays=n_rays, estimator="analog", max_events=30, maps=False)
         experiment = make_experiment(body, above(height + lift[2], radius), settings)
         start = Hits.on_mesh(np.array([lift - [0.0, 0.0, 0.999 * RADIUS]]), np.array([[0.0, 0.0, 1.0]]))
-        embree, seen, kept = experiment.intersector._embree, [], []
+        embree: Any = experiment.intersector._embree
+        seen, kept = [], []
 
         zero = np.zeros(1)
         trace_pixels(experiment, zero, zero, workers=1, first=start)
@@ -344,8 +346,9 @@ def efficiency_rows(n_side: int) -> list[Row]:
         axis = np.linspace(-reach, reach, n_side)
         x, y = (g.ravel() for g in np.meshgrid(axis, axis))
         cost = {}
-        for kind, rays, branches in (("expected", 64, 8), ("analog", 4096, 1)):
-            settings = TraceSettings(rays=rays, branches=branches, estimator=kind, n_orders=2, maps=False)
+        for kind, rays in (("expected", 64), ("analog", 4096)):
+            values = {"rays": rays, "branches": 8, "estimator": kind, "n_orders": 2, "maps": False}
+            settings = TraceSettings.model_validate(values)
             experiment = make_experiment(body, instrument, settings)
             trace_pixels(experiment, x[:16], y[:16], workers=1)
             start = time.process_time()

@@ -124,9 +124,10 @@ class _Side:
         try:
             tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
         except GuardError as e:
+            found = str(e).split(";")[0]
             raise GuardError(
-                f"the surface of the fit is too rough or steep to trace multiple scattering from ({e.args[0].split(';')[0]}"
-                "): check background and gains, or use method = 'nearfield'"
+                f"the surface of the fit is too rough or steep to trace multiple scattering from ({found}): check "
+                "background and gains, or use method = 'nearfield'"
             ) from e
         return tally.probability()[0][1].reshape(-1, *r.x.shape)
 
