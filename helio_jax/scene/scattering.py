@@ -32,7 +32,7 @@ class Shape(IntEnum):
     UNIFORM = 2  # cosine of the cone's half-angle
     LOBE = 3  # width [rad], +1 about the specular direction, -1 about the way back
     COSINE_LOBE = 4
-    DIFFRACTION = 5  # width of broadened peaks; rows: order, order, weight, width
+    DIFFRACTION = 5  # width of broadened peaks, 1 if the lattice turns with the face; rows: order, order, weight, width
     ROUGH = 6  # roughness
     TABLE = 7  # table: intensity [incidence, theta, phi] on axes
 
@@ -211,15 +211,16 @@ class RoughDiffuseLaw(LawModel):
 class DiffractionLaw(Coherent):
     """2-D diffraction: the direction's part along the surface changes by wavelength * (n b1 + m b2).
 
-    b1, b2 are reciprocal (without 2 pi) to the lattice, which is projected onto the face. Peaks are Gaussian in the
-    direction's part along the surface. Orders are given by a Gaussian envelope or as a table of intensities.
+    b1, b2 are reciprocal (without 2 pi) to the lattice on the face. Peaks are Gaussian in the direction's part along
+    the surface. Orders are given by a Gaussian envelope or as a table of intensities.
     """
 
     kind: Literal["diffraction"] = "diffraction"
     wavelength_nm: float = Field(gt=0.0, le=10.0)
     """Wavelength of the atoms [nm]."""
     lattice_nm: tuple[tuple[float, ...], tuple[float, ...]]
-    """The surface lattice's two vectors: x, y, z, or x, y for z = 0; sample frame [nm]."""
+    """The surface lattice's two vectors: x, y, z in the sample frame, projected onto the face; or x, y on a horizontal
+    face, turned with every other face by the shortest way from its normal to z [nm]."""
     max_order: tuple[int, int] = (6, 6)
     """Largest |n| and |m|."""
     order_sigma: float = Field(default=2.0, gt=0.0, le=1000.0)
@@ -247,6 +248,11 @@ class DiffractionLaw(Coherent):
         return self
 
     @property
+    def _is_turned(self) -> bool:
+        """Whether the lattice turns with the face."""
+        return len(self.lattice_nm[0]) == 2
+
+    @property
     def vectors(self) -> np.ndarray:
         """The lattice's vectors [2, 3], nm."""
         return np.array([(*v, 0.0)[:3] for v in self.lattice_nm])
@@ -255,12 +261,16 @@ class DiffractionLaw(Coherent):
         """Return what the law is made of."""
         n, m, weight = (np.array(column, float) for column in self._weights())
         width = np.full(n.shape, self.peak_sigma)
-        if self.compat != "none" and (self.peaks is not None or len(self.lattice_nm[0]) == 3):
+        if self.compat != "none" and (self.peaks is not None or not self._is_turned):
             width[(n == 0) & (m == 0)] = 0.0
         rows = np.stack([n, m, weight / weight.sum(), width], 1)[weight > 1e-12 * weight.max()]
         lattice = self.vectors / self.wavelength_nm
         return self.with_rest(
-            Shape.DIFFRACTION, (self.peak_sigma,), rows=rows, lattice=lattice, attenuation=self.attenuation
+            Shape.DIFFRACTION,
+            (self.peak_sigma, float(self._is_turned)),
+            rows=rows,
+            lattice=lattice,
+            attenuation=self.attenuation,
         )
 
     def _weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -281,7 +291,7 @@ class DiffractionLaw(Coherent):
         n, m = (a.ravel() for a in np.meshgrid(n, m, indexing="ij"))
         if not is_compat:
             return n, m, np.exp(-0.5 * (n**2 + m**2) / self.order_sigma**2)
-        if len(self.lattice_nm[0]) == 2:
+        if self._is_turned:
             return n, m, np.exp(-((n**2 + m**2) // 2) / self.order_sigma**2)
         square = (np.abs(n) + np.abs(m)) ** 2
         return n, m, np.minimum(1.0, (square + 0.05) * np.exp(-0.5 * square / self.order_sigma**2))

@@ -39,7 +39,7 @@ def _kept(table, t, d, x, y, z):
 @njit(cache=True, nogil=True)
 def _has_orders(table, t, d, n):
     """Whether any diffraction order of a term is open."""
-    b1, b2 = lobes.lattice_steps(table.lattice[t], n)
+    b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
     rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
     nodes = table.nodes[table.first_node[t] : table.first_node[t + 1]]
     return lobes.diffraction_norm(d, n, b1, b2, rows, table.numbers[t, 0], nodes) > _NO_ORDER
@@ -56,7 +56,7 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
     rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
     b1, b2 = n, n
     if shape == _DIFFRACTION:
-        b1, b2 = lobes.lattice_steps(table.lattice[t], n)
+        b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
     for trial in range(1, _MAX_TRIALS):
         a, b, c, e = philox(key, stream, pixel, path, event, np.uint64(2 * trial))
         is_exact = False
@@ -94,7 +94,7 @@ def _density(table, t, d, n, o):
     elif shape == _COSINE_LOBE:
         out = lobes.cosine_lobe_density(d, n, o)
     elif shape == _DIFFRACTION:
-        b1, b2 = lobes.lattice_steps(table.lattice[t], n)
+        b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
         rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
         out = lobes.diffraction_density(d, n, b1, b2, rows, p, nodes, o)
     elif shape == _ROUGH:
@@ -113,6 +113,15 @@ def lobe_density(table: LawTable, material, d, n, o):
             if table.shape[t] != _COSINE and table.shape[t] != _SPECULAR:
                 total += table.share[t] * _density(table, t, d, n, o)
     return total
+
+
+@njit(cache=True, nogil=True)
+def lobe_densities(table, material, incoming, normal, outgoing):
+    """Return `lobe_density` of one material for many directions [n]; incoming, normal, outgoing: [n, 3]."""
+    out = np.empty(outgoing.shape[0])
+    for i in range(out.size):
+        out[i] = lobe_density(table, material, incoming[i], normal[i], outgoing[i])
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -138,7 +147,7 @@ def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
 
 
 @njit(cache=True, nogil=True)
-def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed):
+def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, wants_density=True):
     """Draw how atoms leave.
 
     Args:
@@ -148,6 +157,7 @@ def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed):
         normal: unit normals, outward [n, 3].
         u: two numbers for the cosine law, low-discrepancy at the first bounce [n, 2 or more].
         ids, path, event, seed: key of all other random numbers: pixel [n], path in it [n].
+        wants_density: False saves the time for it.
 
     Returns:
         Directions [n, 3]; density of the material's lobes there, 0 for atoms of the cosine law, `EXACT` for exact
@@ -172,5 +182,6 @@ def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed):
         if np.isnan(x) or b >= _kept(table, t, d, x, y, z):
             continue
         out[i, 0], out[i, 1], out[i, 2] = x, y, z
-        density[i] = EXACT if is_exact else lobe_density(table, material[i], d, n, out[i])
+        if wants_density:
+            density[i] = EXACT if is_exact else lobe_density(table, material[i], d, n, out[i])
     return out, density, leaves

@@ -88,7 +88,7 @@ def check_lattices(laws: Sequence[tuple[Term, ...]], names: Sequence[str], norma
     for i, law in enumerate(laws):
         for term in law:
             plane = np.cross(*term.lattice)
-            if term.shape == Shape.DIFFRACTION:
+            if term.shape == Shape.DIFFRACTION and not term.numbers[1]:
                 cosine = np.abs(normals[index == i] @ plane) / np.linalg.norm(plane)
                 if cosine.size and cosine.min() < STEEPEST_LATTICE:
                     angle = np.degrees(np.arccos(cosine.min()))
@@ -140,7 +140,7 @@ def _pack_table(axes: tuple[np.ndarray, ...], intensity: np.ndarray) -> np.ndarr
     Sizes (3), the axes, the intensity normalised to 1 over the hemisphere [i, t, p], for every incidence the cumulative
     envelope of its cells [i, (t - 1) (p - 1)]: largest corner times solid angle, from which cells are drawn.
     """
-    incidence, theta, phi = axes
+    _, theta, phi = axes
     x, w = np.polynomial.legendre.leggauss(8)
     step, turns = np.diff(theta), 2.0 if phi[-1] < 4.0 else 1.0
     at = 0.5 * (x + 1.0)

@@ -144,10 +144,16 @@ def try_rough(d, n, r, a, b, c, e):
 
 
 @njit(cache=True, nogil=True)
-def lattice_steps(lattice, n):
+def lattice_steps(lattice, is_turned, n):
     """Return the changes of direction of the orders (1, 0) and (0, 1) on a face (see `DiffractionLaw`)."""
-    b1, b2 = np.cross(lattice[1], n), np.cross(n, lattice[0])
+    z = np.array((0.0, 0.0, 1.0)) if is_turned else n
+    b1, b2 = np.cross(lattice[1], z), np.cross(z, lattice[0])
     volume = b1[0] * lattice[0, 0] + b1[1] * lattice[0, 1] + b1[2] * lattice[0, 2]
+    if is_turned:
+        for b in (b1, b2):
+            length = np.sqrt(b[0] * b[0] + b[1] * b[1])
+            x, y, up = turn_to(n[0], n[1], n[2], b[0] / length, b[1] / length, 0.0)
+            b[0], b[1], b[2] = length * x, length * y, length * up
     return b1 / volume, b2 / volume
 
 

@@ -265,7 +265,7 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
     if e.laws is None:
         return _Paths(origin, _bounce(hits.normal, u), pixel, path, u[:, 2:].copy(), skip, np.zeros(len(path)))
-    material, key = e.intersector.material_of(hits.surface), (ids[pixel], path, event, s.seed)
+    material, key = e.intersector.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
     direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
     stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
     out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density)
