@@ -118,7 +118,9 @@ def _find(
     is_key = False  # whether the last part was a name of the user's own, as in material.NAME
     for i, part in enumerate(loc):
         node = _child(node, part)
-        if isinstance(part, int) or (i > 0 and field is not None and get_origin(field.annotation) is dict and not is_key):
+        if isinstance(part, int) or (
+            i > 0 and field is not None and get_origin(field.annotation) is dict and not is_key
+        ):
             is_key = not isinstance(part, int)
             continue
         is_key = False

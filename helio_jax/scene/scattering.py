@@ -234,10 +234,9 @@ class DiffractionLaw(Coherent):
 
     @model_validator(mode="after")
     def _has_lattice_and_orders(self) -> "DiffractionLaw":
-        if any(len(v) not in (2, 3) for v in self.lattice_nm):
-            raise ValueError(
-                f"lattice_nm must be two vectors of 2 or 3 numbers, got {list(map(list, self.lattice_nm))}"
-            )
+        if {len(v) for v in self.lattice_nm} not in ({2}, {3}):
+            got = list(map(list, self.lattice_nm))
+            raise ValueError(f"lattice_nm must be two vectors, both of 2 or both of 3 numbers, got {got}")
         a, b = self.vectors
         if np.linalg.norm(np.cross(a, b)) <= 1e-6 * np.linalg.norm(a) * np.linalg.norm(b):
             raise ValueError("lattice_nm must be two vectors in different directions, got parallel ones or zero")

@@ -28,15 +28,16 @@ from helio_jax.trace.tally import STOPPED
 
 COLD = DebyeWaller(energy_mev=63.0, mass_u=28.0, temperature_k=100.0, debye_k=450.0)
 SQUARE = {"wavelength_nm": 0.2, "lattice_nm": ((1.0, 0.0), (0.0, 1.0))}
+N_DRAWN = 100_000
 UP = np.array([0.0, 0.0, 1.0])
 LAWS = {
     "cosine": CosineLaw(),
-    "uniform": UniformLaw(half_angle_deg=70.0),
+    "uniform": UniformLaw(half_angle_deg=60.0),
     "broad_specular": BroadSpecularLaw(sigma_deg=25.0, diffuse_fraction=0.2),
     "backscattering": BackscatteringLaw(sigma_deg=40.0, albedo=0.8),
     "cosine_specular": CosineSpecularLaw(),
     "rough_diffuse": RoughDiffuseLaw(roughness=0.6),
-    "diffraction": DiffractionLaw(**SQUARE, peak_sigma=0.08, diffuse_fraction=0.1),
+    "diffraction": DiffractionLaw(**SQUARE, max_order=(3, 3), peak_sigma=0.08, diffuse_fraction=0.1),
     "attenuated": BroadSpecularLaw(sigma_deg=30.0, debye_waller=COLD),
     "mixture": MixtureLaw(
         parts=(
@@ -60,7 +61,7 @@ def turn(normal: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normal, first), normal], 1)
 
 
-def draw(law, direction, normal=UP, n=400_000, seed=3):
+def draw(law, direction, normal=UP, n=N_DRAWN, seed=3):
     """Draw n atoms; return directions, densities and whether they leave."""
     rng = np.random.default_rng(seed)
     copies = (np.tile(np.asarray(v, float), (n, 1)) for v in (direction, normal))
@@ -83,7 +84,7 @@ def hemisphere(n_cosines: int, n_turns: int) -> np.ndarray:
     return np.stack([r * np.cos(turns), r * np.sin(turns), np.broadcast_to(z[:, None], (n_cosines, n_turns))], -1)
 
 
-def cell_shares(law, direction, matrix, cells=(24, 32), fine=24) -> np.ndarray:
+def cell_shares(law, direction, matrix, cells=(20, 24), fine=10) -> np.ndarray:
     """Share of the atoms that leaves into each cell of the hemisphere, by integrating the density."""
     out = hemisphere(cells[0] * fine, cells[1] * fine)
     lobes = density(law, direction, out @ matrix.T, matrix[:, 2])
@@ -94,7 +95,7 @@ def cell_shares(law, direction, matrix, cells=(24, 32), fine=24) -> np.ndarray:
     return lobes + rest * cosine
 
 
-def count_cells(out, matrix, cells=(24, 32)) -> np.ndarray:
+def count_cells(out, matrix, cells=(20, 24)) -> np.ndarray:
     """Histogram of directions [n, 3] in the same cells."""
     local = out @ matrix
     row = np.minimum((local[:, 2] * cells[0]).astype(int), cells[0] - 1)
@@ -103,10 +104,10 @@ def count_cells(out, matrix, cells=(24, 32)) -> np.ndarray:
     return np.bincount(row * cells[1] + column, minlength=cells[0] * cells[1])
 
 
-@pytest.mark.parametrize("tilt", [0.0, 35.0, 75.0])
+@pytest.mark.parametrize("tilt", [0.0, 40.0, 75.0])
 @pytest.mark.parametrize("name", LAWS)
 def test_sampler_against_density(name, tilt):
-    """Chi-square of 400 000 draws against the integral of eval, on a tilted face too; 4 % too many to one side are rejected.
+    """Chi-square of 100 000 draws against the integral of eval, on a tilted face too; rejects 8 % more on one side.
 
     Catches: a norm that forgets the horizon, a frame that is not about the normal, a wrong acceptance probability.
     """
@@ -115,11 +116,11 @@ def test_sampler_against_density(name, tilt):
         matrix = turn(normal)
         direction = matrix @ incoming(tilt, 20.0)
         out, _, leaves = draw(law, direction, normal)
-        expected = 400_000 * cell_shares(law, direction, matrix).ravel()
+        expected = N_DRAWN * cell_shares(law, direction, matrix).ravel()
         observed = count_cells(out[leaves], matrix)
         assert np.all(out[leaves] @ normal > 0)
         assert_likely(pooled_chi2(observed, expected, 0 * expected), f"{name} at {tilt} deg")
-    wrong = expected * np.where(np.arange(expected.size) % 32 < 16, 1.04, 0.96)
+    wrong = expected * np.where(np.arange(expected.size) % 24 < 12, 1.08, 0.92)
     assert pooled_chi2(observed, wrong, 0 * expected) < 1e-9
 
 
@@ -129,7 +130,7 @@ def test_energy(tilt):
 
     For the rough-diffuse law this checks the closed directional albedo of the paper: any error in it shows.
     """
-    out = hemisphere(2000, 1000)
+    out = hemisphere(800, 300)
     for name in ("uniform", "broad_specular", "backscattering", "cosine_specular", "rough_diffuse", "mixture"):
         law = LAWS[name]
         share = sum(term.share for term in law.terms() if term.shape != 0)
@@ -151,7 +152,7 @@ def test_rough_diffuse_is_reciprocal_and_ends_in_the_cosine_law():
 
 
 def test_closed_forms():
-    """Uniform cone <cos> = (1 + cos a)/2; a very broad lobe and a cosine lobe at normal incidence are the cosine law."""
+    """Uniform cone <cos> = (1 + cos a)/2; at normal incidence a cosine lobe is the cosine law; a lobe is Gaussian."""
     out, _, _ = draw(UniformLaw(half_angle_deg=60.0), incoming(40.0))
     assert_mean(out[:, 2].mean(), 0.75, out[:, 2].std() / np.sqrt(len(out)), "uniform cone")
     down, grid = incoming(0.0), hemisphere(20, 20)
@@ -167,10 +168,12 @@ def test_mirror_and_attenuation():
     B is computed here from the constants of nature. Catches a missing factor 2, energies in K, a wrong mass.
     """
     law = SpecularLaw(debye_waller=COLD)
-    n = 400_000
-    out, found, _ = draw(law, incoming(40.0), n=n)
+    n = N_DRAWN
+    out, found, _ = draw(law, incoming(40.0))
     is_exact = np.isinf(found)
-    np.testing.assert_allclose(out[is_exact], np.tile([np.sin(np.radians(40)), 0, np.cos(np.radians(40))], (is_exact.sum(), 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        out[is_exact], np.tile([np.sin(np.radians(40)), 0, np.cos(np.radians(40))], (is_exact.sum(), 1)), atol=1e-12
+    )
     hbar, k_b, u, mev = 1.054571817e-34, 1.380649e-23, 1.66053907e-27, 1.602176634e-22
     k_squared = 2 * 4.0 * u * COLD.energy_mev * mev / hbar**2
     two_w = 3 * hbar**2 * k_squared * COLD.temperature_k / (COLD.mass_u * u * k_b * COLD.debye_k**2)
@@ -233,10 +236,10 @@ def test_table(tmp_path):
         (tmp_path / "t.txt").write_text("\n".join(lines))
         law = _Bound(TableLaw(file="t.txt", albedo=0.9, diffuse_fraction=0.1), tmp_path)
         direction = incoming(30.0, 50.0)
-        assert density(law, direction, hemisphere(2000, 1000)).mean() * 2 * np.pi == pytest.approx(0.81, rel=1e-3)
+        assert density(law, direction, hemisphere(800, 300)).mean() * 2 * np.pi == pytest.approx(0.81, rel=1e-3)
         out, _, leaves = draw(law, direction)
         assert_mean(leaves.mean(), 0.9, 0.3 / np.sqrt(len(leaves)), "albedo")
-        expected = 400_000 * cell_shares(law, direction, np.eye(3)).ravel()
+        expected = N_DRAWN * cell_shares(law, direction, np.eye(3)).ravel()
         assert_likely(pooled_chi2(count_cells(out[leaves], np.eye(3)), expected, 0 * expected), f"table to {last}")
 
 
@@ -248,7 +251,10 @@ class _Bound:
 
 
 BODIES = {
-    "sphere": (SpheresSample(spheres=(Sphere(radius_um=1000.0, cap_height_um=720.0),), material="m"), 1400.0),
+    "sphere": (
+        SpheresSample(spheres=(Sphere(radius_um=1000.0, cap_height_um=720.0),), size_um=4000.0, material="m"),
+        1400.0,
+    ),
     "trench": (TrenchSample(width_um=200.0, length_um=1000.0, depth_um=150.0, material="m"), 140.0),
 }
 TRACED = LAWS | {
@@ -260,7 +266,7 @@ TRACED = LAWS | {
 @pytest.mark.parametrize("body", BODIES)
 @pytest.mark.parametrize("name", [n for n in TRACED if n != "cosine"])
 def test_expected_against_analog(bshem, name, body):
-    """Both estimators agree per order and detector, masks included; a bias of 10 % of all counts is rejected.
+    """Both estimators agree per order and detector, masks included; a bias of 15 % of all counts is rejected.
 
     Catches: lobes counted twice (aimed at and hit) or not at all, a share of the branches, an order off by one.
     """
@@ -269,19 +275,19 @@ def test_expected_against_analog(bshem, name, body):
     x, y = (g.ravel() for g in np.meshgrid(axis, axis))
     laws = {"m": TRACED[name].terms()}
     settings = {"n_orders": 3, "maps": False}
-    expected = trace_pixels(make_experiment(sample.build(), bshem, TraceSettings(rays=256, **settings), laws), x, y)
-    analog_settings = TraceSettings(rays=8000, estimator="analog", seed=5, **settings)
+    expected = trace_pixels(make_experiment(sample.build(), bshem, TraceSettings(rays=128, **settings), laws), x, y)
+    analog_settings = TraceSettings(rays=2000, estimator="analog", seed=5, **settings)
     analog = trace_pixels(make_experiment(sample.build(), bshem, analog_settings, laws), x, y)
     assert expected.n_unaccounted == analog.n_unaccounted == 0
     mean, variance = (a.sum(-1) for a in expected.probability())
     hits = analog.hits.sum(-1)
     for order in range(3):
         for k in range(3):
-            n = 8000 * mean[order, k]
-            if n > 50:
-                error = np.sqrt(n + 8000**2 * variance[order, k])
+            n = 2000 * mean[order, k]
+            if n > 30:
+                error = np.sqrt(n + 2000**2 * variance[order, k])
                 assert_mean(hits[order, k], n, error, f"{name}: order {order + 1}, detector {k}")
-    assert 0.1 * hits.sum() > 6 * np.sqrt(hits.sum() + 8000**2 * variance.sum())
+    assert 0.15 * hits.sum() > 6 * np.sqrt(hits.sum() + 2000**2 * variance.sum())
 
 
 def test_albedo_sticks_and_scales(bshem):
