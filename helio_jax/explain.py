@@ -115,15 +115,14 @@ def _find(
     parent: type[BaseModel] | None = model
     field: FieldInfo | None = None
     node: Any = data
-    is_key = False  # whether the last part was a name of the user's own, as in material.NAME
+    is_name = False  # whether the last part was a name of the user's own, as in material.NAME
     for i, part in enumerate(loc):
         node = _child(node, part)
-        if isinstance(part, int) or (
-            i > 0 and field is not None and get_origin(field.annotation) is dict and not is_key
-        ):
-            is_key = not isinstance(part, int)
+        if isinstance(part, int):
             continue
-        is_key = False
+        is_name = field is not None and get_origin(field.annotation) is dict and not is_name
+        if is_name:
+            continue
         if i > 0 and field is not None:
             kind = _child(_at(data, loc[:i]), "kind")
             parent = _choose(_models(field.annotation), kind)

@@ -7,7 +7,7 @@ the program SHeM Ray Tracing, inferred from its counts (DATA.md), so that its fi
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Literal
@@ -46,7 +46,7 @@ class Term:
         share: of the atoms; what the shares of a law lack to 1 sticks to the surface.
         numbers: see `Shape`.
         rows: diffraction peaks [n, 4].
-        lattice: reciprocal-space steps are computed from these two vectors per wavelength, 0: none [2, 3].
+        lattice: the two vectors of a diffraction lattice in wavelengths [2, 3].
         attenuation: B of the Debye-Waller factor exp(-B |u_out - u_in|^2); what it takes leaves by the cosine law.
         axes: incidence, theta and phi of a table [rad].
         intensity: of a table, per steradian [incidence, theta, phi].
@@ -352,8 +352,6 @@ class MixtureLaw(LawModel):
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
         """Return what the law is made of."""
-        from dataclasses import replace
-
         total = sum(part.weight for part in self.parts)
         return tuple(
             replace(term, share=term.share * self.albedo * part.weight / total)

@@ -8,6 +8,8 @@ and pdf = eval. d is the incoming unit direction (towards the surface), n the no
 import numpy as np
 from numba import njit
 
+from helio_jax.trace.lawtable import CUT
+
 REFUSED = (False, 0.0, 0.0, 0.0)
 _EON_A = 0.5 - 2.0 / (3.0 * np.pi)
 _EON_B = 2.0 / 3.0 - 28.0 / (15.0 * np.pi)
@@ -171,12 +173,12 @@ def _peak(d, n, b1, b2, row):
 @njit(cache=True, nogil=True)
 def diffraction_norm(d, n, b1, b2, rows, sigma, nodes):
     """Return the share of all peaks that lies above the horizon."""
-    total = 0.0
+    total, low = 0.0, max(0.0, 1.0 - CUT * sigma)
     for i in range(rows.shape[0]):
         x, y, z = _peak(d, n, b1, b2, rows[i])
         distance = np.sqrt(x * x + y * y + z * z)
         if rows[i, 3] > 0.0:
-            total += rows[i, 2] * interpolate(nodes, distance, 1.0 + 8.0 * sigma)
+            total += rows[i, 2] * interpolate(nodes, distance - low, 1.0 + CUT * sigma - low)
         elif distance < 1.0:
             total += rows[i, 2]
     return total
@@ -210,7 +212,7 @@ def diffraction_density(d, n, b1, b2, rows, sigma, nodes, o):
             x, y, z = _peak(d, n, b1, b2, rows[i])
             x, y, z = o[0] - cosine * n[0] - x, o[1] - cosine * n[1] - y, o[2] - cosine * n[2] - z
             square = (x * x + y * y + z * z) / (sigma * sigma)
-            if square < 64.0:
+            if square < CUT * CUT:
                 total += rows[i, 2] * np.exp(-0.5 * square)
     if total == 0.0:
         return 0.0

@@ -21,7 +21,7 @@ from helio_jax.scene.scattering import (
 )
 from helio_jax.scene.shapes import FlatSample, Sphere, SpheresSample, TrenchSample
 from helio_jax.trace.laws import lobe_densities, scatter_atoms
-from helio_jax.trace.lawtable import make_law_table
+from helio_jax.trace.lawtable import make_law_table, open_share
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import STOPPED
@@ -241,6 +241,17 @@ def test_table(tmp_path):
         assert_mean(leaves.mean(), 0.9, 0.3 / np.sqrt(len(leaves)), "albedo")
         expected = N_DRAWN * cell_shares(law, direction, np.eye(3)).ravel()
         assert_likely(pooled_chi2(count_cells(out[leaves], np.eye(3)), expected, 0 * expected), f"table to {last}")
+
+
+def test_share_of_open_peaks():
+    """Half of a narrow Gaussian on the disc's rim is inside, less sigma / sqrt(8 pi) for its curvature; centred: exact.
+
+    Catches: a quadrature that misses the rim, where the half-chord grows like a root.
+    """
+    rim = 0.5 - 0.01 / np.sqrt(8.0 * np.pi)
+    assert open_share(np.ones(1), 0.01)[0] == pytest.approx(rim, abs=1e-4 * 0.01)
+    for sigma in (0.02, 0.3, 0.5):
+        assert open_share(np.zeros(1), sigma)[0] == pytest.approx(-np.expm1(-0.5 / sigma**2), rel=1e-9)
 
 
 class _Bound:

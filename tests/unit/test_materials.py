@@ -101,6 +101,22 @@ def test_groups_of_a_mesh(tmp_path):
         MeshSample(file="m.obj", unit="um", materials={"gold2": "b"}).build(tmp_path)
 
 
+def test_geometries_of_a_glb(tmp_path):
+    """Geometries of a GLB are told apart by name and stay where their scene puts them; catches lost transforms."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    for name, x in (("left", -3.0), ("right", 3.0)):
+        scene.add_geometry(
+            trimesh.creation.box(), geom_name=name, transform=trimesh.transformations.translation_matrix([x, 0, 0])
+        )
+    scene.export(tmp_path / "m.glb")
+    body = MeshSample(file="m.glb", unit="um", materials={"right": "b"}).build(tmp_path)
+    is_b = np.array(body.materials)[body.face_material] == "b"
+    np.testing.assert_array_equal(is_b, body.triangles[..., 0].mean(1) > 0)
+    assert is_b.sum() == 12
+
+
 def test_several_samples(tmp_path):
     """Two spheres on two flats, each with its own law, and the hits know it; catches indices mixed up when joined."""
     sphere = "kind = 'spheres', size_um = 200, spheres = [{radius_um = 20, material = 'y'}]"
