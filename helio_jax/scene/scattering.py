@@ -278,7 +278,8 @@ class DiffractionLaw(Coherent):
         The forms of `compat` were inferred from the counts of one set each (reference/distributions): lattice of two
         numbers: (n^2 + m^2) / 2 is cut to an integer. Of three numbers: min(1, (r^2 + c) exp(-r^2 / (2 s^2))) with
         r = |n| + |m| and c = 0.05 (0.0513 +- 0.0018 fitted), order (0, 0) not broadened. Table: the first intensity
-        counts twice, what then exceeds 1 in all is cut off the last ones, order (0, 0) is not broadened.
+        counts twice, what then exceeds 1 in all is cut off the last ones, order (0, 0) is not broadened. Other
+        parameters may behave otherwise, and the thermal sets hold too few atoms in peaks to tell the forms apart.
         """
         is_compat = self.compat != "none"
         if self.peaks is not None:
