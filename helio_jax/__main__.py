@@ -232,6 +232,7 @@ def validate(scene: SceneArg) -> None:
     from helio_jax.scene.sample import check_body
 
     loaded = load_scene(scene)
+    loaded.read_laws()
     for key, value in check_body(loaded.build_body()).items():
         print(f"  {key}: {value}")
     for warning in loaded.warnings():

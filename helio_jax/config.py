@@ -105,10 +105,17 @@ def _read_extended(path: Path) -> dict[str, Any]:
             f"{path}: extends = {name!r}: that file extends {base['extends']!r} itself; only one level is allowed: "
             "put everything needed into one of the two"
         )
-    sample = base.get("sample")
-    if isinstance(sample, dict) and isinstance(sample.get("file"), str) and not Path(sample["file"]).is_absolute():
-        sample["file"] = Path(os.path.relpath(base_path.parent / sample["file"], path.parent)).as_posix()
+    for table in ("sample", "material"):
+        _move_files(base.get(table), base_path.parent, path.parent)
     return _merge(base, data)
+
+
+def _move_files(node: Any, old: Path, new: Path) -> None:
+    """Let every relative `file` in tables and lists, which starts at the folder `old`, start at `new`."""
+    if isinstance(node, dict) and isinstance(node.get("file"), str) and not Path(node["file"]).is_absolute():
+        node["file"] = Path(os.path.relpath(old / node["file"], new)).as_posix()
+    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        _move_files(child, old, new)
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

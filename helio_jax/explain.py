@@ -6,12 +6,12 @@ Used by config.py for scene and instrument files. Knows the settings models only
 import difflib
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-_UNIT = re.compile(r"_(um|deg|mrad|mb)$")
+_UNIT = re.compile(r"_(um|nm|deg|mrad|mev|mb)$")
 _SIGNS = {"greater_than": (">", "gt"), "greater_than_equal": (">=", "ge"), "less_than": ("<", "lt")}
 _SIGNS["less_than_equal"] = ("<=", "le")
 _KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "string": "a text in quotes"}
@@ -45,7 +45,7 @@ def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, A
     where, kind, context, value = _path(loc), item["type"], item.get("ctx", {}), item["input"]
     parent, field = _find(model, loc, data)
     key = next((part for part in reversed(loc) if isinstance(part, str)), "")
-    unit = f" {_UNIT.search(key)[1]}" if _UNIT.search(key) else ""  # type: ignore[index]
+    unit = f" {_UNIT.search(key)[1]}".replace("mev", "meV") if _UNIT.search(key) else ""  # type: ignore[index]
     about = f" ({_first_sentence(field.description)})" if field is not None and field.description else ""
     if kind == "value_error":
         for line in str(context["error"]).splitlines():
@@ -69,7 +69,7 @@ def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, A
         where = where if kind == "literal_error" else f"{where}.kind"
         yield f"{where} = {_show(value)}: must be one of {expected}" + (f": did you mean {near[0]!r}?" if near else "")
     elif kind == "union_tag_not_found":
-        yield f"{where}.kind: is missing: say which, one of {', '.join(_tags(parent, loc))}"
+        yield f"{where}.kind: is missing: say which, one of {', '.join(_tags(field))}"
     elif kind in _SIGNS:
         sign, name = _SIGNS[kind]
         limit = f"{_number(context[name])}{unit}"
@@ -115,9 +115,13 @@ def _find(
     parent: type[BaseModel] | None = model
     field: FieldInfo | None = None
     node: Any = data
+    is_name = False  # whether the last part was a name of the user's own, as in material.NAME
     for i, part in enumerate(loc):
         node = _child(node, part)
         if isinstance(part, int):
+            continue
+        is_name = field is not None and get_origin(field.annotation) is dict and not is_name
+        if is_name:
             continue
         if i > 0 and field is not None:
             kind = _child(_at(data, loc[:i]), "kind")
@@ -150,11 +154,9 @@ def _choose(models: list[type[BaseModel]], kind: Any) -> type[BaseModel] | None:
     return models[0] if len(models) == 1 else None
 
 
-def _tags(parent: type[BaseModel] | None, loc: tuple) -> list[str]:
-    """Return the kinds that the union at `loc` knows."""
-    if parent is None or not isinstance(loc[-1], str):
-        return []
-    return [repr(m.model_fields["kind"].default) for m in _models(parent.model_fields[loc[-1]].annotation)]
+def _tags(field: FieldInfo | None) -> list[str]:
+    """Return the kinds that a union knows."""
+    return [] if field is None else [repr(m.model_fields["kind"].default) for m in _models(field.annotation)]
 
 
 def _has_wrong_length(item: Any) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 FALSE_ALARM = 1e-6
-N_CHECKS = 50
+N_CHECKS = 400
 P_MIN = FALSE_ALARM / N_CHECKS
 
 

@@ -15,6 +15,8 @@ from helio_jax.heightmap import HeightMap
 
 MAX_HEIGHT_MAP_MB = 512.0
 """Largest height map file, and largest content of an .npz after decompression."""
+MAX_SCATTERING_TABLE_MB = 64.0
+"""Largest table of scattered intensities."""
 
 
 def read_bytes(path: Path, max_mb: float, error: type[HelioError] = InputFileError) -> bytes:
@@ -94,5 +96,47 @@ def _read_grid(path: Path, data: bytes, kind: str) -> np.ndarray:
     except (UnicodeDecodeError, ValueError) as e:
         raise InputFileError(f"{path}: is not a grid of numbers: {e}") from None
     if min(grid.shape) < 2:
-        raise InputFileError(f"{path}: a height map needs at least 2 x 2 values, got {grid.shape}")
+        raise InputFileError(f"{path}: a grid needs at least 2 x 2 values, got {grid.shape}")
     return grid
+
+
+def read_scattering_table(path: Path) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Read intensities per steradian on a full grid: columns ([incidence,] theta, phi, intensity), angles in degrees.
+
+    Returns:
+        Axes incidence [i], theta [t] and phi [p] (0 to pi: the other half is its mirror image; or 0 to 2 pi), rad, and
+        the intensity [i, t, p].
+
+    Raises:
+        InputFileError: as `read_bytes`; not numbers; no full grid; angles or intensities out of range.
+    """
+    kind = path.suffix.lower()
+    rows = _read_grid(path, read_bytes(path, MAX_SCATTERING_TABLE_MB), kind)
+    if rows.shape[1] not in (3, 4) or not np.all(np.isfinite(rows)):
+        raise InputFileError(
+            f"{path}: a scattering table needs 3 or 4 columns of finite numbers ([incidence,] theta, phi, intensity), "
+            f"got {rows.shape[1]} columns"
+        )
+    rows = rows if rows.shape[1] == 4 else np.column_stack([np.zeros(len(rows)), rows])
+    axes, place = zip(*(np.unique(column, return_inverse=True) for column in rows[:, :3].T), strict=True)
+    shape = tuple(axis.size for axis in axes)
+    if np.unique(np.ravel_multi_index(place, shape)).size != len(rows) or len(rows) != np.prod(shape):
+        raise InputFileError(
+            f"{path}: {len(rows)} rows do not fill a grid of {shape[0]} x {shape[1]} x {shape[2]} angles (incidence, "
+            "theta, phi) once each: give every combination on one line"
+        )
+    intensity = np.zeros(shape)
+    intensity[place] = rows[:, 3]
+    incidence, theta, phi = axes
+    if incidence[0] < 0 or incidence[-1] > 90 or theta[0] < 0 or theta[-1] > 90 or theta.size < 2:
+        raise InputFileError(f"{path}: incidence and theta must lie within 0 to 90 deg, with two theta at least")
+    if phi.size < 2 or phi[0] != 0 or not (phi[-1] == 180 or 180 < phi[-1] <= 360):
+        raise InputFileError(
+            f"{path}: phi must start at 0 and run to 180 deg (mirrored) or round to at most 360 deg, got "
+            f"{phi[0]:g} to {phi[-1]:g} deg"
+        )
+    if phi[-1] not in (180.0, 360.0):
+        phi, intensity = np.append(phi, 360.0), np.concatenate([intensity, intensity[..., :1]], -1)
+    if intensity.min() < 0 or np.any(intensity[:, :, 1:].sum((1, 2)) <= 0):
+        raise InputFileError(f"{path}: intensities must be >= 0, and > 0 somewhere for every incidence")
+    return (np.radians(incidence), np.radians(theta), np.radians(phi)), intensity

@@ -15,9 +15,17 @@ from pydantic import Field, PrivateAttr
 from helio_jax.errors import InputFileError
 from helio_jax.heightmap import HeightMap
 from helio_jax.scene import surfaces
+from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes, read_height_map
-from helio_jax.scene.shapes import FlatSample, Length, PyramidSample, SpheresSample, StepSample, TrenchSample
-from helio_jax.scene.surfaces import Body
+from helio_jax.scene.shapes import (
+    FlatSample,
+    Length,
+    PaintedSample,
+    PyramidSample,
+    SpheresSample,
+    StepSample,
+    TrenchSample,
+)
 from helio_jax.settings import Settings
 
 UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
@@ -26,7 +34,7 @@ MESH_EXTENT_UM = (1e-2, 1e6)
 """Smallest and largest sensible extent of a mesh [um]."""
 
 
-class HeightMapSample(Settings):
+class HeightMapSample(PaintedSample):
     """A height map from a file (.npz with x, y, height; .csv, .txt, .tsv: a grid), or from Python: `of`."""
 
     kind: Literal["height_map"] = "height_map"
@@ -78,10 +86,10 @@ class HeightMapSample(Settings):
             )
         x, y = np.meshgrid(height_map.x, height_map.y)
         reach = None if self.size_um is None else 0.5 * self.size_um
-        return surfaces.surface_body(x, y, height_map.height, reach, level=self.level_um)
+        return surfaces.surface_body(x, y, height_map.height, reach, level=self.level_um).painted(self.material)
 
 
-class MeshSample(Settings):
+class MeshSample(PaintedSample):
     """A triangle mesh from a file, scaled, then turned about x, y, z (in this order), then moved."""
 
     kind: Literal["mesh"] = "mesh"
@@ -99,6 +107,13 @@ class MeshSample(Settings):
     """Side of a flat added at z = 0 under the mesh; the mesh's faces in that plane are left out [um]."""
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
+    materials: dict[str, str] = Field(default={}, max_length=1000)
+    """Material by the name of a part: OBJ: its material (usemtl), group or object; GLB: its geometry."""
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of all materials that the sample asks for."""
+        return (self.material, *self.materials.values())
 
     @property
     def top(self) -> float | None:
@@ -112,7 +127,7 @@ class MeshSample(Settings):
             InputFileError: the file is missing, too large, unreadable, empty, non-finite or of absurd size.
         """
         path = base_dir / self.file
-        vertices, faces = _load_mesh(path, self.max_file_mb)
+        vertices, faces, parts = load_mesh(path, self.max_file_mb, tuple(self.materials))
         vertices = _rotation(self.rotate_deg).dot((vertices * (UNITS_UM[self.unit] * self.scale)).T).T
         vertices = vertices + np.asarray(self.translate_um)
         extent, (low, high) = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
@@ -121,16 +136,63 @@ class MeshSample(Settings):
                 f"{path}: the mesh is {extent:g} um across, sensible are {low:g} to {high:g} um: check sample.unit "
                 f"(now {self.unit!r}) and sample.scale (now {self.scale:g})"
             )
+        names = tuple(dict.fromkeys(self.material_names))
+        index = np.array([names.index(name) for name in self.material_names])[parts]
         if self.flat_size_um is None:
-            return Body(vertices, faces)
+            return Body(vertices, faces, materials=names, face_material=index)
         in_plane = np.all(np.abs(vertices[faces][..., 2]) <= 1e-6 * extent, axis=1)
-        flat = surfaces.flat_body(self.flat_size_um)
-        faces = np.concatenate([faces[~in_plane], flat.faces + len(vertices)])
-        return Body(np.concatenate([vertices, flat.vertices]), faces)
+        mesh = Body(vertices, faces[~in_plane], materials=names, face_material=index[~in_plane])
+        return Body.join([mesh, surfaces.flat_body(self.flat_size_um).painted(self.material)])
+
+
+OneSample = Annotated[
+    FlatSample | SpheresSample | StepSample | TrenchSample | PyramidSample | HeightMapSample | MeshSample,
+    Field(discriminator="kind"),
+]
+"""Any single sample."""
+
+
+class PlacedSample(Settings):
+    """A sample and where it stands."""
+
+    sample: OneSample
+    """The sample, with its own flat and materials."""
+    shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift of the sample [um]."""
+
+
+class SeveralSamples(Settings):
+    """Several samples at once; their flats should not overlap: the highest surface hides the others."""
+
+    kind: Literal["several"] = "several"
+    parts: tuple[PlacedSample, ...] = Field(min_length=1, max_length=1000)
+    """The samples and where they stand."""
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of all materials that the samples ask for."""
+        return tuple(name for part in self.parts for name in part.sample.material_names)
+
+    @property
+    def top(self) -> float | None:
+        """Height of the highest point whose height is known [um]."""
+        tops = [part.sample.top + part.shift_um[2] for part in self.parts if part.sample.top is not None]
+        return max(tops, default=None)
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Build and join the samples (errors as theirs)."""
+        return Body.join([part.sample.build(base_dir).moved(part.shift_um) for part in self.parts])
 
 
 Sample = Annotated[
-    FlatSample | SpheresSample | StepSample | TrenchSample | PyramidSample | HeightMapSample | MeshSample,
+    FlatSample
+    | SpheresSample
+    | StepSample
+    | TrenchSample
+    | PyramidSample
+    | HeightMapSample
+    | MeshSample
+    | SeveralSamples,
     Field(discriminator="kind"),
 ]
 """Any sample; `kind` tells which."""
@@ -171,23 +233,30 @@ def check_body(body: Body) -> dict[str, Any]:
     }
 
 
-def _load_mesh(path: Path, max_mb: float) -> tuple[np.ndarray, np.ndarray]:
-    """Read vertices and faces in file units; equal vertices are merged, a closed mesh must not be inside out."""
+def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Read a mesh in file units; equal vertices are merged, a closed mesh must not be inside out.
+
+    Returns:
+        Vertices [n, 3], faces [m, 3], and of each face 1 + the number of its name in `names`, 0: none of them [m].
+
+    Raises:
+        InputFileError: the file is unreadable or holds no sensible mesh, or has no part of one of the names.
+    """
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("stl", "obj", "ply", "glb"):
         raise InputFileError(f"{path}: a mesh must be .stl, .obj, .ply or .glb, got {path.suffix or 'no suffix'!r}")
     data = read_bytes(path, max_mb)
-    import io
-
     import trimesh
 
-    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     try:
-        mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options).to_mesh()
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        pieces = [piece for text, label in _split(data, kind, names) for piece in _pieces(text, kind, label)]
     except Exception as e:  # trimesh's readers raise anything on corrupt files
         raise InputFileError(f"{path}: cannot be read as a {kind.upper()} mesh ({type(e).__name__}: {e})") from e
-    if faces.ndim != 2 or not len(faces):
+    first = np.cumsum([0, *(len(vertices) for vertices, _, _ in pieces)])
+    vertices = np.concatenate([np.zeros((0, 3)), *(v for v, _, _ in pieces)])
+    faces = np.concatenate([np.zeros((0, 3), np.int64), *(f + n for (_, f, _), n in zip(pieces, first, strict=False))])
+    parts = np.repeat([names.index(p) + 1 if p in names else 0 for _, _, p in pieces], [len(f) for _, f, _ in pieces])
+    if not len(faces):
         raise InputFileError(f"{path}: the mesh has no triangles: export a surface, not points or lines")
     if len(faces) > MAX_FACES:
         raise InputFileError(f"{path}: the mesh has {len(faces)} triangles, the limit is {MAX_FACES}: decimate it")
@@ -195,16 +264,57 @@ def _load_mesh(path: Path, max_mb: float) -> tuple[np.ndarray, np.ndarray]:
         raise InputFileError(f"{path}: faces point to vertices that do not exist: the file is corrupt")
     if not np.all(np.isfinite(vertices[faces])):
         raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
+    if missing := [name for i, name in enumerate(names) if not np.any(parts == i + 1)]:
+        raise InputFileError(f"{path}: has no part {missing[0]!r}, to which sample.materials gives a material")
     clean = trimesh.Trimesh(vertices, faces, process=False)
     clean.merge_vertices(merge_tex=True, merge_norm=True)
-    clean.update_faces(clean.nondegenerate_faces(height=0.0))
+    has_area = clean.nondegenerate_faces(height=0.0)
+    clean.update_faces(has_area)
     if not len(clean.faces):
         raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit absurd")
     if clean.is_watertight and clean.volume < 0:
         raise InputFileError(
             f"{path}: the mesh is inside out (volume < 0): flip its normals in the program that made it"
         )
-    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64)
+    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
+
+
+def _split(data: bytes, kind: str, names: tuple[str, ...]) -> list[tuple[bytes, str]]:
+    """Return the text of an OBJ file once for each of its named parts, with that part's faces only; else all."""
+    if kind != "obj" or not names:
+        return [(data, "")]
+    rest: list[bytes] = []
+    faces: dict[str, list[bytes]] = {}
+    current: dict[bytes, str] = {}
+    for line in data.replace(b"\\\n", b" ").splitlines():
+        word, _, value = line.strip().partition(b" ")
+        if word in (b"usemtl", b"g", b"o"):
+            current[word] = value.strip().decode("utf-8", "replace")
+        elif word == b"f":
+            own = [current[w] for w in (b"usemtl", b"g", b"o") if current.get(w) in names]
+            faces.setdefault(own[0] if own else "", []).append(line)
+        elif word in (b"v", b"vn", b"vt"):
+            rest.append(line)
+    return [(b"\n".join(rest + lines), name) for name, lines in faces.items()]
+
+
+def _pieces(data: bytes, kind: str, label: str) -> list[tuple[np.ndarray, np.ndarray, str]]:
+    """Return vertices, faces and name of every geometry of a file, placed in its scene; `label` overrides the names."""
+    import io
+
+    import trimesh
+
+    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
+    loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
+    out = []
+    for node in loaded.graph.nodes_geometry:
+        matrix, name = loaded.graph[node]
+        mesh = loaded.geometry[name].copy()
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        mesh.apply_transform(matrix)
+        out.append((np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), label or str(name)))
+    return out
 
 
 def _rotation(angles_deg: tuple[float, float, float]) -> np.ndarray:

@@ -12,13 +12,14 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Aperture, Instrument
-from helio_jax.scene.sample import HeightMapSample, MeshSample, Sample
+from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.sample import HeightMapSample, MeshSample, Sample, SeveralSamples
 from helio_jax.scene.scan import Raster
-from helio_jax.scene.surfaces import Body
+from helio_jax.scene.scattering import Law, Term
 
 
 class Scene(Instrument):
-    """An instrument with a sample and a raster: `[beam] [plate] [[detector]] [sample] [scan]`."""
+    """An instrument with a sample and a raster: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
 
     name: str = Field(default="scene", min_length=1, max_length=200)
     """Short name, shown in figures and files."""
@@ -28,6 +29,8 @@ class Scene(Instrument):
     """What is imaged."""
     scan: Raster
     """Which beam positions."""
+    material: dict[str, Law] = Field(default={}, max_length=1000)
+    """Scattering laws by the names that the sample uses for its materials."""
     _base_dir: Path = PrivateAttr(default_factory=Path)
 
     @model_validator(mode="after")
@@ -39,6 +42,12 @@ class Scene(Instrument):
     def _problems(self) -> list[str]:
         """Return what does not fit together, each as "key: what is wrong: what to do"."""
         problems = []
+        for name in dict.fromkeys(self.sample.material_names):
+            if name != COSINE and name not in self.material:
+                known = ", ".join(map(repr, (COSINE, *self.material)))
+                problems.append(
+                    f"sample: its material {name!r} is unknown, known are {known}: add the table [material.{name}]"
+                )
         top = self.sample.top
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
@@ -70,7 +79,7 @@ class Scene(Instrument):
     @property
     def flat_size(self) -> float:
         """Side of the flat around the sample's structure; infinity where only a file tells [um]."""
-        if isinstance(self.sample, (HeightMapSample, MeshSample)):
+        if isinstance(self.sample, (HeightMapSample, MeshSample, SeveralSamples)):
             return math.inf
         return self.sample.size_um
 
@@ -89,6 +98,15 @@ class Scene(Instrument):
         if body.max_height >= self.sample_distance:
             raise SceneError(f"sample: {_too_high(body.max_height, self.sample_distance)}")
         return body
+
+    def read_laws(self) -> dict[str, tuple[Term, ...]]:
+        """Return the scattering laws of the materials that the sample uses, and read their files.
+
+        Raises:
+            InputFileError: the table of a law is missing or wrong.
+        """
+        names = set(self.sample.material_names)
+        return {name: law.terms(self.base_dir) for name, law in self.material.items() if name in names}
 
     def warnings(self) -> list[str]:
         """Return what is allowed but probably not meant, for `helio validate`."""

@@ -12,15 +12,27 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from helio_jax.scene import surfaces
-from helio_jax.scene.surfaces import Body
+from helio_jax.scene.body import COSINE, Body
 from helio_jax.settings import Settings
 
 Length = Annotated[float, Field(gt=0.0, le=1e6)]
 """A length of a sample [um]."""
 
 
-class SampleModel(Settings):
-    """What all samples share: a flat of side `size_um` about the z axis, and a way to become a `Body`."""
+class PaintedSample(Settings):
+    """What all samples of one material share."""
+
+    material: str = Field(default=COSINE, min_length=1, max_length=200)
+    """Material of all surfaces without one of their own: a table `[material.NAME]`, or "cosine"."""
+
+    @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of all materials that the sample asks for."""
+        return (self.material,)
+
+
+class SampleModel(PaintedSample):
+    """What samples given by numbers share: a flat of side `size_um` about the z axis, and a way to become a `Body`."""
 
     size_um: Length = 8000.0
     """Side of the square flat around the structure [um]."""
@@ -42,7 +54,7 @@ class FlatSample(SampleModel):
 
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
-        return surfaces.flat_body(self.size_um)
+        return surfaces.flat_body(self.size_um).painted(self.material)
 
 
 class Moat(Settings):
@@ -65,6 +77,8 @@ class Sphere(Settings):
     """Position (x, y) of the axis [um]."""
     moat: Moat | None = None
     """Groove around the rim, or none."""
+    material: str | None = Field(default=None, min_length=1, max_length=200)
+    """Material of the sphere; default: the sample's."""
 
     @model_validator(mode="after")
     def _is_on_flat(self) -> "Sphere":
@@ -123,6 +137,11 @@ class SpheresSample(SampleModel):
         return np.array(rows, np.float64).reshape(-1, 4)
 
     @property
+    def material_names(self) -> tuple[str, ...]:
+        """Names of all materials that the sample asks for."""
+        return (self.material, *(s.material for s in self.spheres if s.material))
+
+    @property
     def sphere_array(self) -> np.ndarray:
         """x, y, z of the centres and radii [s, 4], um: for `surfaces.first_hit_spheres`."""
         return np.array([s.row for s in self.spheres])
@@ -134,7 +153,8 @@ class SpheresSample(SampleModel):
 
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
-        return surfaces.moated_body(self.size_um, self._moats(), self.sphere_array)
+        body = surfaces.moated_body(self.size_um, self._moats(), self.sphere_array)
+        return body.painted(self.material, [s.material or self.material for s in self.spheres])
 
 
 class StepSample(SampleModel):
@@ -168,7 +188,7 @@ class StepSample(SampleModel):
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         angles = map(math.radians, (self.facing_deg, self.slope_deg))
-        return surfaces.step_body(self.size_um, self.height_um, self.position_um, *angles)
+        return surfaces.step_body(self.size_um, self.height_um, self.position_um, *angles).painted(self.material)
 
 
 class TrenchSample(SampleModel):
@@ -194,7 +214,8 @@ class TrenchSample(SampleModel):
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         slot = (self.width_um, self.length_um, self.depth_um)
-        return surfaces.trench_body(self.size_um, *slot, math.radians(self.azimuth_deg), self.center_um)
+        body = surfaces.trench_body(self.size_um, *slot, math.radians(self.azimuth_deg), self.center_um)
+        return body.painted(self.material)
 
 
 class PyramidSample(SampleModel):
@@ -227,7 +248,8 @@ class PyramidSample(SampleModel):
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         shape = (self.base_um, self.height_um, self.top_um)
-        return surfaces.pyramid_body(self.size_um, *shape, math.radians(self.azimuth_deg), self.center_um)
+        body = surfaces.pyramid_body(self.size_um, *shape, math.radians(self.azimuth_deg), self.center_um)
+        return body.painted(self.material)
 
 
 def _check_on_flat(

@@ -1,4 +1,4 @@
-"""Surfaces of samples as triangles and exact spheres, and closed-form first hits of the beam. Pure NumPy.
+"""Build the surfaces of samples as triangles and exact spheres, and closed-form first hits of the beam. Pure NumPy.
 
 Flow: `scene.sample` calls the builders, the tracer intersects the `Body` they return. Sample frame: z up, z = 0 on
 the reference plane, micrometres. Faces run counter-clockwise seen from the vacuum, so normals point out of the
@@ -6,12 +6,11 @@ solid (up on a flat). A sample is an open sheet: neighbouring faces share their 
 between them, and only the outer border of the flat is open.
 """
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
-from helio_jax.arrays import WALL_PITCHES, as_float_array
+from helio_jax.arrays import WALL_PITCHES
 from helio_jax.errors import SceneError
+from helio_jax.scene.body import Body
 
 WALL_SEGMENTS = 1440
 """Segments of a moat's outer wall: the polygon lies at most 2.4e-6 of its radius inside the circle."""
@@ -21,66 +20,6 @@ _LEE_PIXELS = 2.0
 """The lee of a rim is where the heights, averaged with this Gaussian width [pixels], fall down the beam ..."""
 _LEE_COSINE = 0.25
 """... at an angle to its azimuth whose cosine is at least this: a wall along the beam hides nothing."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """Triangles and exact spheres of a sample, sample frame (frozen, checked when made).
-
-    Attributes:
-        vertices: positions [n, 3], um.
-        faces: vertex indices [m, 3], counter-clockwise seen from the vacuum.
-        spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically, beside the triangles.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    spheres: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
-
-    def __post_init__(self) -> None:
-        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
-        put("vertices", as_float_array("vertices", self.vertices, (None, 3), SceneError))
-        put("spheres", as_float_array("spheres", self.spheres, (None, 4), SceneError))
-        faces = np.asarray(self.faces)
-        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-            raise SceneError(f"faces must be integers of the shape any x 3, got {faces.dtype} {faces.shape}")
-        if faces.size and (faces.min() < 0 or faces.max() >= len(self.vertices)):
-            raise SceneError(
-                f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}: correct them"
-            )
-        put("faces", faces.astype(np.int64))
-        for name in ("vertices", "spheres"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise SceneError(f"{name} must be finite, got NaN or infinity: check the sample's file and settings")
-        if np.any(self.spheres[:, 3] <= 0):
-            raise SceneError(f"sphere radius must be > 0 um, got {self.spheres[:, 3].min():g}")
-
-    @property
-    def triangles(self) -> np.ndarray:
-        """Corner positions of every face [m, 3, 3], um."""
-        return self.vertices[self.faces]
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Unit normal of every face, out of the solid [m, 3]; zero for a face without area."""
-        t = self.triangles
-        n = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
-        length = np.linalg.norm(n, axis=1, keepdims=True)
-        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Lowest and highest x, y, z of triangles and spheres [2, 3], um."""
-        low = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] - self.spheres[:, 3:]])
-        high = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] + self.spheres[:, 3:]])
-        if not len(low):
-            raise SceneError("the sample is empty: it has neither faces nor spheres")
-        return np.stack([low.min(0), high.max(0)])
-
-    @property
-    def max_height(self) -> float:
-        """Height of the highest point above the reference plane [um]."""
-        return float(self.bounds[1, 2])
 
 
 def flat_body(size: float, height: float = 0.0) -> Body:

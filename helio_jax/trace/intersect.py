@@ -173,6 +173,8 @@ class Intersector:
         self.triangles = np.ascontiguousarray(self.triangles[is_flat])
         self.normals = cross[is_flat] / length[is_flat, None]
         self.n_degenerate = int(np.sum(~is_flat))
+        self.materials, self._sphere_material = body.materials, body.sphere_material
+        self._face_material = body.face_material[is_flat]
         self._set_scale()
         self._embree = self._build_embree() if engine in (None, "embree") and self.triangles.size else None
         if engine == "embree" and self._embree is None and self.triangles.size:
@@ -182,6 +184,14 @@ class Intersector:
     def has_embree(self) -> bool:
         """Whether the triangles are traced by Embree."""
         return self._embree is not None
+
+    def material_of(self, surface: np.ndarray) -> np.ndarray:
+        """Return which of `materials` each hit surface has (`Hits.surface`, no misses) [n]."""
+        out = np.empty(surface.shape, np.int64)
+        is_face = surface >= 0
+        out[is_face] = self._face_material[surface[is_face]]
+        out[~is_face] = self._sphere_material[-2 - surface[~is_face]]
+        return out
 
     def _set_scale(self) -> None:
         low, high = [], []

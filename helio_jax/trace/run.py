@@ -5,18 +5,20 @@ result is bitwise the same for any number of worker threads.
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from helio_jax.errors import GuardError
+from helio_jax.errors import GuardError, SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
+from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.scene import Scene
-from helio_jax.scene.surfaces import Body
 from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.intersect import MISS, Hits, Intersector
+from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_law_table
 from helio_jax.trace.masks import axis_rays, hidden_form_factor, is_shadowed
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import Sampling
@@ -34,20 +36,49 @@ Progress = Callable[[int, int], None]
 """Called with (blocks done, blocks in all)."""
 
 
-def make_experiment(body: Body | Intersector, instrument: Instrument, settings: TraceSettings) -> Experiment:
-    """Prepare the shared state of a run. The expected estimator rounds the rays up to a multiple of 8."""
+def make_experiment(
+    body: Body | Intersector,
+    instrument: Instrument,
+    settings: TraceSettings,
+    laws: Mapping[str, tuple[Term, ...]] | None = None,
+) -> Experiment:
+    """Prepare the shared state of a run. The expected estimator rounds the rays up to a multiple of 8.
+
+    Args:
+        body: the sample.
+        instrument: beam, plate and detectors.
+        settings: rays, estimator, seed.
+        laws: scattering law of each of the body's materials; "cosine" need not be given.
+
+    Raises:
+        SceneError: a material has no law, or a lattice stands upright on a face.
+    """
     is_expected = settings.estimator == "expected"
     n_replicates = N_REPLICATES if is_expected else 0
     n_rays = -(-settings.rays // N_REPLICATES) * N_REPLICATES if is_expected else settings.rays
+    intersector = body if isinstance(body, Intersector) else Intersector(body)
     return Experiment(
-        intersector=body if isinstance(body, Intersector) else Intersector(body),
+        intersector=intersector,
         instrument=instrument,
         apertures=ApertureTable(instrument),
         sampling=Sampling.make(n_rays, settings.branches if is_expected else 1, n_replicates, settings.seed),
         n_orders=settings.n_orders,
         max_events=settings.max_events,
         is_expected=is_expected,
+        laws=_law_table(intersector, {COSINE: COSINE_LAW} | dict(laws or {})),
     )
+
+
+def _law_table(intersector: Intersector, laws: Mapping[str, tuple[Term, ...]]) -> LawTable | None:
+    """Return the laws in the order of the body's materials; None where all are the cosine law."""
+    names = intersector.materials
+    if missing := [name for name in names if name not in laws]:
+        raise SceneError(f"material {missing[0]!r} has no law: add the table [material.{missing[0]}] to the scene")
+    found = [laws[name] for name in names]
+    if all(map(is_cosine, found)):
+        return None
+    check_lattices(found, names, intersector.normals, intersector.material_of(np.arange(len(intersector.normals))))
+    return make_law_table(found)
 
 
 def _ordered(pool: ThreadPoolExecutor, jobs: Iterator[Callable[[], Tally]], n_ahead: int) -> Iterator[Tally]:
@@ -155,7 +186,8 @@ def trace_scene(
         GuardError: ray book-keeping failed.
     """
     instrument = scene.instrument
-    experiment = make_experiment(scene.build_body() if body is None else body, instrument, settings)
+    body = scene.build_body() if body is None else body
+    experiment = make_experiment(body, instrument, settings, scene.read_laws())
     x, y = scene.scan.positions(instrument.beam)
     grid_x, grid_y = (g.ravel() for g in np.meshgrid(x, y))
     tally = trace_pixels(experiment, grid_x, grid_y, settings.workers, progress)

@@ -6,7 +6,9 @@ import numpy as np
 
 DETECTED, ESCAPED, STOPPED, LOST = range(4)
 FATES = ("detected", "escaped", "stopped", "lost")
-"""Launched = detected + escaped + stopped + lost, per pixel, in exact integers (DESIGN.md section 2)."""
+"""Launched = detected + escaped + stopped + lost, per pixel, in exact integers (DESIGN.md section 2).
+
+Stopped: ended by the cap on events, or stuck to a surface whose albedo is below 1."""
 
 
 @dataclass(frozen=True)

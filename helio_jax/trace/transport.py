@@ -1,10 +1,12 @@
 """Follow the atoms of a block of pixels from the pinhole to a detector or out of the scene.
 
 All rays of a block fly in step: flight e starts after e scatterings, so the scattering order is the same for
-the whole batch. Every path is walked as nature does it (cosine re-emission, no absorption) and tallied in exact
-integers; the `expected` estimator adds, at every scattering, the probability of going straight to each
-detector (next-event estimation): the closed-form form factor minus the hidden part, which one shadow ray to a
-random point of the aperture estimates. That sum has no variance where nothing hides the aperture.
+the whole batch. Every path is walked as nature does it (re-emission by the law of the surface hit) and tallied in
+exact integers; the `expected` estimator adds, at every scattering, the probability of going straight to each
+detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus the hidden part,
+which one shadow ray to a random point of the aperture estimates; it has no variance where nothing hides the
+aperture. Lobes are estimated by the same shadow ray and by the atoms that hit, weighted by the balance heuristic
+(Veach and Guibas, SIGGRAPH 1995); exact directions (mirrors) by the atoms that hit alone.
 """
 
 from dataclasses import dataclass
@@ -14,14 +16,17 @@ from numba import njit
 
 from helio_jax.instrument import Instrument
 from helio_jax.trace.direct import ApertureTable, aperture_point, find_aperture, form_factor
-from helio_jax.trace.intersect import Hits, Intersector
+from helio_jax.trace.intersect import MISS, Hits, Intersector
+from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
+from helio_jax.trace.lawtable import LawTable
+from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED, Tally
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a block of work needs, shared read-only between threads."""
+    """Everything a block of work needs, shared read-only between threads; no `laws`: cosine everywhere."""
 
     intersector: Intersector
     instrument: Instrument
@@ -30,13 +35,15 @@ class Experiment:
     n_orders: int
     max_events: int
     is_expected: bool
+    laws: LawTable | None = None
 
 
 @dataclass
 class _Paths:
     """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
 
-    `target` holds the two random numbers of the next aperture point [n, 2].
+    `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
+    direction (laws.scatter_atoms) [n].
     """
 
     origin: np.ndarray
@@ -45,10 +52,11 @@ class _Paths:
     path: np.ndarray
     target: np.ndarray
     skip: np.ndarray
+    density: np.ndarray
 
     def take(self, keep: np.ndarray) -> "_Paths":
         """Return some of the rays."""
-        columns = (self.origin, self.direction, self.pixel, self.path, self.target, self.skip)
+        columns = (self.origin, self.direction, self.pixel, self.path, self.target, self.skip, self.density)
         return _Paths(*(column[keep] for column in columns))
 
 
@@ -124,10 +132,12 @@ def _aim(k, point, normal, pixel, offset, plate_z, target, center, semi_axes, co
 
 @njit(cache=True, nogil=True)
 def _score(
-    k, share, point, normal, pixel, replicate, offset, plate_z, weight, is_open, semi_axes, rims, sums
+    k, share, cosine, point, normal, pixel, replicate, offset, plate_z, weight, is_open, semi_axes, rims, sums
 ):  # fmt: skip
-    """Add P = n . Phi - (hidden part) of every vertex to its pixel and replicate."""
+    """Add P = n . Phi - (hidden part), times the share of cosine atoms, of every vertex to its pixel and replicate."""
     for i in range(point.shape[0]):
+        if cosine[i] == 0.0:
+            continue
         p = pixel[i]
         fx, fy, fz = form_factor(
             point[i, 0] - offset[p, 0], point[i, 1] - offset[p, 1], plate_z - point[i, 2], k, semi_axes, rims
@@ -135,46 +145,96 @@ def _score(
         value = normal[i, 0] * fx + normal[i, 1] * fy + normal[i, 2] * fz
         if not is_open[i]:
             value -= weight[i]
-        sums[replicate[i], k, p] += share * value
+        sums[replicate[i], k, p] += share * cosine[i] * value
+
+
+@njit(cache=True, nogil=True)
+def _balance(density, n_hits, square, cosine, area):
+    """Return density / (density of aiming + n density of hitting): the balance heuristic of both estimates."""
+    return 1.0 / n_hits if density == np.inf else density / (square / (area * cosine) + n_hits * density)
+
+
+@njit(cache=True, nogil=True)
+def _score_lobes(
+    k, share, n_hits, table, material, incoming, point, normal, pixel, replicate, direction, is_open, plate_z, area,
+    sums,
+):  # fmt: skip
+    """Add what the lobes of every vertex send to the aperture point it aims at."""
+    for i in range(point.shape[0]):
+        if is_open[i]:
+            density = lobe_density(table, material[i], incoming[i], normal[i], direction[i])
+            r = (plate_z - point[i, 2]) / direction[i, 2]
+            value = _balance(density, n_hits, r * r, direction[i, 2], area[k]) if density > 0.0 else 0.0
+            sums[replicate[i], k, pixel[i]] += share * value
+
+
+@njit(cache=True, nogil=True)
+def _score_hits(
+    share, n_hits, density, origin, direction, pixel, replicate, surface, offset, plate_z, center, semi_axes, cos_sin,
+    area, sums,
+):  # fmt: skip
+    """Add the lobes' atoms that hit an aperture."""
+    for i in range(origin.shape[0]):
+        if density[i] > 0.0 and surface[i] == MISS and direction[i, 2] > 0.0:
+            r, p = (plate_z - origin[i, 2]) / direction[i, 2], pixel[i]
+            x, y = origin[i, 0] + r * direction[i, 0] - offset[p, 0], origin[i, 1] + r * direction[i, 1] - offset[p, 1]
+            k = find_aperture(x, y, center, semi_axes, cos_sin)
+            if k >= 0:
+                value = _balance(density[i], n_hits, r * r, direction[i, 2], area[k])
+                sums[replicate[i], k, p] += share * n_hits * value
 
 
 @njit(cache=True, nogil=True)
 def _bounce(normal, u):
-    """Draw cosine-distributed directions about the normals [n, 3] (Malley's method)."""
+    """Draw cosine-distributed directions about the normals [n, 3]."""
     out = np.empty(normal.shape)
     for i in range(normal.shape[0]):
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        # Duff et al., J. Comput. Graph. Tech. 6 (2017) 1: a frame about any unit vector
-        sign = 1.0 if nz >= 0.0 else -1.0
-        a = -1.0 / (sign + nz)
-        b = nx * ny * a
-        r, angle = np.sqrt(u[i, 0]), 2.0 * np.pi * u[i, 1]
-        s, t, c = r * np.cos(angle), r * np.sin(angle), np.sqrt(1.0 - u[i, 0])
-        x = s * (1.0 + sign * nx * nx * a) + t * b + c * nx
-        y = s * sign * b + t * (sign + ny * ny * a) + c * ny
-        z = -s * sign * nx - t * ny + c * nz
-        length = np.sqrt(x * x + y * y + z * z)
-        out[i, 0], out[i, 1], out[i, 2] = x / length, y / length, z / length
+        x, y, z = cosine_direction(normal[i, 0], normal[i, 1], normal[i, 2], u[i, 0], u[i, 1])
+        out[i, 0], out[i, 1], out[i, 2] = x, y, z
     return out
 
 
-def _add_next_event(e: Experiment, event, sums, point, normal, surface, paths: _Paths, offset) -> None:
+def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
+    """Return the replicate of each path, with one or several paths per beam ray."""
+    return path // (s.n_rays * n_branches // s.n_replicates)
+
+
+def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, offset) -> None:
     """Add the expected contribution of every vertex to every detector (the next-event estimate)."""
-    table, plate_z, sampling = e.apertures, e.instrument.sample_distance, e.sampling
-    n_branches = 1 if event == 0 else sampling.n_branches
-    replicate = paths.path // (sampling.n_rays * n_branches // sampling.n_replicates)
+    table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
+    point, normal, pixel = hits.point, hits.normal, paths.pixel
+    replicate = _replicate(e.sampling, paths.path, n_branches)
     shape = (table.center, table.semi_axes, table.cos_sin)
-    origin, skip = lift_off(point, normal, surface, e.intersector.restart)
+    origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
+    cosine = np.ones(len(point))
+    if e.laws is not None:
+        material = e.intersector.material_of(hits.surface)
+        key = (ids[pixel], paths.path, event, e.sampling.seed)
+        cosine = cosine_shares(e.laws, material, paths.direction, normal, *key)
     for k in range(len(table.center)):
-        direction, weight, is_open = _aim(
-            k, point, normal, paths.pixel, offset, plate_z, paths.target, *shape, table.area
-        )
+        direction, weight, is_open = _aim(k, point, normal, pixel, offset, plate_z, paths.target, *shape, table.area)
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
-            k, 1.0 / n_branches, point, normal, paths.pixel, replicate, offset, plate_z, weight, is_open,
+            k, 1.0 / n_branches, cosine, point, normal, pixel, replicate, offset, plate_z, weight, is_open,
             table.semi_axes, table.rims, sums,
         )  # fmt: skip
+        if e.laws is not None:
+            n_hits = e.sampling.n_branches if event == 0 else 1
+            _score_lobes(
+                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, pixel, replicate,
+                direction, is_open, plate_z, table.area, sums,
+            )  # fmt: skip
+
+
+def _add_hits(e: Experiment, event: int, sums, surface: np.ndarray, paths: _Paths, offset) -> None:
+    """Add the atoms of lobes that hit a detector after scattering `event` times."""
+    n_branches, table = e.sampling.n_branches, e.apertures
+    _score_hits(
+        1.0 / n_branches, n_branches if event == 1 else 1, paths.density, paths.origin, paths.direction, paths.pixel,
+        _replicate(e.sampling, paths.path, n_branches), surface, offset, e.instrument.sample_distance, table.center,
+        table.semi_axes, table.cos_sin, table.area, sums,
+    )  # fmt: skip
 
 
 def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> _Paths:
@@ -184,19 +244,32 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     origin, direction = launch_rays(e.instrument, x, y, numbers)
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
-    return _Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(flying.size, -1, np.int32))
+    return _Paths(
+        origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(flying.size, -1, np.int32), np.zeros(flying.size)
+    )
 
 
-def _scatter(e: Experiment, event: int, ids: np.ndarray, point, normal, surface, pixel, path) -> _Paths:
-    """Return the rays that leave the scattering points, several from each after the beam's first hit."""
+def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, stopped: np.ndarray) -> _Paths:
+    """Return the rays that leave the scattering points, several from each after the beam's first hit.
+
+    Atoms that stick are added to `stopped` [pixels].
+    """
     s = e.sampling
     if event == 0 and s.n_branches > 1:
-        point, normal, surface, pixel = (np.repeat(a, s.n_branches, 0) for a in (point, normal, surface, pixel))
-        path = (path[:, None] * s.n_branches + np.arange(s.n_branches)).ravel()
+        index = np.repeat(np.arange(len(paths.path)), s.n_branches)
+        hits, paths = hits.take(index), paths.take(index)
+        paths.path = paths.path * s.n_branches + np.tile(np.arange(s.n_branches), index.size // s.n_branches)
+    path, pixel = paths.path, paths.pixel
     per_replicate = s.n_rays * s.n_branches // s.n_replicates if s.n_replicates else 1
     u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
-    origin, skip = lift_off(point, normal, surface, e.intersector.restart)
-    return _Paths(origin, _bounce(normal, u), pixel, path, u[:, 2:].copy(), skip)
+    origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
+    if e.laws is None:
+        return _Paths(origin, _bounce(hits.normal, u), pixel, path, u[:, 2:].copy(), skip, np.zeros(len(path)))
+    material, key = e.intersector.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
+    direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
+    stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
+    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density)
+    return out if leaves.all() else out.take(leaves)
 
 
 def trace_block(
@@ -227,12 +300,12 @@ def trace_block(
             hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin,
             tally.fates, tally.hits,
         )  # fmt: skip
+        if e.is_expected and e.laws is not None and event > 0:
+            _add_hits(e, event, tally.sums[min(event, e.n_orders) - 1], hits.surface, paths, offset)
         if not keep.size:
             break
-        point, normal, surface = hits.point[keep], hits.normal[keep], hits.surface[keep]
-        paths = paths.take(keep)
+        hits, paths = hits.take(keep), paths.take(keep)
         if e.is_expected:
-            sums = tally.sums[min(event, e.n_orders - 1)]
-            _add_next_event(e, event, sums, point, normal, surface, paths, offset)
-        paths = _scatter(e, event, ids, point, normal, surface, paths.pixel, paths.path)
+            _add_next_event(e, event, ids, tally.sums[min(event, e.n_orders - 1)], hits, paths, offset)
+        paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
     return tally

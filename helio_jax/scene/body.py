@@ -1,0 +1,114 @@
+"""What every sample becomes: triangles and exact spheres, each with the name of its material.
+
+Sample frame: z up, z = 0 on the reference plane, micrometres. The scene says which law a material's name stands for
+(scattering.py); a body only knows which name is where. Builders are in surfaces.py.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from helio_jax.arrays import as_float_array
+from helio_jax.errors import SceneError
+
+COSINE = "cosine"
+"""Name of the material that every surface has where a scene says nothing else: re-emission by the cosine law."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Triangles and exact spheres of a sample, sample frame (frozen, checked when made).
+
+    Attributes:
+        vertices: positions [n, 3], um.
+        faces: vertex indices [m, 3], counter-clockwise seen from the vacuum.
+        spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically, beside the triangles.
+        materials: names of the materials.
+        face_material: which of `materials` each face has [m]; default: the first.
+        sphere_material: which each sphere has [s]; default: the first.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    spheres: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    materials: tuple[str, ...] = (COSINE,)
+    face_material: np.ndarray = field(default=None)  # type: ignore[assignment]
+    sphere_material: np.ndarray = field(default=None)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
+        put("vertices", as_float_array("vertices", self.vertices, (None, 3), SceneError))
+        put("spheres", as_float_array("spheres", self.spheres, (None, 4), SceneError))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise SceneError(f"faces must be integers of the shape any x 3, got {faces.dtype} {faces.shape}")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(self.vertices)):
+            raise SceneError(
+                f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}: correct them"
+            )
+        put("faces", faces.astype(np.int64))
+        for name in ("vertices", "spheres"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise SceneError(f"{name} must be finite, got NaN or infinity: check the sample's file and settings")
+        if np.any(self.spheres[:, 3] <= 0):
+            raise SceneError(f"sphere radius must be > 0 um, got {self.spheres[:, 3].min():g}")
+        for name, n in (("face_material", len(self.faces)), ("sphere_material", len(self.spheres))):
+            given = getattr(self, name)
+            index = np.zeros(n, np.int64) if given is None else np.asarray(given, np.int64)
+            if index.shape != (n,) or (n and not 0 <= index.min() <= index.max() < len(self.materials)):
+                raise SceneError(f"{name} must be {n} numbers of the {len(self.materials)} materials, got {index!r}")
+            put(name, index)
+
+    def painted(self, face: str, sphere: Sequence[str] = ()) -> "Body":
+        """Return the body with one material on all faces, and one for each sphere (default: the faces')."""
+        names = tuple(dict.fromkeys((face, *sphere)))
+        index = np.array([names.index(name) for name in sphere], np.int64) if sphere else None
+        return replace(self, materials=names, face_material=None, sphere_material=index)
+
+    def moved(self, shift: tuple[float, float, float]) -> "Body":
+        """Return the body at another place [um]."""
+        spheres = self.spheres + np.array([*shift, 0.0])
+        return replace(self, vertices=self.vertices + np.asarray(shift), spheres=spheres)
+
+    @classmethod
+    def join(cls, bodies: Sequence["Body"]) -> "Body":
+        """Return one body of several."""
+        names = tuple(dict.fromkeys(name for body in bodies for name in body.materials))
+        maps = [np.array([names.index(name) for name in body.materials]) for body in bodies]
+        first = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+        return cls(
+            np.concatenate([body.vertices for body in bodies]),
+            np.concatenate([body.faces + start for body, start in zip(bodies, first[:-1], strict=True)]),
+            np.concatenate([body.spheres for body in bodies]),
+            names,
+            np.concatenate([m[body.face_material] for m, body in zip(maps, bodies, strict=True)]),
+            np.concatenate([m[body.sphere_material] for m, body in zip(maps, bodies, strict=True)]),
+        )
+
+    @property
+    def triangles(self) -> np.ndarray:
+        """Corner positions of every face [m, 3, 3], um."""
+        return self.vertices[self.faces]
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normal of every face, out of the solid [m, 3]; zero for a face without area."""
+        t = self.triangles
+        n = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+        length = np.linalg.norm(n, axis=1, keepdims=True)
+        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest x, y, z of triangles and spheres [2, 3], um."""
+        low = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] - self.spheres[:, 3:]])
+        high = np.concatenate([self.triangles.reshape(-1, 3), self.spheres[:, :3] + self.spheres[:, 3:]])
+        if not len(low):
+            raise SceneError("the sample is empty: it has neither faces nor spheres")
+        return np.stack([low.min(0), high.max(0)])
+
+    @property
+    def max_height(self) -> float:
+        """Height of the highest point above the reference plane [um]."""
+        return float(self.bounds[1, 2])
