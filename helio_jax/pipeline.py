@@ -37,7 +37,8 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres, flat_body
 from helio_jax.trace.intersect import MISS, Intersector
-from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
+from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
+from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
 
 SUBSTRATE_RATIO = 1.35
