@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 
-from helio_jax import pipeline  # noqa: E402
+from helio_jax import pipeline, provenance  # noqa: E402
 from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.evaluate.metrics import Truth, evaluate_height  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
@@ -217,9 +217,9 @@ def main() -> None:
         rows += measured_rows(args.shared)
     names = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba")
     about = {
-        "git": pipeline.git_commit(),
+        "git": provenance.git_commit(),
         "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
-        "versions": {name: pipeline.package_version(name) for name in names},
+        "versions": {name: provenance.package_version(name) for name in names},
         "seed": args.seed,
         "rows": rows,
     }

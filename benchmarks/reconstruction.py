@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.error_bars import coverage_row, efficiency_row  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
+from helio_jax import pipeline, provenance  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
@@ -46,9 +46,9 @@ class Record:
         self.path = path
         names = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba")
         self.about = {
-            "git": pipeline.git_commit(),
+            "git": provenance.git_commit(),
             "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
-            "versions": {name: pipeline.package_version(name) for name in names},
+            "versions": {name: provenance.package_version(name) for name in names},
             "seed": seed,
             "rows": json.loads(path.read_text())["rows"] if path.exists() else [],
         }

@@ -36,7 +36,7 @@ class Parts:
     @property
     def exist(self) -> bool:
         """Whether a run was begun and not finished."""
-        return self.folder.is_dir()
+        return (self.folder / "manifest.json").is_file()
 
     def begin(self, manifest: dict[str, Any]) -> None:
         """Make the folder and its manifest.

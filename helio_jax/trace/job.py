@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from llvmlite import binding as llvm
 
+import helio_jax
 from helio_jax.scene.scene import Scene
 from helio_jax.scene.surfaces import Body
 from helio_jax.trace.run import paths_of
@@ -61,7 +62,10 @@ class Job:
             "scene": scene.model_dump(mode="json", include=set(Scene.model_fields) - {"description"}),
             "trace": settings.model_dump(mode="json", exclude={"workers"}),
             "the sample's surface": _hash_body(body),
-            "program": {"helio_jax": _hash_program(), **{name: _version(name) for name in _LIBRARIES}},
+            "program": {
+                "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
+                **{name: _version(name) for name in _LIBRARIES},
+            },
         }
         return cls(scene.at(scene.base_dir.resolve()), settings, about)
 
@@ -137,7 +141,7 @@ def _hash_program() -> str:
     digest = hashlib.sha256()
     for path in sorted(path for pattern in _PROGRAM for path in root.glob(pattern)):
         digest.update(path.name.encode() + path.read_bytes().replace(b"\r\n", b"\n"))
-    return digest.hexdigest()[:32]
+    return digest.hexdigest()[:16]
 
 
 def _version(name: str) -> str:
