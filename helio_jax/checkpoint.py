@@ -94,25 +94,32 @@ class Keeper:
         except (KeyboardInterrupt, StoppedRun) as e:
             raise self._stopped(e, units) from None
         except GuardError:
-            if self.shard is None:
-                self.parts.remove()
+            self._remove_own()
             raise
+        finally:
+            if not any(self.parts.has(unit.number) for unit in units):
+                self._remove_own()
+
+    def _remove_own(self) -> None:
+        """Remove the folder of parts, unless other shards use it too."""
+        if self.shard is None:
+            self.parts.remove()
 
     def _begin(self, job: Job, n_units: int) -> None:
         """Make the folder of parts, or check that the one found belongs to this job."""
         parts = self.parts
         if self.restart:
             parts.remove()
-        if not parts.exist:
-            if n_units > 1 or self.shard:
-                parts.begin({"format": FORMAT, "command": self.command, "about": job.about, "n_units": n_units})
+        if not parts.exist and n_units == 1 and self.shard is None:
             return
-        found = parts.manifest()
-        if changes := differences(found.get("about"), job.about, ("then", "now")):
+        about = parts.manifest().get("about") if parts.exist else job.about
+        if changes := differences(about, job.about, ("then", "now")):
             raise ResumeError(
                 f"{parts.folder} holds an unfinished run of something else:\n  " + "\n  ".join(changes) + "\nput back "
                 "what was changed to go on, or give --restart to discard the run, or name another output"
             )
+        if not parts.exist or self.shard is None:  # the last command given is the one that is resumed
+            parts.begin({"format": FORMAT, "command": self.command, "about": job.about, "n_units": n_units})
 
     def _share(self, units: list[Unit]) -> list[Unit]:
         return units if self.shard is None else units[self.shard.number - 1 :: self.shard.of]
@@ -163,7 +170,6 @@ class Keeper:
         why = str(e) or ("stopped by SIGTERM" if kind is StoppedRun else "interrupted")
         n_kept = sum(self.parts.has(unit.number) for unit in units)
         if n_kept == 0 and self.shard is None:
-            self.parts.remove()
             return kind(f"{why}; no unit of work was finished yet, nothing is left behind")
         how = "the same command" if self.shard else f"`helio resume {self.parts.output}`"
         return kind(f"{why}; {n_kept} of {len(units)} units are kept in {self.parts.folder}: {how} goes on")

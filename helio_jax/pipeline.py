@@ -127,8 +127,7 @@ def simulate_file(
     if stack is None:
         return None
     stack = with_provenance(record(scene, stack) if o.noise else stack, scene, scene_path)
-    write(stack, output)
-    parts.remove()
+    parts.finish(lambda path: write(stack, path))
     return stack
 
 
@@ -148,6 +147,7 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     parts = Parts(output)
     if not parts.exist:
         if output.is_file():
+            parts.remove()  # what is left when a process is killed while it cleans up
             say(f"{output} is complete: nothing to resume")
             return []
         raise ResumeError(f"there is no unfinished run of {output}: {parts.folder} does not exist; start it anew")

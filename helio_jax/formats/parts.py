@@ -8,8 +8,10 @@ pickle, every failure names the file.
 import contextlib
 import io
 import json
+import os
 import shutil
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +44,9 @@ class Parts:
         """Make the folder and its manifest.
 
         Raises:
-            SceneError: the folder cannot be made.
+            SceneError: the folder, or the file itself when its time comes, cannot be written.
         """
+        safe.check_target(self.output)
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as e:
@@ -112,7 +115,33 @@ class Parts:
             return False
         return True
 
+    def finish(self, write: Callable[[Path], None]) -> None:
+        """Write the whole file, and remove the parts.
+
+        It is written within the folder and then moved, so that a killed process leaves nothing beside it.
+
+        Args:
+            write: writes it to the path it is given.
+
+        Raises:
+            SceneError: the file cannot be written.
+        """
+        if not self.exist:
+            write(self.output)
+            return
+        whole = self.folder / f"whole{self.output.suffix}"
+        write(whole)
+        try:
+            os.replace(whole, safe.check_target(self.output))
+        except OSError as e:
+            raise SceneError(f"cannot write {self.output}: {e.strerror}; check the folder and its rights") from None
+        self.remove()
+
     def remove(self) -> None:
-        """Remove the folder, with the parts and what a killed process left there."""
+        """Remove the folder, with the parts and what a killed process left there; the manifest first.
+
+        When this is killed half-way, what is left is no unfinished run.
+        """
         with contextlib.suppress(FileNotFoundError):
+            (self.folder / "manifest.json").unlink(missing_ok=True)
             shutil.rmtree(self.folder)

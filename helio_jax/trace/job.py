@@ -58,10 +58,11 @@ class Job:
     @classmethod
     def of(cls, scene: Scene, settings: TraceSettings, body: Body) -> "Job":
         """Describe the tracing of a scene whose surface is `body`."""
+        file = getattr(scene.sample, "file", None)
         about = {
             "scene": scene.model_dump(mode="json", include=set(Scene.model_fields) - {"description"}),
             "trace": settings.model_dump(mode="json", exclude={"workers"}),
-            "the sample's surface": _hash_body(body),
+            "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
             "program": {
                 "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
                 **{name: _version(name) for name in _LIBRARIES},
@@ -100,13 +101,13 @@ class Job:
 
 def differences(then: Any, now: Any, names: tuple[str, str], place: str = "") -> list[str]:
     """Say in which places two trees of JSON values differ; `names` are what to call the one and the other."""
+    if isinstance(then, (list, tuple)) and isinstance(now, (list, tuple)) and len(then) == len(now):
+        then, now = dict(enumerate(then)), dict(enumerate(now))
     if isinstance(then, dict) and isinstance(now, dict):
         keys = dict.fromkeys([*then, *now])
         inner = ((f"{place}.{key}".lstrip("."), key) for key in keys)
         return [line for at, key in inner for line in differences(then.get(key), now.get(key), names, at)]
-    # texts, because JSON knows no tuples
-    same = json.dumps(then, sort_keys=True) == json.dumps(now, sort_keys=True)
-    return [] if same else [f"{place}: {_short(then)} ({names[0]}), {_short(now)} ({names[1]})"]
+    return [] if then == now else [f"{place}: {_short(then)} ({names[0]}), {_short(now)} ({names[1]})"]
 
 
 def _short(value: Any) -> str:
@@ -131,7 +132,7 @@ def _hash_body(body: Body) -> str:
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
             value = np.round(value / step).astype(np.int64)
         digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    return digest.hexdigest()[:32]
+    return digest.hexdigest()[:16]
 
 
 @functools.cache

@@ -63,13 +63,17 @@ def make_experiment(body: Body | Intersector, instrument: Instrument, settings: 
 
 
 def in_order(workers: int, tasks: Iterable[Callable[[], T]]) -> Iterator[T]:
-    """Run tasks on threads and yield their results in order; at most two per thread are begun or wait to be fetched."""
+    """Run tasks on threads and yield their results in order.
+
+    At most two per thread are begun or wait to be fetched; a single thread begins none while a result is dealt with.
+    """
     waiting: list[Future[T]] = []
+    n_ahead = 2 * workers if workers > 1 else 1
     with ThreadPoolExecutor(workers) as pool:
         try:
             for task in tasks:
                 waiting.append(pool.submit(task))
-                if len(waiting) >= 2 * workers:
+                if len(waiting) >= n_ahead:
                     yield waiting.pop(0).result()
             while waiting:
                 yield waiting.pop(0).result()
