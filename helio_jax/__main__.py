@@ -139,13 +139,36 @@ def simulate(
 
 @app.command()
 def resume(
-    path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate or run.")],
+    path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study.")],
 ) -> None:
-    """Go on with a simulation or run that was interrupted or killed; nothing that was finished is done again."""
+    """Go on with what was interrupted or killed; no unit that was finished is traced again."""
     from helio_jax.pipeline import resume as resume_run
 
+    if (path / "study.json").is_file():
+        from helio_jax.study import resume_study
+
+        print(resume_study(path, say=_say))
+        return
     for file in resume_run(path, stage=_Bar, say=_say):
         print(file)
+
+
+@app.command()
+def study(
+    file: Annotated[Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the points and their index.")],
+    go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
+    workers: Workers = None,
+    processes: Processes = False,
+    shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, beginning with the i-th.")] = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
+    from helio_jax.pipeline import Crew, SimulateOptions
+    from helio_jax.study import run_study
+
+    options = SimulateOptions(crew=Crew(workers, processes, scheduler), shard=shard, say=_say)
+    print(run_study(file, output, resume=go_on, options=options))
 
 
 @app.command("import")

@@ -337,6 +337,7 @@ def run(
     stage: Stage = _silent,
     crew: Crew = DEFAULT_CREW,
     restart: bool = False,
+    report: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> RunResult:
     """Do the main job: simulate, reconstruct, score, report.
@@ -350,6 +351,7 @@ def run(
         stage: called with the name of each stage; a context manager that yields its progress callback.
         crew: who traces.
         restart: discard what an unfinished run left in the folder.
+        report: write the HTML report and the PNG panel, too.
         say: called with messages.
 
     Raises:
@@ -362,12 +364,8 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise SceneError(f"output folder {out} cannot be made: {e.strerror}; choose another with -o") from None
-    names = {
-        "micrographs": "micrographs.h5",
-        "height map": "height.h5",
-        "report": "report.html",
-        "scores": "scores.json",
-    }
+    names = {"micrographs": "micrographs.h5", "height map": "height.h5", "scores": "scores.json"}
+    names |= {"report": "report.html"} if report else {}
     files = {label: out / name for label, name in names.items()}
     with stage("simulating micrographs") as progress:
         options = SimulateOptions(True, crew, None, restart, progress, say)
@@ -381,8 +379,9 @@ def run(
         scores = evaluate(rec, truth)
         with atomic_path(files["scores"]) as part:
             part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")
-        title = f"{scene.name}: simulated, reconstructed, scored"
-        files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
+        if report:
+            title = f"{scene.name}: simulated, reconstructed, scored"
+            files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)
 
 

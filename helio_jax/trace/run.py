@@ -5,7 +5,7 @@ result is bitwise the same for any number of worker threads. Whole scans: `scan`
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -62,7 +62,7 @@ def make_experiment(body: Body | Intersector, instrument: Instrument, settings: 
     )
 
 
-def in_order(workers: int, tasks: Iterable[Callable[[], T]]) -> Iterator[T]:
+def in_order(workers: int, tasks: Iterable[Callable[[], T]]) -> Generator[T, None, None]:
     """Run tasks on threads and yield their results in order.
 
     At most two per thread are begun or wait to be fetched; a single thread begins none while a result is dealt with.

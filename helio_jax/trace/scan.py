@@ -8,7 +8,7 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -33,6 +33,8 @@ MAX_SENT = 1024
 """Units sent to a cluster at a time."""
 CONNECT_SECONDS = 10
 """How long a scheduler may take to answer [s]."""
+Results = Generator[tuple[Unit, Patch], None, None]
+"""Units with their patches, as they finish; close it to stop the work."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,7 @@ class Crew:
     processes: bool = False
     scheduler: str | None = None
 
-    def run(
-        self, job: Job, units: list[Unit], body: Body, progress: Progress | None = None
-    ) -> Iterator[tuple[Unit, Patch]]:
+    def run(self, job: Job, units: list[Unit], body: Body, progress: Progress | None = None) -> Results:
         """Yield every unit with its patch as it finishes.
 
         Raises:
@@ -69,7 +69,7 @@ class Crew:
         return _watched(results, job.n_pixels, sum(u.stop - u.start for u in units), progress)
 
 
-def _watched(results, n_pixels: int, n_todo: int, progress: Progress | None) -> Iterator[tuple[Unit, Patch]]:
+def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | None) -> Results:
     """Report every finished unit."""
     done = n_pixels - n_todo
     with closing(results):
@@ -80,9 +80,7 @@ def _watched(results, n_pixels: int, n_todo: int, progress: Progress | None) -> 
             yield unit, patch
 
 
-def _on_threads(
-    workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None
-) -> Iterator[tuple[Unit, Patch]]:
+def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None) -> Results:
     """Run the pieces of all units on threads, in order, so that all CPUs work on one or two units at a time."""
     experiment = make_experiment(body, job.scene.instrument, job.settings)
     done = job.n_pixels - sum(unit.stop - unit.start for unit in units)
@@ -97,7 +95,7 @@ def _on_threads(
             yield unit, join_pieces(experiment, pieces)
 
 
-def _on_processes(workers: int, job: Job, units: list[Unit]) -> Iterator[tuple[Unit, Patch]]:
+def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
     """Run units on spawned processes; those that die are replaced, and what they were at is done again."""
     left = {unit.number: unit for unit in units}
     n_deaths = 0
@@ -130,7 +128,7 @@ def _begin_worker() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(address: str, job: Job, units: list[Unit]) -> Iterator[tuple[Unit, Patch]]:
+def _on_cluster(address: str, job: Job, units: list[Unit]) -> Results:
     """Run units on the workers of a dask scheduler, which repeats what a lost worker was at."""
     try:
         from distributed import Client, KilledWorker
@@ -153,7 +151,7 @@ def _on_cluster(address: str, job: Job, units: list[Unit]) -> Iterator[tuple[Uni
             ) from None
 
 
-def _submit(executor: Executor, n_ahead: int, job: Job, units: list[Unit]) -> Iterator[tuple[Unit, Patch]]:
+def _submit(executor: Executor, n_ahead: int, job: Job, units: list[Unit]) -> Results:
     """Yield units with their patches as an executor finishes them; at most `n_ahead` are with it."""
     todo, waiting = iter(units), {}
     try:

@@ -52,15 +52,15 @@ class Tally:
         of one path are correlated, so those of the total are taken from the replicates' totals. Analog: hits / rays
         with the Poisson variance hits / rays^2.
         """
-        kept = {"fates": self.fates, "hits": self.hits, "n_rays": self.n_rays, "n_branches": self.n_branches}
+        kept = (self.fates, self.hits, self.n_rays, self.n_branches)
         n_replicates, n = self.sums.shape[1], self.n_launched
         if n_replicates == 0:
             total = self.hits.sum(0)
-            return Estimate(self.hits / n, self.hits / n**2, total / n, total / n**2, **kept)
+            return Estimate(self.hits / n, self.hits / n**2, total / n, total / n**2, *kept)
         means = self.sums * (n_replicates / self.n_rays)
         totals = self.sums.sum(0) * (n_replicates / self.n_rays)
         variance, total_variance = (m.var(-3, ddof=1) / n_replicates for m in (means, totals))
-        return Estimate(means.mean(1), variance, totals.mean(0), total_variance, **kept)
+        return Estimate(means.mean(1), variance, totals.mean(0), total_variance, *kept)
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class Estimate:
     def join(cls, parts: list["Estimate"]) -> "Estimate":
         """Put blocks of pixels side by side, in order."""
         names = ("mean", "variance", "total_mean", "total_variance", "fates", "hits")
-        joined = (np.concatenate([getattr(p, name) for p in parts], -1) for name in names)
-        return cls(*joined, parts[0].n_rays, parts[0].n_branches)
+        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
+        return cls(**joined, n_rays=parts[0].n_rays, n_branches=parts[0].n_branches)
 
     @property
     def n_launched(self) -> int:

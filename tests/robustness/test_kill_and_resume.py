@@ -13,7 +13,7 @@ from scale import N_UNITS, SCENE, SMALL, assert_same_bits, run_logged
 
 import helio_jax as hx
 from helio_jax import pipeline
-from helio_jax.errors import InputFileError, InterruptedRun, ResumeError, StoppedRun
+from helio_jax.errors import InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.formats.parts import Parts
 from helio_jax.trace.scan import Crew
 
@@ -290,3 +290,20 @@ def test_sigterm_keeps_what_is_finished(tmp_path):
         pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert caught.value.exit_code == 75 and n_kept(parts) == 3
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_wrong_shard_and_scheduler(tmp_path, monkeypatch):
+    """Shares that do not exist and schedulers that do not answer: code 2, the remedy, and nothing left behind."""
+    from helio_jax.trace import scan
+
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(scan, "CONNECT_SECONDS", 0.5)
+    cases = (
+        (pipeline.SimulateOptions(shard="3/2"), "i from 1 to N"),
+        (pipeline.SimulateOptions(crew=Crew(scheduler="tcp://127.0.0.1:9")), "dask scheduler"),
+        (pipeline.SimulateOptions(crew=Crew(scheduler="nonsense://x")), "dask scheduler"),
+    )
+    for options, words in cases:
+        with pytest.raises(SceneError, match=words) as caught:
+            pipeline.simulate_file(SCENE, tmp_path / "out.h5", overrides=SMALL, options=options)
+        assert caught.value.exit_code == 2 and list(tmp_path.iterdir()) == []
