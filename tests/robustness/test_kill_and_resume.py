@@ -307,3 +307,32 @@ def test_wrong_shard_and_scheduler(tmp_path, monkeypatch):
         with pytest.raises(SceneError, match=words) as caught:
             pipeline.simulate_file(SCENE, tmp_path / "out.h5", overrides=SMALL, options=options)
         assert caught.value.exit_code == 2 and list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_run_goes_on_in_its_folder(tmp_path):
+    """`helio run` interrupted while it traces: resume of the folder reconstructs and scores, with noise and settings.
+
+    Catches a resume that forgets what the command was, or its overrides.
+    """
+    folder = tmp_path / "run"
+    overrides = SMALL | {"trace.rays": 16, "trace.paths_per_unit": 16 * 8 * 30, "reconstruct.method": "nearfield"}
+
+    class Stage:
+        def __init__(self, label: str) -> None: ...
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+        def __call__(self, done: int, total: int, note: str = "") -> None:
+            if n_kept(Parts(folder / "micrographs.h5")) >= 5:
+                raise KeyboardInterrupt
+
+    with pytest.raises(InterruptedRun, match="helio resume"):
+        pipeline.run(SCENE, folder, overrides=overrides, stage=Stage, crew=Crew(1), report=False)
+    said: list[str] = []
+    pipeline.resume(folder, say=said.append)
+    assert said == [f"going on: 5 of {N_UNITS} units were finished"]
+    assert not Parts(folder / "micrographs.h5").exist and (folder / "scores.json").is_file()
+    stack, scene = hx.read(folder / "micrographs.h5"), hx.load_scene(SCENE, overrides)
+    assert np.array_equal(stack.counts, pipeline.record(scene, pipeline.simulate(scene)).counts)
+    assert hx.read(folder / "height.h5").method == "nearfield"

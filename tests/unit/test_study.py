@@ -79,6 +79,16 @@ def test_wrong_studies_are_refused_before_anything_runs(tmp_path, text, words):
     assert not (tmp_path / "out").exists()
 
 
+def test_documented_study_is_valid():
+    """Catches an example that the program refuses."""
+    path = SCENES.parent / "docs" / "study_cap_height.toml"
+    study = load_study(path)
+    points = study.points()
+    assert len(points) == 10
+    for values in points:
+        load_scene(path.parent / study.scene, study.set | values)
+
+
 @pytest.mark.parametrize("name", ["sphere_a", "step", "trench", "pyramid", "measured_sphere_a"])
 def test_scene_as_toml_is_read_back(tmp_path, name):
     """A point's scene file is the whole scene. Catches a value that is lost or changed on the way."""
