@@ -156,7 +156,7 @@ def main() -> None:
     }
     scene = load_scene(ROOT / "scenes" / "sphere_a.toml", small) if args.tiny else scene
     makers = {
-        "memory": lambda: memory_rows((20, 40), 60, 8) if args.tiny else memory_rows((250, 500, 1000), 807, 8),
+        "memory": lambda: memory_rows((24,), 60, 8) if args.tiny else memory_rows((250, 500, 1000), 807, 8),
         "speed": lambda: speed_rows(scene, 1 if args.tiny else 5),
         "cost": lambda: cost_rows(scene, 1 if args.tiny else 5),
     }

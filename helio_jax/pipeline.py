@@ -121,7 +121,7 @@ def simulate_file(
     parts = Parts(Path(output))
     shard = Shard.parse(o.shard) if o.shard else None
     command = {"verb": verb, "scene": str(Path(scene_path).resolve()), "overrides": overrides, "noise": o.noise}
-    command["crew"] = asdict(o.crew)
+    command |= {"crew": asdict(o.crew)}
     keeper = Keeper(parts, command, o.crew, shard, o.restart, o.say)
     stack = keeper.trace(scene, scene.trace, o.progress)
     if stack is None:
@@ -132,12 +132,7 @@ def simulate_file(
 
 
 def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], None] = print) -> list[Path]:
-    """Go on with an unfinished simulation or run; return the files written.
-
-    Args:
-        path: the file that is missing (OUT.h5), or the folder of `helio run`.
-        stage: as for `run`.
-        say: called with messages.
+    """Go on with an unfinished simulation (`path`: its file) or run (its folder); return the files written.
 
     Raises:
         ResumeError: there is nothing to go on with, or something changed since.

@@ -139,9 +139,9 @@ def test_stop_refuse_and_resume(small_scene, tmp_path):
     Catches a command line that swallows the signal or the exit code, and options that do not reach the tracer.
     """
     scene, out = tmp_path / "scene.toml", tmp_path / "s.h5"
-    scene.write_text(small_scene.read_text().replace("[trace]", "[trace]\npaths_per_unit = 150_000"))
+    scene.write_text(small_scene.read_text().replace("[trace]", "[trace]\npaths_per_unit = 75_000"))
     process = subprocess.Popen(
-        [sys.executable, "-m", "helio_jax", "simulate", str(scene), "-o", str(out), "--rays", "512", "--workers", "1"],
+        [sys.executable, "-m", "helio_jax", "simulate", str(scene), "-o", str(out), "--rays", "256", "--workers", "1"],
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -150,12 +150,11 @@ def test_stop_refuse_and_resume(small_scene, tmp_path):
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 75 and f"helio resume {out}" in said, said
-    refused = helio("simulate", scene, "-o", out, "--seed", "5", "--rays", "512")
+    refused = helio("simulate", scene, "-o", out, "--seed", "5", "--rays", "256")
     assert refused.returncode == 6 and "trace.seed: 1 (then), 5 (now)" in refused.stderr
     done = helio("resume", out)
     assert done.returncode == 0 and "units were finished" in done.stderr, done.stderr
     assert {p.name for p in tmp_path.iterdir()} == {"scene.toml", "s.h5"}
-    assert helio("resume", tmp_path / "other.h5").returncode == 6
 
 
 def test_imports_measured_files(shared, tmp_path):

@@ -116,6 +116,8 @@ def test_interrupted_run_goes_on(whole, half):
         assert_same_bits(hx.read(path), whole[0])
         assert not Parts(path).folder.exists()
     assert pipeline.resume(copy, say=said.append) == [] and "complete" in said[-1]
+    with pytest.raises(ResumeError, match=r"no unfinished run of .*other\.h5"):
+        pipeline.resume(copy.with_name("other.h5"))
 
 
 @pytest.mark.parametrize(
