@@ -108,6 +108,8 @@ class Keeper:
     def _begin(self, job: Job, n_units: int) -> None:
         """Make the folder of parts, or check that the one found belongs to this job."""
         parts = self.parts
+        if self.restart and self.shard:
+            raise SceneError(f"--restart would discard what other shards did: remove {parts.folder} before they start")
         if self.restart:
             parts.remove()
         if not parts.exist and n_units == 1 and self.shard is None:

@@ -103,7 +103,7 @@ def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
         n_before = len(left)
         pool = ProcessPoolExecutor(min(workers, n_before), get_context("spawn"), _begin_worker)
         try:
-            with pool, closing(_submit(pool, 2 * workers, job, list(left.values()))) as results:
+            with pool, closing(_submit(pool, workers + 1, job, list(left.values()))) as results:
                 for unit, patch in results:
                     del left[unit.number]
                     yield unit, patch

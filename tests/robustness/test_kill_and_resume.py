@@ -302,6 +302,7 @@ def test_wrong_shard_and_scheduler(tmp_path, monkeypatch):
     monkeypatch.setattr(scan, "CONNECT_SECONDS", 0.5)
     cases = (
         (pipeline.SimulateOptions(shard="3/2"), "i from 1 to N"),
+        (pipeline.SimulateOptions(shard="1/2", restart=True), "other shards"),
         (pipeline.SimulateOptions(crew=Crew(scheduler="tcp://127.0.0.1:9")), "dask scheduler"),
         (pipeline.SimulateOptions(crew=Crew(scheduler="nonsense://x")), "dask scheduler"),
     )
