@@ -11,7 +11,8 @@ import importlib.metadata
 import json
 import math
 import platform
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -127,12 +128,25 @@ def _hash_body(body: Body) -> str:
     """Return a hash of a surface that does not depend on the CPU which built it."""
     step = SURFACE_STEP * float(np.ptp(body.bounds, axis=0).max())
     digest = hashlib.sha256()
-    for f in fields(body):
-        value = getattr(body, f.name)
-        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            value = np.round(value / step).astype(np.int64)
-        digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    for piece in _pieces(body, step):
+        digest.update(piece)
     return digest.hexdigest()[:16]
+
+
+def _pieces(value: Any, step: float) -> Iterator[bytes]:
+    """Yield what identifies a tree of records, tables and arrays; floating-point arrays are rounded to `step`."""
+    if is_dataclass(value):
+        value = {f.name: getattr(value, f.name) for f in fields(value)}
+    if isinstance(value, Mapping):
+        value = tuple(value.items())
+    if isinstance(value, (tuple, list)):
+        for item in value:
+            yield from _pieces(item, step)
+    elif isinstance(value, np.ndarray):
+        rounded = np.round(value / step).astype(np.int64) if value.dtype.kind == "f" else value
+        yield repr(value.shape).encode() + rounded.tobytes()
+    else:
+        yield repr(value).encode()
 
 
 @functools.cache

@@ -22,10 +22,10 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.scene import Scene
 from helio_jax.scene.surfaces import Body
 from helio_jax.trace.job import Job, Unit
-from helio_jax.trace.run import Progress, check_rays, in_order, make_experiment, n_cpus, paths_of
+from helio_jax.trace.run import Progress, check_rays, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
-from helio_jax.trace.units import Patch, join_pieces, tasks, trace_unit
+from helio_jax.trace.units import Patch, experiment_of, join_pieces, tasks, trace_unit
 
 MAX_DEATHS = 3
 """Times that worker processes may die without any unit finished in between."""
@@ -82,7 +82,7 @@ def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | 
 
 def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None) -> Results:
     """Run the pieces of all units on threads, in order, so that all CPUs work on one or two units at a time."""
-    experiment = make_experiment(body, job.scene.instrument, job.settings)
+    experiment = experiment_of(job, body)
     done = job.n_pixels - sum(unit.stop - unit.start for unit in units)
     with closing(in_order(workers, (task for unit in units for task in tasks(experiment, job, unit)))) as results:
         for unit in units:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.errors import ResumeError
+from helio_jax.scene.surfaces import Body
 from helio_jax.trace.intersect import MISS
 from helio_jax.trace.job import Job, Unit, differences, instruction_set
 from helio_jax.trace.masks import hidden_form_factor, is_shadowed
@@ -74,6 +75,11 @@ class Patch:
         return cls(**{name: arrays[name] for name in shapes}, cpu=str(arrays["cpu"]))
 
 
+def experiment_of(job: Job, body: Body) -> Experiment:
+    """Prepare what all units of a job share in one process."""
+    return make_experiment(body, job.scene.instrument, job.settings)
+
+
 def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:
     """Return the independent pieces of a unit, for `join_pieces`: its blocks of rays, and its maps of cause."""
     size = pixels_per_block(experiment)
@@ -127,7 +133,7 @@ def _prepared(job: Job) -> Experiment:
             "the worker does not run what was sent: " + "; ".join(changes) + "; install the same version and put the "
             "same files everywhere"
         )
-    return make_experiment(body, job.scene.instrument, job.settings)
+    return experiment_of(job, body)
 
 
 def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
