@@ -189,7 +189,7 @@ def test_bad_files(tmp_path, content, expected):
 
 
 def test_override_of_one_element():
-    """An element of an array is replaced by its number; others stay. Catches a list that is replaced whole, or grows."""
+    """An array's element is replaced by its number; others stay. Catches a list that is replaced whole, or grows."""
     scene = load_scene(SCENES / "sphere_a.toml", {"sample.spheres.0.cap_height_um": 500.0, "detector.1.name": "other"})
     assert scene.sample.spheres[0].cap_height_um == 500.0 and scene.sample.spheres[0].radius_um == 1000.0
     assert scene.detector_names == ("forward", "other", "left")
