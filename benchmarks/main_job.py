@@ -6,9 +6,7 @@ Rows 1-11 need the shared data; `--tiny` runs a small simulated scene through th
 """
 
 import argparse
-import json
 import os
-import platform
 import sys
 import time
 from pathlib import Path
@@ -19,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 
+from benchmarks.rows import Row, row, write  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
 from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.evaluate.metrics import Truth, evaluate_height  # noqa: E402
@@ -28,14 +27,6 @@ from helio_jax.reconstruct.integrate import integrate_slopes  # noqa: E402
 from helio_jax.reconstruct.linear import signal_of, solve_linear  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
-
-Row = dict[str, object]
-
-
-def row(number: str, what: str, value: str, target: str, is_reached: bool | None, **more: object) -> Row:
-    mark = {True: "yes", False: "NO", None: "-"}[is_reached]
-    print(f"{number:>3}  {what:<58} {value:<44} {target:<26} {mark}", flush=True)
-    return {"row": number, "what": what, "value": value, "target": target, "reached": is_reached, **more}
 
 
 def micrograph_rows(scene, stack, seed: int) -> list[Row]:
@@ -215,18 +206,7 @@ def main() -> None:
         stack = import_micrographs(args.shared / "data" / "sphere_a_simulated.mat", scene.instrument)
         rows = micrograph_rows(scene, stack, args.seed) + linear_rows(scene, stack) + height_rows(scene, stack)
         rows += measured_rows(args.shared)
-    names = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba")
-    about = {
-        "git": pipeline.git_commit(),
-        "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
-        "versions": {name: pipeline.package_version(name) for name in names},
-        "seed": args.seed,
-        "rows": rows,
-    }
-    args.output.mkdir(parents=True, exist_ok=True)
-    path = args.output / ("main_job_tiny.json" if args.tiny else "main_job.json")
-    path.write_text(json.dumps(about, indent=1) + "\n")
-    print(f"written to {path}")
+    write(args.output / ("main_job_tiny.json" if args.tiny else "main_job.json"), rows, args.seed)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ reference program) need the shared data; `--tiny` runs small cases of the other 
 import argparse
 import json
 import os
-import platform
 import resource
 import sys
 import time
@@ -25,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.error_bars import coverage_row, efficiency_row  # noqa: E402
+from benchmarks.rows import with_origin  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
@@ -44,14 +44,7 @@ class Record:
 
     def __init__(self, path: Path, seed: int) -> None:
         self.path = path
-        names = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba")
-        self.about = {
-            "git": pipeline.git_commit(),
-            "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
-            "versions": {name: pipeline.package_version(name) for name in names},
-            "seed": seed,
-            "rows": json.loads(path.read_text())["rows"] if path.exists() else [],
-        }
+        self.about = with_origin(json.loads(path.read_text())["rows"] if path.exists() else [], seed)
 
     def keep(self, row: str, case: str, work: Callable[[], Case]) -> Case:
         """Run a case unless it is done, write the file (at once and whole), and return the case."""

@@ -6,9 +6,6 @@ Row numbers are those of the tracer's issue. Times are CPU times of one thread; 
 """
 
 import argparse
-import json
-import os
-import platform
 import sys
 import time
 from pathlib import Path
@@ -19,8 +16,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.main_job import Row, row  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
+from benchmarks.rows import Row, row, write  # noqa: E402
 from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.instrument import Beam, Detector, Instrument, Plate  # noqa: E402
 from helio_jax.scene.shapes import Sphere, SpheresSample, StepSample, TrenchSample  # noqa: E402
@@ -412,18 +408,7 @@ def main() -> None:
         "12": lambda: size_rows((24,) if tiny else (24, 72, 224, 708), 8 if tiny else 256),
     }
     rows = [r for name in args.rows.split(",") for r in work[name]()]
-    names = ("helio-jax", "numpy", "embreex", "numba")
-    about = {
-        "git": pipeline.git_commit(),
-        "machine": {"processor": platform.machine(), "cpus": os.cpu_count()},
-        "versions": {name: pipeline.package_version(name) for name in names},
-        "seed": 1,
-        "rows": rows,
-    }
-    args.output.mkdir(parents=True, exist_ok=True)
-    path = args.output / ("tracer_tiny.json" if tiny else "tracer.json")
-    path.write_text(json.dumps(about, indent=1) + "\n")
-    print(f"written to {path}")
+    write(args.output / ("tracer_tiny.json" if tiny else "tracer.json"), rows, seed=1)
 
 
 if __name__ == "__main__":

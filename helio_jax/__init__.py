@@ -10,14 +10,14 @@ folder per verb. Which file does what:
 * `scene/` what is imaged: `sample` (kinds of samples), `surfaces` (their geometry), `scan` (raster), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
   `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `denoise`, `run`
-  (threads).
+  (blocks on threads), `job`, `units` (units of work), `scan` (threads, processes, cluster).
 * `prepare/` `noise` (counting noise), `calibrate` (first background and gain of a measured scan).
 * `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
   -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
 * `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
-* `formats/` `hdf5` (NeXus), `matlab` (import), `safe` (untrusted files).
-* `config` (scene files), `predict` (tracer and masks for the fit), `pipeline` (joins the stages), `__main__` (command
-  line).
+* `formats/` `hdf5` (NeXus), `parts` (finished units), `matlab` (import), `safe` (untrusted files).
+* `config` (scene files), `predict` (tracer and masks for the fit), `checkpoint` (long simulations), `pipeline` (joins
+  the stages), `study` (sweeps), `__main__` (command line).
 
 Public names are loaded on first use, so that `import helio_jax` is instant.
 """

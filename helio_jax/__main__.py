@@ -27,7 +27,10 @@ OutFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
-Workers = Annotated[int | None, typer.Option(min=1, help="Threads (default: all CPUs).")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]
+Processes = Annotated[bool, typer.Option("--processes", help="Let the workers be processes instead of threads.")]
+Scheduler = Annotated[str | None, typer.Option(help="Address of a dask scheduler whose workers trace (tcp://...).")]
+Restart = Annotated[bool, typer.Option("--restart", help="Discard what an unfinished run left, and start afresh.")]
 Method = Annotated[str | None, typer.Option(help="linear, nearfield or refine (default: the scene's, or refine).")]
 
 
@@ -83,13 +86,19 @@ def run(
     rays: Rays = None,
     seed: Seed = None,
     method: Method = None,
+    workers: Workers = None,
+    processes: Processes = False,
+    scheduler: Scheduler = None,
+    restart: Restart = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
+    from helio_jax.pipeline import Crew
     from helio_jax.pipeline import run as run_scene
 
     overrides = _given(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
-    result = run_scene(scene, output, overrides=overrides, stage=_Bar)
+    crew = Crew(workers, processes, scheduler)
+    result = run_scene(scene, output, overrides=overrides, stage=_Bar, crew=crew, restart=restart, say=_say)
     if as_json:
         print(json.dumps(result.as_dict()))
         return
@@ -111,18 +120,55 @@ def simulate(
     workers: Workers = None,
     estimator: Annotated[str | None, typer.Option(help="expected or analog.")] = None,
     noise: Annotated[bool, typer.Option(help="Add the scene's counting noise and background.")] = False,
+    processes: Processes = False,
+    shard: Annotated[str | None, typer.Option(help="i/N: trace the i-th of N shares; the last one writes.")] = None,
+    scheduler: Scheduler = None,
+    restart: Restart = False,
 ) -> None:
-    """Trace the micrographs of a scene and write them to an HDF5 file."""
-    from helio_jax import pipeline, write
-    from helio_jax.config import load_scene
+    """Trace the micrographs of a scene and write them to an HDF5 file; if interrupted, give it again to go on."""
+    from helio_jax.pipeline import Crew, SimulateOptions, simulate_file
 
-    loaded = load_scene(scene)
-    changes = _given(rays=rays, seed=seed, workers=workers, estimator=estimator)
+    overrides = _given(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
     with _Bar("tracing") as bar:
-        stack = pipeline.simulate(loaded, progress=bar, **changes)
-    stack = pipeline.with_provenance(pipeline.record(loaded, stack) if noise else stack, loaded, scene)
-    write(stack, output)
-    print(f"{output}: {stack.shape[0]} micrographs of {stack.shape[2]} x {stack.shape[1]} pixels ({stack.noise})")
+        options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, _say)
+        stack = simulate_file(scene, output, overrides=overrides, options=options)
+    if stack is not None:
+        n, ny, nx = stack.shape
+        print(f"{output}: {n} micrographs of {nx} x {ny} pixels ({stack.noise})")
+
+
+@app.command()
+def resume(
+    path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study.")],
+) -> None:
+    """Go on with what was interrupted or killed; no unit that was finished is traced again."""
+    from helio_jax.pipeline import resume as resume_run
+
+    if (path / "study.json").is_file():
+        from helio_jax.study import resume_study
+
+        print(resume_study(path, say=_say))
+        return
+    for file in resume_run(path, stage=_Bar, say=_say):
+        print(file)
+
+
+@app.command()
+def study(
+    file: Annotated[Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the points and their index.")],
+    go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
+    workers: Workers = None,
+    processes: Processes = False,
+    shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, beginning with the i-th.")] = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
+    from helio_jax.pipeline import Crew, SimulateOptions
+    from helio_jax.study import run_study
+
+    options = SimulateOptions(crew=Crew(workers, processes, scheduler), shard=shard, say=_say)
+    print(run_study(file, output, resume=go_on, options=options))
 
 
 @app.command("import")

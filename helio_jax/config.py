@@ -44,7 +44,8 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
 
     Args:
         path: of the TOML file. `extends = "FILE"` (relative to it) names one file whose tables lie beneath.
-        overrides: values that win over the file: nested tables, or dotted keys as in {"trace.rays": 1000}.
+        overrides: values that win over the file: nested tables, or dotted keys as in {"trace.rays": 1000}
+            and {"sample.spheres.0.radius_um": 500.0}.
 
     Raises:
         SceneError: missing, too large, not UTF-8, not TOML, or wrong; the message lists all errors, each with file,
@@ -134,16 +135,26 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge tables deeply; everything else, arrays too, is replaced whole, and so is a table of another `kind`."""
+    """Merge tables deeply; everything else is replaced whole, and so is a table of another `kind`.
+
+    Of an array single elements are replaced where they are named by number, from 0 ({"spheres": {"0": ...}}).
+    """
     out = dict(under)
     for key, value in over.items():
         old = out.get(key)
         both = isinstance(old, Mapping) and isinstance(value, Mapping)
         if both and value.get("kind", old.get("kind")) == old.get("kind"):  # type: ignore[union-attr]
             out[key] = _merge(old, value)  # type: ignore[arg-type]
+        elif isinstance(old, list) and isinstance(value, Mapping) and all(_is_index(k, old) for k in value):
+            out[key] = list(_merge(dict(zip(map(str, range(len(old))), old, strict=True)), value).values())
         else:
             out[key] = value
     return out
+
+
+def _is_index(key: str, array: list) -> bool:
+    """Whether a key is the number of an element."""
+    return key in map(str, range(len(array)))
 
 
 def _nest(overrides: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,6 +41,12 @@ class ResumeError(HelioError):
     exit_code = 6
 
 
+class StoppedRun(HelioError):
+    """The run was stopped from outside (SIGTERM, a batch system's time limit, lost workers); it can go on."""
+
+    exit_code = 75
+
+
 class InterruptedRun(HelioError):
     """The user stopped the run; what was finished has been saved."""
 

@@ -4,31 +4,31 @@ import json
 import math
 import os
 import platform
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from helio_jax.config import SceneFile, load_scene, resolved
-from helio_jax.errors import SceneError
+from helio_jax.checkpoint import Keeper, Shard
+from helio_jax.config import SceneFile, load_scene
+from helio_jax.errors import ResumeError, SceneError
 from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Region, Scores, Truth, evaluate_height
 from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
 from helio_jax.evaluate.report import write_report
 from helio_jax.formats.hdf5 import read, write
+from helio_jax.formats.parts import Parts
 from helio_jax.formats.safe import atomic_path
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
+from helio_jax.provenance import package_version, with_provenance
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
@@ -37,11 +37,20 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres, flat_body
 from helio_jax.trace.intersect import MISS, Intersector
-from helio_jax.trace.run import first_hits, make_experiment, trace_pixels, trace_scene
+from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
+from helio_jax.trace.scan import Crew, trace_scene
 from helio_jax.trace.settings import TraceSettings
 
+DEFAULT_CREW = Crew()
+"""Threads of this process, one per CPU."""
+Stage = Callable[[str], Any]
+"""Called with the name of each stage; a context manager that yields its progress callback."""
 SUBSTRATE_RATIO = 1.35
 """Where a scene does not say: the substrate begins at this many radii of the scored region."""
+
+
+def _silent(label: str) -> Any:
+    return nullcontext()
 
 
 def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> MicrographStack:
@@ -49,7 +58,7 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
 
     Args:
         scene: from `load_scene`.
-        progress: called with (blocks done, blocks in all).
+        progress: called with (pixels done, pixels in all).
         trace: settings of table [trace] that replace the scene's, e.g. rays=2000, seed=1.
 
     Raises:
@@ -57,6 +66,101 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
         GuardError: ray book-keeping failed.
     """
     return trace_scene(scene, _changed(scene.trace, trace), progress)
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """How `simulate_file` goes about it; the counts depend on `noise` alone.
+
+    Attributes:
+        noise: add the scene's counting noise and background, if its table [noise] is enabled.
+        crew: who runs the units of work.
+        shard: "i/N": run the i-th of N shares only; who finishes last writes the file.
+        restart: discard what an unfinished run left.
+        progress: called with (pixels done, pixels in all).
+        say: called with messages.
+    """
+
+    noise: bool = False
+    crew: Crew = DEFAULT_CREW
+    shard: str | None = None
+    restart: bool = False
+    progress: Callable[[int, int], None] | None = None
+    say: Callable[[str], None] = lambda text: None
+
+
+def simulate_file(
+    scene_path: str | Path,
+    output: str | Path,
+    *,
+    overrides: dict[str, Any] | None = None,
+    options: SimulateOptions = SimulateOptions(),
+    verb: str = "simulate",
+) -> MicrographStack | None:
+    """Trace a scene's micrographs into a file; finished units are kept in OUTPUT.parts until it is written.
+
+    Where such parts are found, the run goes on from there.
+
+    Args:
+        scene_path: of the scene file.
+        output: of the HDF5 file.
+        overrides: settings that win over the scene, dotted keys.
+        options: noise, workers, shards.
+        verb: the command that `resume` gives again: "simulate", or "run" where that is what was asked for.
+
+    Returns:
+        The micrographs; None where other shards are still missing.
+
+    Raises:
+        ResumeError: the parts found are of another scene, surface, seed or version.
+        InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; the message says how to go on.
+        GuardError: ray book-keeping failed.
+    """
+    o, overrides = options, overrides or {}
+    scene = load_scene(scene_path, overrides)
+    parts = Parts(Path(output))
+    shard = Shard.parse(o.shard) if o.shard else None
+    command = {"verb": verb, "scene": str(Path(scene_path).resolve()), "overrides": overrides, "noise": o.noise}
+    command |= {"crew": asdict(o.crew)}
+    keeper = Keeper(parts, command, o.crew, shard, o.restart, o.say)
+    stack = keeper.trace(scene, scene.trace, o.progress)
+    if stack is None:
+        return None
+    stack = with_provenance(record(scene, stack) if o.noise else stack, scene, scene_path)
+    parts.finish(lambda path: write(stack, path))
+    return stack
+
+
+def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], None] = print) -> list[Path]:
+    """Go on with an unfinished simulation (`path`: its file) or run (its folder); return the files written.
+
+    Raises:
+        ResumeError: there is nothing to go on with, or something changed since.
+    """
+    path = Path(path)
+    output = path / "micrographs.h5" if path.is_dir() else path
+    parts = Parts(output)
+    if not parts.exist:
+        if output.is_file():
+            parts.remove()  # what is left when a process is killed while it cleans up
+            say(f"{output} is complete: nothing to resume")
+            return []
+        raise ResumeError(f"there is no unfinished run of {output}: {parts.folder} does not exist; start it anew")
+    try:
+        c = parts.manifest()["command"]
+        scene, crew = Path(c["scene"]), Crew(**c["crew"])
+        is_run, overrides, noise = c["verb"] == "run", dict(c["overrides"]), bool(c["noise"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise ResumeError(f"{parts.folder}/manifest.json is damaged ({e!r}): remove the folder, start anew") from None
+    if not scene.is_file():
+        raise ResumeError(f"the scene {scene} of {parts.folder} is gone: put it back, or remove the folder")
+    if is_run:
+        return list(run(scene, output.parent, overrides=overrides, stage=stage, crew=crew, say=say).files.values())
+    with stage("tracing") as progress:
+        simulate_file(
+            scene, output, overrides=overrides, options=SimulateOptions(noise, crew, None, False, progress, say)
+        )
+    return [output]
 
 
 def _changed(settings, changes: dict[str, Any]):
@@ -220,47 +324,16 @@ class RunResult:
         }
 
 
-def with_provenance(stack: MicrographStack, scene: SceneFile, scene_path: str | Path) -> MicrographStack:
-    """Return the stack with what is needed to make it again: scene text, versions, commit, command line, time."""
-    path = Path(scene_path)
-    names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
-    about = {
-        "scene_file": path.name,
-        "scene_text": path.read_text(encoding="utf-8"),
-        "scene": resolved(scene),
-        "versions": {name: package_version(name) for name in names},
-        "git": git_commit(),
-        "machine": {"processor": platform.machine(), "system": platform.system(), "cpus": os.cpu_count()},
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-    return stack.replace(provenance={**stack.provenance, **about})
-
-
-def package_version(name: str) -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
-
-
-def git_commit() -> str:
-    """Return the commit of the checkout that this package runs from, or "" outside one."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=False).stdout.strip()
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-
-
 def run(
     scene_path: str | Path,
     folder: str | Path | None = None,
     *,
     overrides: dict[str, Any] | None = None,
-    stage: Callable[[str], Any] = lambda label: nullcontext(),
+    stage: Stage = _silent,
+    crew: Crew = DEFAULT_CREW,
+    restart: bool = False,
+    report: bool = True,
+    say: Callable[[str], None] = lambda text: None,
 ) -> RunResult:
     """Do the main job: simulate, reconstruct, score, report.
 
@@ -271,6 +344,14 @@ def run(
         folder: where the files go; default helio-out/NAME.
         overrides: settings that win over the scene, dotted keys.
         stage: called with the name of each stage; a context manager that yields its progress callback.
+        crew: who traces.
+        restart: discard what an unfinished run left in the folder.
+        report: write the HTML report and the PNG panel, too.
+        say: called with messages.
+
+    Raises:
+        ResumeError: the folder holds an unfinished run of something else.
+        InterruptedRun, StoppedRun: stopped while tracing; what was finished is kept.
     """
     scene = load_scene(scene_path, overrides)
     out = Path(folder) if folder else Path("helio-out") / scene.name
@@ -278,16 +359,13 @@ def run(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise SceneError(f"output folder {out} cannot be made: {e.strerror}; choose another with -o") from None
-    names = {
-        "micrographs": "micrographs.h5",
-        "height map": "height.h5",
-        "report": "report.html",
-        "scores": "scores.json",
-    }
+    names = {"micrographs": "micrographs.h5", "height map": "height.h5", "scores": "scores.json"}
+    names |= {"report": "report.html"} if report else {}
     files = {label: out / name for label, name in names.items()}
     with stage("simulating micrographs") as progress:
-        stack = with_provenance(record(scene, simulate(scene, progress=progress)), scene, scene_path)
-    write(stack, files["micrographs"])
+        options = SimulateOptions(True, crew, None, restart, progress, say)
+        stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
+    assert stack is not None  # no shards here
     with stage("reconstructing heights") as progress:
         rec = reconstruct(stack, settings=scene.reconstruct, report=progress)
     write(rec, files["height map"])
@@ -296,8 +374,9 @@ def run(
         scores = evaluate(rec, truth)
         with atomic_path(files["scores"]) as part:
             part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")
-        title = f"{scene.name}: simulated, reconstructed, scored"
-        files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
+        if report:
+            title = f"{scene.name}: simulated, reconstructed, scored"
+            files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)
 
 

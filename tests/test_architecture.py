@@ -1,7 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > pipeline, study > predict > config > explain > stages > scene > nouns > settings, arrays, errors.
+__main__ > study > pipeline > predict, checkpoint, provenance > config > explain > stages > scene > nouns > settings,
+arrays, errors.
 """
 
 import ast
@@ -22,8 +23,9 @@ LEVELS = [
     {"trace", "prepare", "reconstruct", "evaluate", "formats"},
     {"explain"},
     {"config"},
-    {"predict"},
-    {"pipeline", "study"},
+    {"predict", "checkpoint", "provenance"},
+    {"pipeline"},
+    {"study"},
     {"__main__", "__init__"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -34,10 +36,11 @@ DOORS = {
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {"evaluate/figures.py"},
+    "matplotlib": {"evaluate/figures.py", "evaluate/sweep.py"},
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},
     "lineax": {"reconstruct/refiner.py"},
+    "distributed": {"trace/scan.py"},
     "rich": {"__main__.py"},
     "typer": {"__main__.py"},
 }
@@ -45,6 +48,7 @@ FOLDERS = {
     "jax": {"reconstruct", "pipeline.py"},
     "equinox": {"reconstruct"},
     "numba": {"trace", "reconstruct/horizon.py"},
+    "llvmlite": {"trace"},
 }
 SOFT_LINES, MAX_LINES = 400, 450
 FILES = sorted(ROOT.rglob("*.py"))

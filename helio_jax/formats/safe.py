@@ -210,6 +210,22 @@ def _unpack(value: Any, arrays: Any) -> Any:
     return {k: _unpack(v, arrays) for k, v in value["dict"].items()}
 
 
+def check_target(target: Path) -> Path:
+    """Return the file that writing to `target` will replace: a link is followed, what it points to is replaced.
+
+    Raises:
+        SceneError: it is a folder, a device or write-protected, or its folder does not exist.
+    """
+    real = target.resolve()
+    if real.exists() and not real.is_file():
+        raise SceneError(f"cannot write {target}: it is a folder or device; name a file")
+    if real.exists() and not os.access(real, os.W_OK):
+        raise SceneError(f"cannot write {target}: it is write-protected; name another file or allow writing")
+    if not real.parent.is_dir():
+        raise SceneError(f"cannot write {target}: No such file or directory; check the folder, rights and space")
+    return real
+
+
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path in the same folder that becomes `path` when the block succeeds.
@@ -223,12 +239,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     target = Path(path)
     temporary: Path | None = None
     try:
-        # a link is followed, so that the file it points to is replaced and not the link
-        real = target.resolve()
-        if real.exists() and not real.is_file():
-            raise SceneError(f"cannot write {target}: it is a folder or device; name a file")
-        if real.exists() and not os.access(real, os.W_OK):
-            raise SceneError(f"cannot write {target}: it is write-protected; name another file or allow writing")
+        real = check_target(target)
         temporary = real.with_name(f".{real.stem[:80]}.{secrets.token_hex(4)}.part{real.suffix}")
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.scene.surfaces import Body
+from helio_jax.scene.body import Body
 
 RESTART = 1e-6
 """Distance off the surface at which a ray leaving a triangle starts, in scene half-sizes."""

@@ -22,7 +22,9 @@ class TraceSettings(Settings):
     """A ray is stopped, and counted as stopped, after this many hits of the sample or the plate."""
     n_orders: int = Field(default=4, ge=1, le=64)
     """Scattering orders kept apart; the last one holds "and above"."""
+    paths_per_unit: int = Field(default=4_000_000, ge=1)
+    """Paths (rays times branches) in a unit of work, the most that a killed worker loses: a few seconds of tracing."""
     workers: int | None = Field(default=None, ge=1, le=4096)
-    """Threads; default: one per CPU."""
+    """Threads (or processes); default: one per CPU."""
     maps: bool = True
     """Also make the masking and shadowing maps."""

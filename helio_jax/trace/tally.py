@@ -42,43 +42,69 @@ class Tally:
             n_branches,
         )
 
-    @classmethod
-    def join(cls, parts: list["Tally"]) -> "Tally":
-        """Put blocks of pixels side by side, in order."""
-        return cls(
-            np.concatenate([p.fates for p in parts], -1),
-            np.concatenate([p.hits for p in parts], -1),
-            np.concatenate([p.sums for p in parts], -1),
-            parts[0].n_rays,
-            parts[0].n_branches,
-        )
-
     @property
-    def n_unaccounted(self) -> int:
-        """Launched minus all fates, summed over pixels; anything but 0 is a bug."""
-        return int(np.abs(self.n_launched - self.fates.sum(0)).sum())
+    def n_launched(self) -> int:
+        """Paths launched per pixel: beam rays times branches."""
+        return self.n_rays * self.n_branches
+
+    def estimate(self) -> "Estimate":
+        """Reduce the replicates to means and variances.
+
+        With replicates: mean over them, variance of the mean from their spread (R - 1 degrees of freedom); the orders
+        of one path are correlated, so those of the total are taken from the replicates' totals. Analog: hits / rays
+        with the Poisson variance hits / rays^2.
+        """
+        kept = (self.fates, self.hits, self.n_rays, self.n_branches)
+        n_replicates, n = self.sums.shape[1], self.n_launched
+        if n_replicates == 0:
+            total = self.hits.sum(0)
+            return Estimate(self.hits / n, self.hits / n**2, total / n, total / n**2, *kept)
+        means = self.sums * (n_replicates / self.n_rays)
+        totals = self.sums.sum(0) * (n_replicates / self.n_rays)
+        variance, total_variance = (m.var(-3, ddof=1) / n_replicates for m in (means, totals))
+        return Estimate(means.mean(1), variance, totals.mean(0), total_variance, *kept)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is kept of a tally once its pixels are traced: detection probabilities per ray, without the replicates.
+
+    Attributes:
+        mean, variance: by order, the variance being that of the mean [order, detector, pixels].
+        total_mean, total_variance: of all orders together [detector, pixels].
+        fates, hits, n_rays, n_branches: as in `Tally`.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    total_mean: np.ndarray
+    total_variance: np.ndarray
+    fates: np.ndarray
+    hits: np.ndarray
+    n_rays: int
+    n_branches: int
+
+    @classmethod
+    def join(cls, parts: list["Estimate"]) -> "Estimate":
+        """Put blocks of pixels side by side, in order."""
+        names = ("mean", "variance", "total_mean", "total_variance", "fates", "hits")
+        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
+        return cls(**joined, n_rays=parts[0].n_rays, n_branches=parts[0].n_branches)
 
     @property
     def n_launched(self) -> int:
         """Paths launched per pixel: beam rays times branches."""
         return self.n_rays * self.n_branches
 
-    def probability(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean detection probability per ray and its variance, both [order, detector, pixels].
+    @property
+    def n_unaccounted(self) -> int:
+        """Launched minus all fates, summed over pixels; anything but 0 is a bug."""
+        return int(np.abs(self.n_launched - self.fates.sum(0)).sum())
 
-        With replicates: mean over them, variance of the mean from their spread (R - 1 degrees of freedom).
-        Analog: hits / rays with the Poisson variance hits / rays^2.
-        """
-        n_replicates = self.sums.shape[1]
-        if n_replicates == 0:
-            return self.hits / self.n_launched, self.hits / self.n_launched**2
-        means = self.sums * (n_replicates / self.n_rays)
-        return means.mean(1), means.var(1, ddof=1) / n_replicates
+    def probability(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean detection probability per ray and its variance, both [order, detector, pixels]."""
+        return self.mean, self.variance
 
     def total(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same for all orders together [detector, pixels]; orders of one path are correlated."""
-        n_replicates = self.sums.shape[1]
-        if n_replicates == 0:
-            return self.hits.sum(0) / self.n_launched, self.hits.sum(0) / self.n_launched**2
-        means = self.sums.sum(0) * (n_replicates / self.n_rays)
-        return means.mean(0), means.var(0, ddof=1) / n_replicates
+        """Return the same for all orders together [detector, pixels]."""
+        return self.total_mean, self.total_variance

@@ -128,7 +128,33 @@ def test_interrupt_ends_with_130(small_scene, tmp_path):
             continue
     process.kill()
     assert process.returncode == 130, said
-    assert list(tmp_path.iterdir()) == []
+    left = [p.name for p in tmp_path.iterdir()]
+    assert left == [] or (left == ["s.h5.parts"] and "helio resume" in said)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_stop_refuse_and_resume(small_scene, tmp_path):
+    """SIGTERM ends with 75 and the way on; another seed is refused with 6; resume ends with 0 and removes the parts.
+
+    Catches a command line that swallows the signal or the exit code, and options that do not reach the tracer.
+    """
+    scene, out = tmp_path / "scene.toml", tmp_path / "s.h5"
+    scene.write_text(small_scene.read_text().replace("[trace]", "[trace]\npaths_per_unit = 75_000"))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "helio_jax", "simulate", str(scene), "-o", str(out), "--rays", "256", "--workers", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while process.poll() is None and len(list(tmp_path.glob("s.h5.parts/*.npz"))) < 2:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 75 and f"helio resume {out}" in said, said
+    refused = helio("simulate", scene, "-o", out, "--seed", "5", "--rays", "256")
+    assert refused.returncode == 6 and "trace.seed: 1 (then), 5 (now)" in refused.stderr
+    done = helio("resume", out)
+    assert done.returncode == 0 and "units were finished" in done.stderr, done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"scene.toml", "s.h5"}
 
 
 def test_imports_measured_files(shared, tmp_path):

@@ -21,7 +21,8 @@ from helio_jax.scene.scene import Scene
 from helio_jax.scene.shapes import FlatSample, Sphere, SpheresSample, TrenchSample
 from helio_jax.scene.surfaces import first_hit_spheres
 from helio_jax.trace.intersect import Intersector
-from helio_jax.trace.run import first_hits, trace_scene
+from helio_jax.trace.run import first_hits
+from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
 
 TAN = math.tan(math.radians(30.0))

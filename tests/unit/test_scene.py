@@ -188,6 +188,16 @@ def test_bad_files(tmp_path, content, expected):
         load_scene(tmp_path)
 
 
+def test_override_of_one_element():
+    """An array's element is replaced by its number; others stay. Catches a list that is replaced whole, or grows."""
+    scene = load_scene(SCENES / "sphere_a.toml", {"sample.spheres.0.cap_height_um": 500.0, "detector.1.name": "other"})
+    assert scene.sample.spheres[0].cap_height_um == 500.0 and scene.sample.spheres[0].radius_um == 1000.0
+    assert scene.detector_names == ("forward", "other", "left")
+    for key in ("sample.spheres.1.radius_um", "sample.spheres.00.radius_um"):
+        with pytest.raises(SceneError, match="spheres"):
+            load_scene(SCENES / "sphere_a.toml", {key: 900.0})
+
+
 def test_extends_merges_one_level(tmp_path):
     """Tables of the extended file lie beneath; `detector` is replaced whole; overrides win over both.
 

@@ -1,0 +1,203 @@
+"""Long simulations: every finished unit is kept on disk until all are there, so that a killed run can go on.
+
+Joins the tracer's units (`trace.scan`) and the folder that keeps them (`formats.parts`). A run of a single unit leaves
+no trace on disk. A run goes on only where scene, settings, surface and program are what they were (`Job.about`); as
+units are pure functions of these, going on gives the bits of an undisturbed run.
+"""
+
+import re
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from helio_jax.errors import GuardError, InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
+from helio_jax.formats.parts import Parts
+from helio_jax.micrograph import MicrographStack
+from helio_jax.scene.scene import Scene
+from helio_jax.trace.job import Job, Unit, differences
+from helio_jax.trace.run import Progress
+from helio_jax.trace.scan import Canvas, Crew
+from helio_jax.trace.settings import TraceSettings
+from helio_jax.trace.units import Patch
+
+FORMAT = 1
+"""Version of the manifest."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The share of one of several independent processes: units `number`, `number` + `of`, ... (counted from 1)."""
+
+    number: int
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> "Shard":
+        """Read "2/8", the second of eight.
+
+        Raises:
+            SceneError: it is not of this form, or out of range.
+        """
+        found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+        number, of = (int(found[1]), int(found[2])) if found else (0, 0)
+        if not 1 <= number <= of:
+            raise SceneError(f"--shard must be i/N with i from 1 to N, e.g. 2/8, got {text!r}")
+        return cls(number, of)
+
+
+@dataclass(frozen=True)
+class Keeper:
+    """Traces a scene into a file's parts.
+
+    Attributes:
+        parts: where finished units are kept.
+        command: what `helio resume` needs to start this again (JSON-compatible).
+        crew: who runs the units.
+        shard: run this share only; None: all units.
+        restart: discard what an earlier run left.
+        say: called with messages.
+    """
+
+    parts: Parts
+    command: dict[str, Any]
+    crew: Crew
+    shard: Shard | None = None
+    restart: bool = False
+    say: Callable[[str], None] = lambda text: None
+
+    def trace(self, scene: Scene, settings: TraceSettings, progress: Progress | None = None) -> MicrographStack | None:
+        """Return the micrographs, or None where other shards are not finished. The parts are left to the caller.
+
+        Raises:
+            ResumeError: the parts are of something else than this scene.
+            InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; what was finished is kept.
+            GuardError: ray book-keeping failed.
+        """
+        body = scene.build_body()
+        job = Job.of(scene, settings, body)
+        units, canvas = job.units(), Canvas(job)
+        self._begin(job, len(units))
+        try:
+            with _sigterm_raises():
+                todo = list(self._not_loaded(job, self._share(units), canvas))
+                with closing(self.crew.run(job, todo, body, progress)) as results:
+                    for unit, patch in results:
+                        if self.parts.exist:
+                            self.parts.save(unit.number, patch.arrays() | {"job": _label(job, unit)})
+                        canvas.put(unit, patch)
+                return self._complete(job, units, canvas)
+        except (KeyboardInterrupt, StoppedRun) as e:
+            raise self._stopped(e, units) from None
+        except GuardError:
+            self._remove_own()
+            raise
+        finally:
+            if not any(self.parts.has(unit.number) for unit in units):
+                self._remove_own()
+
+    def _remove_own(self) -> None:
+        """Remove the folder of parts, unless other shards use it too."""
+        if self.shard is None:
+            self.parts.remove()
+
+    def _begin(self, job: Job, n_units: int) -> None:
+        """Make the folder of parts, or check that the one found belongs to this job."""
+        parts = self.parts
+        if self.restart and self.shard:
+            raise SceneError(f"--restart would discard what other shards did: remove {parts.folder} before they start")
+        if self.restart:
+            parts.remove()
+        if not parts.exist and n_units == 1 and self.shard is None:
+            return
+        about = parts.manifest().get("about") if parts.exist else job.about
+        if changes := differences(about, job.about, ("then", "now")):
+            raise ResumeError(
+                f"{parts.folder} holds an unfinished run of something else:\n  " + "\n  ".join(changes) + "\nput back "
+                "what was changed to go on, or give --restart to discard the run, or name another output"
+            )
+        if not parts.exist or self.shard is None:  # the last command given is the one that is resumed
+            parts.begin({"format": FORMAT, "command": self.command, "about": job.about, "n_units": n_units})
+
+    def _share(self, units: list[Unit]) -> list[Unit]:
+        return units if self.shard is None else units[self.shard.number - 1 :: self.shard.of]
+
+    def _not_loaded(self, job: Job, units: list[Unit], canvas: Canvas) -> Iterator[Unit]:
+        """Put what is kept on the canvas; yield the units that are missing or damaged."""
+        n_loaded = 0
+        for unit in units:
+            try:
+                canvas.put(unit, self._load(job, unit))
+                n_loaded += 1
+            except InputFileError as e:
+                if self.parts.has(unit.number):
+                    self.say(f"{e}: computing it again")
+                yield unit
+        if n_loaded:
+            self.say(f"going on: {n_loaded} of {len(units)} units were finished")
+
+    def _load(self, job: Job, unit: Unit) -> Patch:
+        """Return the kept patch of a unit."""
+        arrays = self.parts.load(unit.number)
+        try:
+            if str(arrays.pop("job", None)) != str(_label(job, unit)):
+                raise ValueError("it belongs to another run")
+            return Patch.from_arrays(arrays, job, unit)
+        except ValueError as e:
+            raise InputFileError(f"{self.parts.path(unit.number)} is damaged ({e})") from None
+
+    def _complete(self, job: Job, units: list[Unit], canvas: Canvas) -> MicrographStack | None:
+        """Return the micrographs, once, when all shards are finished."""
+        if self.shard is not None:
+            n_there = sum(self.parts.has(unit.number) for unit in units)
+            mine = f"shard {self.shard.number}/{self.shard.of} is finished"
+            if n_there < len(units):
+                self.say(f"{mine}; {n_there} of all {len(units)} units are there")
+                return None
+            if not self.parts.claim():
+                self.say(f"{mine}, as are all others; another process is writing {self.parts.output}")
+                return None
+            for unit in units:
+                if unit.number in canvas.missing:
+                    canvas.put(unit, self._load(job, unit))
+        return canvas.stack()
+
+    def _stopped(self, e: BaseException, units: list[Unit]) -> Exception:
+        """Return the error that says what is kept and how to go on."""
+        kind = StoppedRun if isinstance(e, (StoppedRun, _Terminated)) else InterruptedRun
+        why = str(e) or ("stopped by SIGTERM" if kind is StoppedRun else "interrupted")
+        n_kept = sum(self.parts.has(unit.number) for unit in units)
+        if n_kept == 0 and self.shard is None:
+            return kind(f"{why}; no unit of work was finished yet, nothing is left behind")
+        how = "the same command" if self.shard else f"`helio resume {self.parts.output}`"
+        return kind(f"{why}; {n_kept} of {len(units)} units are kept in {self.parts.folder}: {how} goes on")
+
+
+def _label(job: Job, unit: Unit) -> np.ndarray:
+    """Return what tells a part of one run from one of another."""
+    return np.array(f"{job.key} {unit.start} {unit.stop}")
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: a batch system's time limit."""
+
+
+@contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    """Let SIGTERM interrupt the block as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)

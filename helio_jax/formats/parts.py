@@ -1,0 +1,147 @@
+"""Parts of a file to be: finished pieces of a long run, kept in the folder OUT.parts beside OUT until all are there.
+
+A manifest (JSON) says what run they belong to; every part is an uncompressed .npz, renamed into place in one step,
+whose members carry checksums. Knows nothing of what the parts mean. Parts are read like any other file: bounded, no
+pickle, every failure names the file.
+"""
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from helio_jax.errors import InputFileError, SceneError
+from helio_jax.formats import safe
+
+MAX_PART_BYTES = safe.GIB
+MAX_MANIFEST_BYTES = 16 * safe.MIB
+
+
+class Parts:
+    """The parts of one file.
+
+    Args:
+        output: the file that they will make.
+    """
+
+    def __init__(self, output: Path) -> None:
+        self.output = output
+        self.folder = output.with_name(output.name + ".parts")
+
+    @property
+    def exist(self) -> bool:
+        """Whether a run was begun and not finished."""
+        return (self.folder / "manifest.json").is_file()
+
+    def begin(self, manifest: dict[str, Any]) -> None:
+        """Make the folder and its manifest.
+
+        Raises:
+            SceneError: the folder, or the file itself when its time comes, cannot be written.
+        """
+        safe.check_target(self.output)
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as e:
+            raise SceneError(f"cannot make {self.folder}: {e.strerror}; check the folder, rights and space") from None
+        with safe.atomic_path(self.folder / "manifest.json") as path:
+            path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+    def manifest(self) -> dict[str, Any]:
+        """Return the manifest.
+
+        Raises:
+            InputFileError: missing or damaged.
+        """
+        path = self.folder / "manifest.json"
+        safe.check_size(path, MAX_MANIFEST_BYTES)
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as e:
+            raise InputFileError(f"{path} is damaged ({e}): remove {self.folder} and start again") from None
+        if not isinstance(found, dict):
+            raise InputFileError(f"{path} must hold one JSON object: remove {self.folder} and start again")
+        return found
+
+    def path(self, number: int) -> Path:
+        """Return where a part is kept."""
+        return self.folder / f"{number:06d}.npz"
+
+    def has(self, number: int) -> bool:
+        """Whether a part is there (sound or not)."""
+        return self.path(number).is_file()
+
+    def save(self, number: int, arrays: dict[str, np.ndarray]) -> None:
+        """Store one part, in one step.
+
+        Raises:
+            SceneError: it cannot be written.
+        """
+        with safe.atomic_path(self.path(number)) as path:
+            np.savez(path, **arrays)  # type: ignore[arg-type]
+
+    def load(self, number: int) -> dict[str, np.ndarray]:
+        """Read one part.
+
+        Raises:
+            InputFileError: missing, too large or damaged; the message names it.
+        """
+        path = self.path(number)
+        safe.check_size(path, MAX_PART_BYTES)
+        try:
+            data = path.read_bytes()
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                    raise ValueError("it is compressed")
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except Exception as e:  # zipfile and numpy raise many kinds on corrupt files
+            raise InputFileError(f"{path} is damaged ({type(e).__name__}: {e})") from None
+
+    def claim(self) -> bool:
+        """Return True to one caller only, of all that find the parts complete."""
+        try:
+            (self.folder / "claimed").mkdir()
+        except FileNotFoundError:  # already put together and removed
+            return False
+        except FileExistsError:
+            return False
+        return True
+
+    def finish(self, write: Callable[[Path], None]) -> None:
+        """Write the whole file, and remove the parts.
+
+        It is written within the folder and then moved, so that a killed process leaves nothing beside it.
+
+        Args:
+            write: writes it to the path it is given.
+
+        Raises:
+            SceneError: the file cannot be written.
+        """
+        if not self.exist:
+            write(self.output)
+            return
+        whole = self.folder / f"whole{self.output.suffix}"
+        write(whole)
+        try:
+            os.replace(whole, safe.check_target(self.output))
+        except OSError as e:
+            raise SceneError(f"cannot write {self.output}: {e.strerror}; check the folder and its rights") from None
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove the folder, with the parts and what a killed process left there; the manifest first.
+
+        When this is killed half-way, what is left is no unfinished run.
+        """
+        with contextlib.suppress(FileNotFoundError):
+            (self.folder / "manifest.json").unlink(missing_ok=True)
+            shutil.rmtree(self.folder)

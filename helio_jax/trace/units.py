@@ -1,0 +1,155 @@
+"""Units of work: runs of neighbouring pixels, each traced for itself.
+
+A unit takes a `Job` and the range of its pixels. It gives a `Patch`: counts by order, totals with their variance, maps
+of cause, and what became of the rays. It is a pure function of both: threads, processes, other machines and later runs
+give the same bits on CPUs of one instruction set, which every patch names. Who runs units: `scan`.
+"""
+
+import functools
+import platform
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from helio_jax.errors import ResumeError
+from helio_jax.scene.body import Body
+from helio_jax.trace.intersect import MISS
+from helio_jax.trace.job import Job, Unit, differences, instruction_set
+from helio_jax.trace.masks import hidden_form_factor, is_shadowed
+from helio_jax.trace.run import check_rays, first_hits, make_experiment, pixels_per_block
+from helio_jax.trace.tally import FATES, Estimate
+from helio_jax.trace.transport import Experiment, trace_block
+
+
+@dataclass(frozen=True)
+class Patch:
+    """What a unit gives; whole numbers for `analog`, else per beam ray.
+
+    Attributes:
+        by_order: counts by scattering order [order, detector, pixels].
+        total, variance: of all orders together, the variance being that of the mean [detector, pixels].
+        fates: rays per fate (`FATES`), summed over the pixels [4]; pixel by pixel they add up to those launched.
+        masked: share of each aperture that the sample hides [detector, pixels]; empty where no maps are wanted.
+        shadowed: 1 where the beam cannot see the topmost point [pixels]; empty likewise.
+        cpu: instruction set of the CPU that ran it.
+    """
+
+    by_order: np.ndarray
+    total: np.ndarray
+    variance: np.ndarray
+    fates: np.ndarray
+    masked: np.ndarray
+    shadowed: np.ndarray
+    cpu: str
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the attributes by name, to be stored."""
+        return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], job: Job, unit: Unit) -> "Patch":
+        """Undo `arrays`.
+
+        Raises:
+            ValueError: an array is missing, or not what this unit of this job gives.
+        """
+        n, n_detectors = unit.stop - unit.start, len(job.scene.detector)
+        n_maps = n if job.settings.maps else 0
+        shapes = {
+            "by_order": (job.settings.n_orders, n_detectors, n),
+            "total": (n_detectors, n),
+            "variance": (n_detectors, n),
+            "fates": (len(FATES),),
+            "masked": (n_detectors, n_maps),
+            "shadowed": (n_maps,),
+        }
+        if set(arrays) != {*shapes, "cpu"}:
+            raise ValueError(f"it must hold {', '.join(shapes)} and cpu, it holds {', '.join(arrays) or 'nothing'}")
+        for name, shape in shapes.items():
+            a = arrays[name]
+            if a.shape != shape or a.dtype.kind not in "if" or not np.all(np.isfinite(a)):
+                raise ValueError(f"{name} must be finite numbers of shape {shape}, got {a.dtype} of shape {a.shape}")
+        return cls(**{name: arrays[name] for name in shapes}, cpu=str(arrays["cpu"]))
+
+
+def experiment_of(job: Job, body: Body) -> Experiment:
+    """Prepare what all units of a job share in one process."""
+    return make_experiment(body, job.scene.instrument, job.settings, job.scene.read_laws())
+
+
+def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:
+    """Return the independent pieces of a unit, for `join_pieces`: its blocks of rays, and its maps of cause."""
+    size = pixels_per_block(experiment)
+    starts = range(unit.start, unit.stop, size)
+    out: list[Callable[[], Any]] = [
+        functools.partial(_trace, experiment, job, start, min(start + size, unit.stop)) for start in starts
+    ]
+    maps = functools.partial(_maps, experiment, *job.pixels(unit.start, unit.stop)[1:])
+    return [maps, *out] if job.settings.maps else out
+
+
+def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
+    """Put the results of a unit's `tasks` together, which must be in their order.
+
+    Raises:
+        GuardError: rays are unaccounted for.
+    """
+    blocks = [p for p in pieces if isinstance(p, Estimate)]
+    maps = [p for p in pieces if not isinstance(p, Estimate)]
+    e = Estimate.join(blocks)
+    fates = e.fates.sum(1)
+    check_rays(np.zeros_like(fates), e.n_unaccounted, 1)
+    masked, shadowed = maps[0] if maps else (np.zeros((e.total_mean.shape[0], 0)), np.zeros(0))
+    if experiment.is_expected:
+        return Patch(e.mean, e.total_mean, e.total_variance, fates, masked, shadowed, instruction_set())
+    hits = e.hits.astype(float)
+    return Patch(hits, hits.sum(0), hits.sum(0), fates, masked, shadowed, instruction_set())
+
+
+def trace_unit(job: Job, unit: Unit) -> Patch:
+    """Trace a unit from its description alone; the surface is built once per process.
+
+    Raises:
+        ResumeError: this process sees another mesh file, or runs another version, than the one that sent the job.
+        GuardError: rays are unaccounted for.
+    """
+    with _LOCK:
+        experiment = _prepared(job)
+    return join_pieces(experiment, [task() for task in tasks(experiment, job, unit)])
+
+
+_LOCK = threading.Lock()
+
+
+@functools.lru_cache(maxsize=1)
+def _prepared(job: Job) -> Experiment:
+    body = job.scene.build_body()
+    here = Job.of(job.scene, job.settings, body)
+    if changes := differences(job.about, here.about, ("sender", f"worker on {platform.node()}")):
+        raise ResumeError(
+            "the worker does not run what was sent: " + "; ".join(changes) + "; install the same version and put the "
+            "same files everywhere"
+        )
+    return experiment_of(job, body)
+
+
+def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
+    """Trace a block of pixels."""
+    return trace_block(experiment, *job.pixels(start, stop)).estimate()
+
+
+def _maps(experiment: Experiment, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the maps of cause: `masked` [detector, n] and `shadowed` [n]."""
+    e = experiment
+    hits = first_hits(e.intersector, e.instrument, x, y)
+    found = np.flatnonzero((hits.surface != MISS) & ~hits.is_back)
+    offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)[found]
+    _, fraction = hidden_form_factor(
+        e.intersector, e.instrument, hits.point[found], hits.normal[found], hits.surface[found], offset
+    )
+    masked = np.zeros((len(fraction), len(x)))
+    masked[:, found] = fraction
+    return masked, is_shadowed(e.intersector, e.instrument, x, y).astype(float)
