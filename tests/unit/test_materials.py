@@ -8,7 +8,8 @@ from helio_jax.errors import InputFileError, SceneError
 from helio_jax.scene.files import read_scattering_table
 from helio_jax.scene.sample import MeshSample
 from helio_jax.trace.intersect import Intersector
-from helio_jax.trace.run import make_experiment, trace_scene
+from helio_jax.trace.run import make_experiment
+from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
 
 SCENE = """
