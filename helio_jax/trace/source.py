@@ -71,6 +71,13 @@ def beam_numbers(pixels, n_rays, n_replicates, points, seed):
 
 
 @njit(cache=True, nogil=True)
+def bounce_number(seed, pixel_id, path, event):
+    """Return four random numbers of one path of a pixel for the bounce after `event`."""
+    key, zero = np.uint64(seed), np.uint64(0)
+    return philox(key, _BOUNCE_STREAM, np.uint64(pixel_id), np.uint64(path), np.uint64(event), zero)
+
+
+@njit(cache=True, nogil=True)
 def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, is_low_discrepancy):
     """Return two random numbers per path for the bounce after `event`, and two for the next aperture point [n, 4].
 
@@ -79,9 +86,9 @@ def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, i
     out = np.empty((path.size, 4))
     key, zero = np.uint64(seed), np.uint64(0)
     for i in range(path.size):
-        pixel = np.uint64(pixel_ids[i])
-        a, b, c, d = philox(key, _BOUNCE_STREAM, pixel, np.uint64(path[i]), np.uint64(event), zero)
+        a, b, c, d = bounce_number(seed, pixel_ids[i], path[i], event)
         if event == 0 and is_low_discrepancy:
+            pixel = np.uint64(pixel_ids[i])
             replicate, point = path[i] // paths_per_replicate, path[i] % paths_per_replicate
             a, b, _, _ = philox(key, _BRANCH_STREAM, pixel, np.uint64(replicate), zero, zero)
             a, b = a + bounces[point, 0], b + bounces[point, 1]

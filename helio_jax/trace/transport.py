@@ -15,13 +15,14 @@ import numpy as np
 from numba import njit
 
 from helio_jax.instrument import Instrument
+from helio_jax.trace.analog import fly_to_the_end, land
 from helio_jax.trace.direct import ApertureTable, aperture_point, find_aperture, form_factor
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
-from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED, Tally
+from helio_jax.trace.tally import STOPPED, Tally
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,11 @@ class Experiment:
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all that is done after the first scattering is what `analog` does in one go."""
+        return not self.is_expected and self.laws is None and self.intersector.has_embree
 
 
 @dataclass
@@ -62,7 +68,7 @@ class _Paths:
 
 @njit(cache=True, nogil=True)
 def _settle(
-    event, max_events, n_branches, origin, direction, pixel, point, surface, is_back, offset, plate_z,
+    event, max_events, n_branches, origin, direction, pixel, surface, is_back, offset, plate_z,
     center, semi_axes, cos_sin, fates, hits,
 ):  # fmt: skip
     """Tally the rays that end after this flight; return the indices of those that scatter.
@@ -75,25 +81,17 @@ def _settle(
     share = n_branches if event == 0 else 1
     for i in range(n):
         p = pixel[i]
-        if surface[i] == -1:
-            k = -1
-            if event > 0 and direction[i, 2] > 0.0:
-                s = (plate_z - origin[i, 2]) / direction[i, 2]
-                x = origin[i, 0] + s * direction[i, 0] - offset[p, 0]
-                y = origin[i, 1] + s * direction[i, 1] - offset[p, 1]
-                k = find_aperture(x, y, center, semi_axes, cos_sin)
-            if k >= 0:
-                fates[DETECTED, p] += 1
-                hits[min(event, hits.shape[0]) - 1, k, p] += 1
-            else:
-                fates[ESCAPED, p] += share
-        elif is_back[i]:
-            fates[LOST, p] += share
-        elif event >= max_events:
-            fates[STOPPED, p] += share
-        else:
+        fate, k = land(
+            event, event >= max_events, origin, direction, i, surface[i], is_back[i], offset[p, 0], offset[p, 1],
+            plate_z, center, semi_axes, cos_sin,
+        )  # fmt: skip
+        if fate < 0:
             keep[m] = i
             m += 1
+        else:
+            fates[fate, p] += share
+            if k >= 0:
+                hits[min(event, hits.shape[0]) - 1, k, p] += 1
     return keep[:m]
 
 
@@ -296,9 +294,8 @@ def trace_block(
         else:
             hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
         keep = _settle(
-            event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, hits.point, hits.surface,
-            hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin,
-            tally.fates, tally.hits,
+            event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, hits.surface, hits.is_back,
+            offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, tally.fates, tally.hits,
         )  # fmt: skip
         if e.is_expected and e.laws is not None and event > 0:
             _add_hits(e, event, tally.sums[min(event, e.n_orders) - 1], hits.surface, paths, offset)
@@ -308,4 +305,9 @@ def trace_block(
         if e.is_expected:
             _add_next_event(e, event, ids, tally.sums[min(event, e.n_orders - 1)], hits, paths, offset)
         paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
+        if e.is_plain:
+            flying = paths.origin, paths.direction, paths.pixel, paths.path, paths.skip
+            plate = e.apertures, e.instrument.sample_distance
+            fly_to_the_end(e.intersector, *plate, e.max_events, s.seed, ids, offset, flying, tally)
+            break
     return tally
