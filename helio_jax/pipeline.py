@@ -6,7 +6,7 @@ import os
 import platform
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -214,7 +214,11 @@ def reconstruct(
     def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
         return make_predictor(one, n_rays, refine.substrate_um, multiple=refine.multiple)
 
-    return reconstruct_stack(one, chosen, make_predict, report)
+    rec = reconstruct_stack(one, chosen, make_predict, report)
+    others = [f"{name} ({kind})" for name, kind in one.provenance.get("materials", {}).items() if kind != "cosine"]
+    if not others:
+        return rec
+    return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:

@@ -99,14 +99,19 @@ class Scene(Instrument):
             raise SceneError(f"sample: {_too_high(body.max_height, self.sample_distance)}")
         return body
 
+    @property
+    def used_materials(self) -> dict[str, Law]:
+        """Scattering laws of the materials that the sample uses, by name, but for the default one."""
+        names = set(self.sample.material_names)
+        return {name: law for name, law in self.material.items() if name in names}
+
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
         """Return the scattering laws of the materials that the sample uses, and read their files.
 
         Raises:
             InputFileError: the table of a law is missing or wrong.
         """
-        names = set(self.sample.material_names)
-        return {name: law.terms(self.base_dir) for name, law in self.material.items() if name in names}
+        return {name: law.terms(self.base_dir) for name, law in self.used_materials.items()}
 
     def warnings(self) -> list[str]:
         """Return what is allowed but probably not meant, for `helio validate`."""

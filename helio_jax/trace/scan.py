@@ -234,6 +234,7 @@ class Canvas:
                 "trace": settings.model_dump(mode="json"),
                 "rays": {"launched": sum(fates.values()), **fates},
                 "n_negative": n_negative,
+                "materials": {name: law.kind for name, law in scene.used_materials.items()},
                 "job": self.job.key,
                 "cpu": sorted(self.cpus),
                 **(note if len(self.cpus) > 1 else {}),

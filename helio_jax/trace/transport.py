@@ -5,8 +5,9 @@ the whole batch. Every path is walked as nature does it (re-emission by the law 
 exact integers; the `expected` estimator adds, at every scattering, the probability of going straight to each
 detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus the hidden part,
 which one shadow ray to a random point of the aperture estimates; it has no variance where nothing hides the
-aperture. Lobes are estimated by the same shadow ray and by the atoms that hit, weighted by the balance heuristic
-(Veach and Guibas, SIGGRAPH 1995); exact directions (mirrors) by the atoms that hit alone.
+aperture, and heavy tails where a hidden aperture is many times wider than it is away. Lobes are estimated by the same
+shadow ray and by the atoms that hit, weighted by the balance heuristic (Veach and Guibas, SIGGRAPH 1995); exact
+directions (mirrors) by the atoms that hit alone.
 """
 
 from dataclasses import dataclass

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from helio_jax import pipeline
 from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.scene.files import read_scattering_table
@@ -190,3 +191,19 @@ def test_tables_start_at_the_scene_file(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text("extends = 'sub/base.toml'\n")
     assert len(load_scene(path).read_laws()["x"]) == 1
+
+
+def test_heights_of_another_law_say_so():
+    """The fit takes every surface for cosine: where the scene's is another, the status names it. Catches silence."""
+    changes = {
+        "scan.nx": 12,
+        "scan.ny": 12,
+        "scan.pixel_size_um": 200.0,
+        "trace.rays": 16,
+        "sample.spheres.0.material": "glass",
+        "material.glass": {"kind": "rough_diffuse", "roughness": 0.4},
+        "material.unused": {"kind": "specular"},
+    }
+    scene = load_scene("scenes/sphere_a.toml", changes)
+    status = pipeline.reconstruct(pipeline.simulate(scene), "linear").status
+    assert "NOT the cosine law" in status and "glass (rough_diffuse)" in status and "unused" not in status

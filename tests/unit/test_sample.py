@@ -1,16 +1,19 @@
 """Sample geometry against closed forms, a brute-force ray caster and trimesh."""
 
 import math
+import time
 
 import numpy as np
 import pytest
 import trimesh
 from pydantic import TypeAdapter
 
-from helio_jax.errors import InputFileError, SceneError
+from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.heightmap import HeightMap
 from helio_jax.scene.sample import HeightMapSample, MeshSample, Sample, check_body
 from helio_jax.scene.surfaces import WALL_SEGMENTS, Body, first_hit_spheres, surface_body
+from helio_jax.trace.run import make_experiment, trace_pixels
+from helio_jax.trace.settings import TraceSettings
 
 TAN30 = math.tan(math.radians(30.0))
 KINDS = {
@@ -346,6 +349,33 @@ def test_bad_meshes(tmp_path, name, content, message):
     with pytest.raises(InputFileError, match=message) as error:
         MeshSample(file=name, unit="um").build(tmp_path)
     assert name in str(error.value)
+
+
+def test_noise_as_a_mesh_is_refused(tmp_path):
+    """50 MB of noise as STL: an InputFileError that names the file, soon. Catches a reader that hangs or trusts it."""
+    (tmp_path / "noise.stl").write_bytes(np.random.default_rng(0).bytes(50_000_000))
+    start = time.monotonic()
+    with pytest.raises(InputFileError, match=r"noise\.stl"):
+        MeshSample(file="noise.stl", unit="um").build(tmp_path)
+    assert time.monotonic() - start < 60.0
+
+
+def test_a_mesh_with_holes_is_counted_and_refused(tmp_path, bshem):
+    """100 faces missing from a closed ball: `validate` counts the open edges, the tracer refuses the lost atoms.
+
+    Catches a silent wrong number: atoms that fly into the ball meet its wall from behind.
+    """
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=300.0)
+    rng = np.random.default_rng(1)
+    up = np.flatnonzero(ball.triangles_center[:, 2] > 100.0)
+    ball.update_faces(~np.isin(np.arange(len(ball.faces)), rng.choice(up, 100, replace=False)))
+    ball.export(tmp_path / "ball.stl")
+    body = MeshSample(file="ball.stl", unit="um").build(tmp_path)
+    assert check_body(body)["n_inner_open_edges"] > 100 and not check_body(body)["is_watertight"]
+    axis = np.linspace(-150.0, 150.0, 15)
+    x, y = (g.ravel() for g in np.meshgrid(axis, axis))
+    with pytest.raises(GuardError, match="met a surface from behind"):
+        trace_pixels(make_experiment(body, bshem, TraceSettings(rays=64)), x, y)
 
 
 def test_large_mesh_is_refused(tmp_path):
