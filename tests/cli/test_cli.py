@@ -1,5 +1,6 @@
 """The command line, as a user meets it: files, output, exit codes."""
 
+import functools
 import json
 import os
 import signal
@@ -116,7 +117,9 @@ def test_interrupt_ends_with_130(small_scene, tmp_path):
     assert helio("simulate", small_scene, "-o", tmp_path / "first.h5", "--rays", "8").returncode == 0
     (tmp_path / "first.h5").unlink()
     command = [sys.executable, "-m", "helio_jax", "simulate", str(small_scene), "-o", str(tmp_path / "s.h5")]
-    process = subprocess.Popen([*command, "--rays", "20000"], stderr=subprocess.PIPE, text=True)
+    # a shell's background job ignores Ctrl-C, and so does what it starts: the gate may be one
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen([*command, "--rays", "20000"], stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     assert process.stderr is not None
     said = process.stderr.readline()
     for _ in range(6):
