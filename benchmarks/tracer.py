@@ -43,11 +43,31 @@ def around(z: np.ndarray, r: np.ndarray, n: int) -> Body:
     return Body(rings.reshape(-1, 3), faces)
 
 
-def cavity(open_share: float, n: int) -> tuple[Body, float, float]:
-    """Return a sphere seen from inside with a hole at the top of a share of its area; height and radius of the hole."""
-    top = 1.0 - 2.0 * open_share
+def cavity(open_share: float, n: int) -> tuple[Body, Hits, Instrument]:
+    """Return a sphere seen from inside with a hole at the top of a share of its area, its bottom, and the hole.
+
+    The plate of the tracer lies above z = 0, so the cavity is lifted.
+    """
+    top, lift = 1.0 - 2.0 * open_share, 2.0 * RADIUS
     angle = np.linspace(np.pi, np.arccos(top), n)
-    return around(RADIUS * np.cos(angle), RADIUS * np.sin(angle), n), RADIUS * top, RADIUS * np.sqrt(1.0 - top**2)
+    body = around(RADIUS * np.cos(angle) + lift, RADIUS * np.sin(angle), n)
+    hole = above(RADIUS * top + lift, RADIUS * np.sqrt(1.0 - top**2))
+    return body, upward(np.array([[0.0, 0.0, lift - RADIUS]])), hole
+
+
+def upward(points: np.ndarray) -> Hits:
+    """Return points [n, 3] on level facets, for atoms to start from."""
+    return Hits.on_mesh(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+
+
+def tube_transmission(ratio: float, n_points: int, rays: int) -> tuple[float, float]:
+    """Return the share of atoms that pass a tube of a length over radius, and its standard error."""
+    tube = around(np.array([0.0, ratio * RADIUS]), np.full(2, RADIUS), 720)
+    rng = np.random.default_rng(1)
+    r, turn = RADIUS * np.sqrt(rng.random(n_points)), 2.0 * np.pi * rng.random(n_points)
+    entrance = upward(np.stack([r * np.cos(turn), r * np.sin(turn), np.zeros(n_points)], -1))
+    share = analog(tube, above(ratio * RADIUS, RADIUS), entrance, rays).hits.sum((0, 1)) / rays
+    return float(share.mean()), float(share.std() / np.sqrt(n_points))
 
 
 def above(height: float, radius: float) -> Instrument:
@@ -64,7 +84,7 @@ def analog(body: Body, instrument: Instrument, first: Hits, rays: int, n_orders:
     return trace_pixels(make_experiment(body, instrument, settings), zero, zero, first=first)
 
 
-def judged(what: str, found: float, exact: float, std: float) -> Row:
+def judged(what: str, found: float, std: float, exact: float) -> Row:
     """Judge a measurement against a closed form: within 4 standard errors of 0.1 % or better."""
     good = abs(found - exact) <= 4.0 * std and std <= 1.05e-3 * exact
     return row("3", what, f"{found:.6f} +- {std:.6f}", f"{exact:.6f}", bool(good))
@@ -72,42 +92,27 @@ def judged(what: str, found: float, exact: float, std: float) -> Row:
 
 def closed_forms(scale: int) -> list[Row]:
     """Row 3: Clausing's tubes, a cavity with a hole, the floor of a slot, the length of a mask."""
-    rows, rng = [], np.random.default_rng(1)
+    rows = []
     for ratio, exact in CLAUSING.items():
-        tube = around(np.array([0.0, ratio * RADIUS]), np.full(2, RADIUS), 720)
         n = 4000 // scale
-        r, turn = RADIUS * np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
-        point = np.stack([r * np.cos(turn), r * np.sin(turn), np.zeros(n)], -1)
         rays = max(int(3.4e6 * (1.0 / exact - 1.0) / n) + 1, 64) if scale == 1 else 64
-        up = np.tile([0.0, 0.0, 1.0], (n, 1))
-        tally = analog(tube, above(ratio * RADIUS, RADIUS), Hits.on_mesh(point, up), rays)
-        share = tally.hits.sum((0, 1)) / rays
-        rows.append(judged(f"Clausing tube, length / radius {ratio}", share.mean(), exact, share.std() / np.sqrt(n)))
-    open_share, n_orders = 0.1, 8
-    body, height, radius = cavity(open_share, 400)
-    n, rays = 100, 150_000 // scale
-    start = Hits.on_mesh(np.tile([0.0, 0.0, -RADIUS], (n, 1)), np.tile([0.0, 0.0, 1.0], (n, 1)))
-    # the plate of the tracer lies above z = 0, so the cavity is lifted
-    lift = np.array([0.0, 0.0, 2.0 * RADIUS])
-    lifted = Body(body.vertices + lift, body.faces)
-    start = Hits.on_mesh(start.point + lift, start.normal)
-    tally = analog(lifted, above(height + lift[2], radius), start, rays, n_orders)
-    hits = tally.hits.sum((1, 2))
+        rows.append(judged(f"Clausing tube, length / radius {ratio}", *tube_transmission(ratio, n, rays), exact))
+    open_share, n, rays = 0.1, 100, 150_000 // scale
+    body, bottom, hole = cavity(open_share, 400)
+    hits = analog(body, hole, bottom.take(np.zeros(n, int)), rays, n_orders=8).hits.sum((1, 2))
     for k in (0, 1, 4):
         exact = open_share * (1.0 - open_share) ** k
         found = hits[k] / (n * rays)
         std = np.sqrt(exact * (1.0 - exact) / (n * rays))
-        rows.append(judged(f"sphere with a hole of a tenth of it, order {k + 1}", found, exact, std))
+        rows.append(judged(f"sphere with a hole of a tenth of it, order {k + 1}", found, std, exact))
     width, depth = 400.0, 300.0
     slot = TrenchSample(width_um=width, length_um=60_000.0, depth_um=depth, size_um=80_000.0).build()
     wide = above(4000.0, 4e6)
     n, rays = 100, 20_000 // scale
-    tally = analog(
-        slot, wide, Hits.on_mesh(np.tile([0.0, 0.0, -depth], (n, 1)), np.tile([0.0, 0.0, 1.0], (n, 1))), rays
-    )
+    tally = analog(slot, wide, upward(np.tile([0.0, 0.0, -depth], (n, 1))), rays)
     exact = 1.0 / np.sqrt(1.0 + (2.0 * depth / width) ** 2)
     std = np.sqrt(exact * (1.0 - exact) / (n * rays))
-    rows.append(judged("floor of a slot: share of the sky", tally.hits[0].sum() / (n * rays), exact, std))
+    rows.append(judged("floor of a slot: share of the sky", tally.hits[0].sum() / (n * rays), std, exact))
     return rows + mask_lengths()
 
 
@@ -136,7 +141,7 @@ def mask_lengths() -> list[Row]:
         found = float(np.interp(0.5, np.clip(single / single.max(), 0.0, 1.0), length))
         where = "across from" if is_across else "beside"
         rows.append(
-            judged(f"mask of a step, source {where} the detector [um]", found, float(exact), 5e-4 * float(exact))
+            judged(f"mask of a step, source {where} the detector [um]", found, 5e-4 * float(exact), float(exact))
         )
     return rows
 
@@ -169,13 +174,12 @@ def engines(n_rays: int, n_flights: float) -> list[Row]:
     text = f"{differ.size} other triangles, {n_left} unexplained"
     rows = [row("4", f"{n_rays} rays at edges and grazing, Embree and float64", text, "0 unexplained", n_left == 0)]
     angle = np.linspace(np.pi, 0.0, 200)
-    closed = around(RADIUS * np.cos(angle), RADIUS * np.sin(angle), 200)
-    lift = np.array([0.0, 0.0, 2.0 * RADIUS])
+    closed = around(RADIUS * np.cos(angle) + 2.0 * RADIUS, RADIUS * np.sin(angle), 200)
     n, events = 512, 1000
     rays = max(int(n_flights / events / n), 1)
-    start = Hits.on_mesh(np.tile(lift - [0.0, 0.0, 0.9999 * RADIUS], (n, 1)), np.tile([0.0, 0.0, 1.0], (n, 1)))
     settings = TraceSettings(rays=max(rays, 8), estimator="analog", max_events=events, maps=False)
-    experiment = make_experiment(Body(closed.vertices + lift, closed.faces), above(5.0 * RADIUS, RADIUS), settings)
+    experiment = make_experiment(closed, above(5.0 * RADIUS, RADIUS), settings)
+    start = upward(np.tile([0.0, 0.0, RADIUS], (n, 1)))
     tally = trace_pixels(experiment, np.zeros(n), np.zeros(n), first=start, max_lost=1.0)
     fates = tally.fates.sum(1)
     out_of = fates[0] + fates[1]
@@ -270,12 +274,9 @@ def bounce_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
     """Row 8: the analog bounce loop against the bare embreex call on the same rays."""
     rows = []
     for n in sizes:
-        body, height, radius = cavity(0.05, n)
-        lift = np.array([0.0, 0.0, 2.0 * RADIUS])
-        body = Body(body.vertices + lift, body.faces)
+        body, start, hole = cavity(0.05, n)
         settings = TraceSettings(rays=n_rays, estimator="analog", max_events=30, maps=False)
-        experiment = make_experiment(body, above(height + lift[2], radius), settings)
-        start = Hits.on_mesh(np.array([lift - [0.0, 0.0, 0.999 * RADIUS]]), np.array([[0.0, 0.0, 1.0]]))
+        experiment = make_experiment(body, hole, settings)
         embree: Any = experiment.intersector._embree
         seen, kept = [], []
 

@@ -6,7 +6,7 @@ scene imports neither JAX nor the tracer. Units: see helio_jax.settings.
 
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -106,17 +106,29 @@ def _read_extended(path: Path) -> dict[str, Any]:
             f"{path}: extends = {name!r}: that file extends {base['extends']!r} itself; only one level is allowed: "
             "put everything needed into one of the two"
         )
-    for table in ("sample", "material"):
-        _move_files(base.get(table), base_path.parent, path.parent)
-    return _merge(base, data)
+
+    def moved(name: str) -> str:
+        return (
+            name if Path(name).is_absolute() else Path(os.path.relpath(base_path.parent / name, path.parent)).as_posix()
+        )
+
+    return _merge(with_files(base, moved), data)
 
 
-def _move_files(node: Any, old: Path, new: Path) -> None:
-    """Let every relative `file` in tables and lists, which starts at the folder `old`, start at `new`."""
-    if isinstance(node, dict) and isinstance(node.get("file"), str) and not Path(node["file"]).is_absolute():
-        node["file"] = Path(os.path.relpath(old / node["file"], new)).as_posix()
-    for child in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
-        _move_files(child, old, new)
+def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """Return a scene's tables with the name of every file, relative to the scene, changed."""
+
+    def changed(node: Any) -> Any:
+        if isinstance(node, list):
+            return [changed(child) for child in node]
+        if not isinstance(node, dict):
+            return node
+        return {
+            key: change(child) if key == "file" and isinstance(child, str) else changed(child)
+            for key, child in node.items()
+        }
+
+    return {key: changed(node) if key in ("sample", "material") else node for key, node in tables.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -120,8 +120,13 @@ def simulate_file(
     scene = load_scene(scene_path, overrides)
     parts = Parts(Path(output))
     shard = Shard.parse(o.shard) if o.shard else None
-    command = {"verb": verb, "scene": str(Path(scene_path).resolve()), "overrides": overrides, "noise": o.noise}
-    command |= {"crew": asdict(o.crew)}
+    command = {
+        "verb": verb,
+        "scene": str(Path(scene_path).resolve()),
+        "overrides": overrides,
+        "noise": o.noise,
+        "crew": asdict(o.crew),
+    }
     keeper = Keeper(parts, command, o.crew, shard, o.restart, o.say)
     stack = keeper.trace(scene, scene.trace, o.progress)
     if stack is None:
@@ -157,9 +162,8 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     if is_run:
         return list(run(scene, output.parent, overrides=overrides, stage=stage, crew=crew, say=say).files.values())
     with stage("tracing") as progress:
-        simulate_file(
-            scene, output, overrides=overrides, options=SimulateOptions(noise, crew, None, False, progress, say)
-        )
+        options = SimulateOptions(noise=noise, crew=crew, progress=progress, say=say)
+        simulate_file(scene, output, overrides=overrides, options=options)
     return [output]
 
 
@@ -367,7 +371,7 @@ def run(
     names |= {"report": "report.html"} if report else {}
     files = {label: out / name for label, name in names.items()}
     with stage("simulating micrographs") as progress:
-        options = SimulateOptions(True, crew, None, restart, progress, say)
+        options = SimulateOptions(noise=True, crew=crew, restart=restart, progress=progress, say=say)
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
     assert stack is not None  # no shards here
     with stage("reconstructing heights") as progress:

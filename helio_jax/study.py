@@ -25,7 +25,7 @@ from scipy.stats import qmc
 
 from helio_jax import pipeline
 from helio_jax.checkpoint import Shard
-from helio_jax.config import load_scene, resolved
+from helio_jax.config import load_scene, resolved, with_files
 from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.evaluate.sweep import save_sweep
 from helio_jax.explain import explain_errors
@@ -263,18 +263,7 @@ def _scene_text(path: Path, overrides: dict[str, Any], place: str) -> str:
         scene = load_scene(path, overrides)
     except SceneError as e:
         raise SceneError(f"{place}: {e}") from None
-    tables = resolved(scene)
-    return to_toml(tables | {key: _absolute(tables[key], scene.base_dir) for key in ("sample", "material")})
-
-
-def _absolute(value: Any, base_dir: Path) -> Any:
-    """Return a tree of settings with the names of all files made absolute."""
-    if isinstance(value, dict):
-        return {
-            key: str((base_dir / inner).resolve()) if key == "file" and inner else _absolute(inner, base_dir)
-            for key, inner in value.items()
-        }
-    return [_absolute(inner, base_dir) for inner in value] if isinstance(value, list) else value
+    return to_toml(with_files(resolved(scene), lambda name: str((scene.base_dir / name).resolve())))
 
 
 def _run_point(study: Study, point: _Point, text: str, options: pipeline.SimulateOptions) -> None:

@@ -142,6 +142,20 @@ class Coherent(DiffuseRest):
         return 0.0 if self.debye_waller is None else self.debye_waller.attenuation
 
 
+class GaussianLobe(DiffuseRest):
+    """A lobe cos(theta) exp(-g^2 / (2 s^2)) per steradian, g the angle to its axis."""
+
+    sigma_deg: float = Field(ge=1.0, le=180.0)
+    """Width s of the lobe [deg]."""
+    compat: Compat = "none"
+    """`shem-ray-tracing`: half the stated width."""
+
+    @property
+    def sigma(self) -> float:
+        """Width of the lobe [rad]."""
+        return math.radians(self.sigma_deg) * (1.0 if self.compat == "none" else 0.5)
+
+
 class SpecularLaw(Coherent):
     """A perfect mirror."""
 
@@ -152,34 +166,24 @@ class SpecularLaw(Coherent):
         return self.with_rest(Shape.SPECULAR, attenuation=self.attenuation)
 
 
-class BroadSpecularLaw(Coherent):
-    """A lobe cos(theta) exp(-g^2 / (2 s^2)) per steradian, g the angle to the specular direction."""
+class BroadSpecularLaw(GaussianLobe, Coherent):
+    """A Gaussian lobe about the specular direction."""
 
     kind: Literal["broad_specular"] = "broad_specular"
-    sigma_deg: float = Field(ge=1.0, le=180.0)
-    """Width s of the lobe [deg]."""
-    compat: Compat = "none"
-    """`shem-ray-tracing`: half the stated width."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
         """Return what the law is made of."""
-        sigma = math.radians(self.sigma_deg) * (1.0 if self.compat == "none" else 0.5)
-        return self.with_rest(Shape.LOBE, (sigma, 1.0), attenuation=self.attenuation)
+        return self.with_rest(Shape.LOBE, (self.sigma, 1.0), attenuation=self.attenuation)
 
 
-class BackscatteringLaw(DiffuseRest):
-    """A lobe cos(theta) exp(-g^2 / (2 s^2)) per steradian, g the angle to where the atom came from."""
+class BackscatteringLaw(GaussianLobe):
+    """A Gaussian lobe about where the atom came from."""
 
     kind: Literal["backscattering"] = "backscattering"
-    sigma_deg: float = Field(ge=1.0, le=180.0)
-    """Width s of the lobe [deg]."""
-    compat: Compat = "none"
-    """`shem-ray-tracing`: half the stated width."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
         """Return what the law is made of."""
-        sigma = math.radians(self.sigma_deg) * (1.0 if self.compat == "none" else 0.5)
-        return self.with_rest(Shape.LOBE, (sigma, -1.0))
+        return self.with_rest(Shape.LOBE, (self.sigma, -1.0))
 
 
 class CosineSpecularLaw(DiffuseRest):

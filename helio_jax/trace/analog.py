@@ -8,7 +8,7 @@ does the same in separate steps for other laws, for the expected estimator and w
 import numpy as np
 from numba import njit
 
-from helio_jax.trace.direct import ApertureTable, find_aperture
+from helio_jax.trace.direct import ApertureTable, aperture_ahead
 from helio_jax.trace.intersect import MISS, Intersector, resolve_hit
 from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.source import bounce_number
@@ -28,10 +28,8 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
         if is_back:
             return LOST, -1
         return (STOPPED if is_last else -1), -1
-    if event > 0 and directions[i, 2] > 0.0:
-        s = (plate_z - origins[i, 2]) / directions[i, 2]
-        x, y = origins[i, 0] + s * directions[i, 0] - x, origins[i, 1] + s * directions[i, 1] - y
-        k = find_aperture(x, y, center, semi_axes, cos_sin)
+    if event > 0:
+        k, _ = aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin)
         if k >= 0:
             return DETECTED, k
     return ESCAPED, -1

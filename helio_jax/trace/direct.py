@@ -75,6 +75,16 @@ def find_aperture(x, y, center, semi_axes, cos_sin):
 
 
 @njit(cache=True, nogil=True)
+def aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin):
+    """Return the aperture that ray `i` flies through, or -1, and its distance [um]; `x`, `y`: the plate's origin."""
+    if directions[i, 2] <= 0.0:
+        return -1, 0.0
+    r = (plate_z - origins[i, 2]) / directions[i, 2]
+    x, y = origins[i, 0] + r * directions[i, 0] - x, origins[i, 1] + r * directions[i, 1] - y
+    return find_aperture(x, y, center, semi_axes, cos_sin), r
+
+
+@njit(cache=True, nogil=True)
 def aperture_point(u, v, k, center, semi_axes, cos_sin):
     """Map two uniform numbers to a point uniform in area on aperture `k`; return (x, y) [um]."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v

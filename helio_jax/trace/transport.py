@@ -17,7 +17,7 @@ from numba import njit
 
 from helio_jax.instrument import Instrument
 from helio_jax.trace.analog import fly_to_the_end, land
-from helio_jax.trace.direct import ApertureTable, aperture_point, find_aperture, form_factor
+from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
@@ -174,10 +174,9 @@ def _score_hits(
 ):  # fmt: skip
     """Add the lobes' atoms that hit an aperture."""
     for i in range(origin.shape[0]):
-        if density[i] > 0.0 and surface[i] == MISS and direction[i, 2] > 0.0:
-            r, p = (plate_z - origin[i, 2]) / direction[i, 2], pixel[i]
-            x, y = origin[i, 0] + r * direction[i, 0] - offset[p, 0], origin[i, 1] + r * direction[i, 1] - offset[p, 1]
-            k = find_aperture(x, y, center, semi_axes, cos_sin)
+        if density[i] > 0.0 and surface[i] == MISS:
+            p = pixel[i]
+            k, r = aperture_ahead(origin, direction, i, offset[p, 0], offset[p, 1], plate_z, center, semi_axes, cos_sin)
             if k >= 0:
                 value = _balance(density[i], n_hits, r * r, direction[i, 2], area[k])
                 sums[replicate[i], k, p] += share * n_hits * value

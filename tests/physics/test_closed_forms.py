@@ -9,7 +9,6 @@ from stats import assert_likely, assert_mean, pooled_chi2
 
 from benchmarks import tracer
 from helio_jax.scene.shapes import Sphere, SpheresSample, TrenchSample
-from helio_jax.trace.intersect import Hits
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED
@@ -22,16 +21,9 @@ def test_clausing_tube(ratio):
     60 000 atoms: 1 % (L/R = 5: 2 %) is rejected. Catches walls that do not scatter by the cosine law (a specular tube
     passes all), leaks, a random direction about the wrong normal, and atoms that are lost near the rim.
     """
-    tube = tracer.around(np.array([0.0, ratio * tracer.RADIUS]), np.full(2, tracer.RADIUS), 720)
-    rng, n, rays = np.random.default_rng(4), 600, 100
-    r, turn = tracer.RADIUS * np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
-    point = np.stack([r * np.cos(turn), r * np.sin(turn), np.zeros(n)], -1)
-    first = Hits.on_mesh(point, np.tile([0.0, 0.0, 1.0], (n, 1)))
-    tally = tracer.analog(tube, tracer.above(ratio * tracer.RADIUS, tracer.RADIUS), first, rays)
-    share = tally.hits.sum((0, 1)) / rays
+    share, std = tracer.tube_transmission(ratio, 600, 100)
     exact = tracer.CLAUSING[ratio]
-    std = share.std() / np.sqrt(n)
-    assert_mean(share.mean(), exact, std, f"transmission of a tube of L/R = {ratio}")
+    assert_mean(share, exact, std, f"transmission of a tube of L/R = {ratio}")
     assert 6.0 * std < 0.05 * exact
 
 
@@ -42,11 +34,8 @@ def test_sphere_with_a_hole():
     cosine law, for which the chance would depend on where the atom is.
     """
     share, n_orders, n = 0.1, 13, 200_000
-    body, height, radius = tracer.cavity(share, 200)
-    lift = np.array([0.0, 0.0, 2.0 * tracer.RADIUS])
-    start = Hits.on_mesh((lift - [0.0, 0.0, tracer.RADIUS])[None], np.array([[0.0, 0.0, 1.0]]))
-    lifted = tracer.Body(body.vertices + lift, body.faces)
-    hits = tracer.analog(lifted, tracer.above(height + lift[2], radius), start, n, n_orders).hits.sum((1, 2))
+    body, bottom, hole = tracer.cavity(share, 200)
+    hits = tracer.analog(body, hole, bottom, n, n_orders).hits.sum((1, 2))
     expected = n * share * (1.0 - share) ** np.arange(n_orders - 1)
     assert_likely(pooled_chi2(hits[:-1], expected, 0.0 * expected), "orders of a cavity")
     assert pooled_chi2(hits[1:], expected, 0.0 * expected) < 1e-12  # one order off
