@@ -3,21 +3,22 @@
 All rays of a block fly in step: flight e starts after e scatterings, so the scattering order is the same for
 the whole batch. Every path is walked as nature does it (re-emission by the law of the surface hit) and tallied in
 exact integers; the `expected` estimator adds, at every scattering, the probability of going straight to each
-detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus the hidden part,
-which one shadow ray to a random point of the aperture estimates; it has no variance where nothing hides the
-aperture, and heavy tails where a hidden aperture is many times wider than it is away. Lobes are estimated by the same
-shadow ray and by the atoms that hit, weighted by the balance heuristic (Veach and Guibas, SIGGRAPH 1995); exact
-directions (mirrors) by the atoms that hit alone.
+detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus the hidden
+part; it has no variance where nothing hides the aperture. The hidden part is estimated by a shadow ray to a random
+point of the aperture or, where an aperture is so wide that this has the larger variance, by the atoms that fly on and
+do not get there (maximum heuristic); what lobes send by both at once, weighted by the balance heuristic (Veach and
+Guibas, SIGGRAPH 1995). So neither a narrow lobe nor a wide aperture makes heavy tails. Exact directions (mirrors) are
+estimated by the atoms that hit alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
 
 from helio_jax.instrument import Instrument
 from helio_jax.trace.analog import fly_to_the_end, land
-from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor
+from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor, is_inside
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
@@ -50,7 +51,7 @@ class _Paths:
     """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
 
     `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
-    direction (laws.scatter_atoms) [n].
+    direction (laws.scatter_atoms) [n], `normal` that of the surface left (zero: the pinhole) [n, 3].
     """
 
     origin: np.ndarray
@@ -60,11 +61,11 @@ class _Paths:
     target: np.ndarray
     skip: np.ndarray
     density: np.ndarray
+    normal: np.ndarray
 
     def take(self, keep: np.ndarray) -> "_Paths":
         """Return some of the rays."""
-        columns = (self.origin, self.direction, self.pixel, self.path, self.target, self.skip, self.density)
-        return _Paths(*(column[keep] for column in columns))
+        return _Paths(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 @njit(cache=True, nogil=True)
@@ -111,7 +112,17 @@ def lift_off(point, normal, surface, restart):
 
 
 @njit(cache=True, nogil=True)
-def _aim(k, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
+def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
+    """Return the chance that an atom goes to an aperture as small as a point and `area` large, if aiming may tell it.
+
+    It is 0 where `n_hits` atoms that fly on tell it with less variance. Signed as the cosine at the surface.
+    """
+    weight = area * cosine_surface * cosine_plate / square / np.pi
+    return weight if n_hits * abs(weight) <= 1.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
     """Aim at a random point of aperture `k`: direction, weight of that point, and whether it can count at all."""
     n = point.shape[0]
     direction, weight, is_open = np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
@@ -123,9 +134,9 @@ def _aim(k, point, normal, pixel, offset, plate_z, target, center, semi_axes, co
         r2 = dx * dx + dy * dy + dz * dz
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
-        cos_surface = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
-        weight[i] = area[k] * cos_surface * dz / r / r2 / np.pi
-        is_open[i] = cos_surface > 0.0 and find_aperture(x, y, center, semi_axes, cos_sin) == k
+        cosine = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
+        weight[i] = _aimed_weight(n_hits, r2, cosine, dz / r, area[k])
+        is_open[i] = cosine > 0.0 and find_aperture(x, y, center, semi_axes, cos_sin) == k
     return direction, weight, is_open
 
 
@@ -183,6 +194,35 @@ def _score_hits(
 
 
 @njit(cache=True, nogil=True)
+def _subtract_hidden(
+    share, n_hits, density, normal, origin, direction, pixel, replicate, surface, offset, plate_z, center, semi_axes,
+    cos_sin, area, sums,
+):  # fmt: skip
+    """Subtract the wide apertures that cosine atoms do not reach though they fly towards them: what `_score` left.
+
+    The mirror image of an atom's direction below the surface it leaves tells of the parts below the horizon there.
+    """
+    for i in range(origin.shape[0]):
+        if density[i] != 0.0:
+            continue
+        n, d = normal[i], direction[i]
+        cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+        for sign in (1.0, -1.0):
+            dz = d[2] if sign > 0.0 else d[2] - 2.0 * cosine * n[2]
+            is_hidden = sign < 0.0 or surface[i] != MISS
+            if dz <= 0.0 or cosine <= 0.0:
+                continue
+            r = (plate_z - origin[i, 2]) / dz
+            x = origin[i, 0] - offset[pixel[i], 0] + r * (d[0] if sign > 0.0 else d[0] - 2.0 * cosine * n[0])
+            y = origin[i, 1] - offset[pixel[i], 1] + r * (d[1] if sign > 0.0 else d[1] - 2.0 * cosine * n[1])
+            for k in range(center.shape[0]):
+                if is_inside(x, y, k, center, semi_axes, cos_sin):
+                    if is_hidden and _aimed_weight(n_hits, r * r, cosine, dz, area[k]) == 0.0:
+                        sums[replicate[i], k, pixel[i]] -= sign * share
+                    is_hidden = True  # where apertures overlap, the first one has it
+
+
+@njit(cache=True, nogil=True)
 def _bounce(normal, u):
     """Draw cosine-distributed directions about the normals [n, 3]."""
     out = np.empty(normal.shape)
@@ -201,7 +241,7 @@ def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, 
     """Add the expected contribution of every vertex to every detector (the next-event estimate)."""
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
     point, normal, pixel = hits.point, hits.normal, paths.pixel
-    replicate = _replicate(e.sampling, paths.path, n_branches)
+    replicate, n_hits = _replicate(e.sampling, paths.path, n_branches), e.sampling.n_branches if event == 0 else 1
     shape = (table.center, table.semi_axes, table.cos_sin)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
@@ -210,7 +250,9 @@ def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, 
         key = (ids[pixel], paths.path, event, e.sampling.seed)
         cosine = cosine_shares(e.laws, material, paths.direction, normal, *key)
     for k in range(len(table.center)):
-        direction, weight, is_open = _aim(k, point, normal, pixel, offset, plate_z, paths.target, *shape, table.area)
+        direction, weight, is_open = _aim(
+            k, n_hits, point, normal, pixel, offset, plate_z, paths.target, *shape, table.area
+        )
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
@@ -218,7 +260,6 @@ def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, 
             table.semi_axes, table.rims, sums,
         )  # fmt: skip
         if e.laws is not None:
-            n_hits = e.sampling.n_branches if event == 0 else 1
             _score_lobes(
                 k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, pixel, replicate,
                 direction, is_open, plate_z, table.area, sums,
@@ -226,13 +267,14 @@ def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, 
 
 
 def _add_hits(e: Experiment, event: int, sums, surface: np.ndarray, paths: _Paths, offset) -> None:
-    """Add the atoms of lobes that hit a detector after scattering `event` times."""
+    """Add what the atoms that fly on after scattering `event` times tell: lobes' hits, and what is hidden."""
     n_branches, table = e.sampling.n_branches, e.apertures
-    _score_hits(
-        1.0 / n_branches, n_branches if event == 1 else 1, paths.density, paths.origin, paths.direction, paths.pixel,
-        _replicate(e.sampling, paths.path, n_branches), surface, offset, e.instrument.sample_distance, table.center,
-        table.semi_axes, table.cos_sin, table.area, sums,
-    )  # fmt: skip
+    weight = 1.0 / n_branches, n_branches if event == 1 else 1
+    flight = paths.origin, paths.direction, paths.pixel, _replicate(e.sampling, paths.path, n_branches), surface
+    plate = offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, table.area
+    _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, sums)
+    if e.laws is not None:
+        _score_hits(*weight, paths.density, *flight, *plate, sums)
 
 
 def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> _Paths:
@@ -242,9 +284,8 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     origin, direction = launch_rays(e.instrument, x, y, numbers)
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
-    return _Paths(
-        origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(flying.size, -1, np.int32), np.zeros(flying.size)
-    )
+    skip, density, normal = np.full(flying.size, -1, np.int32), np.zeros(flying.size), np.zeros((flying.size, 3))
+    return _Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal)
 
 
 def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, stopped: np.ndarray) -> _Paths:
@@ -262,11 +303,12 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
     u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
     if e.laws is None:
-        return _Paths(origin, _bounce(hits.normal, u), pixel, path, u[:, 2:].copy(), skip, np.zeros(len(path)))
+        direction, density = _bounce(hits.normal, u), np.zeros(len(path))
+        return _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, hits.normal)
     material, key = e.intersector.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
     direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
     stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
-    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density)
+    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, hits.normal)
     return out if leaves.all() else out.take(leaves)
 
 
@@ -297,7 +339,7 @@ def trace_block(
             event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, hits.surface, hits.is_back,
             offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, tally.fates, tally.hits,
         )  # fmt: skip
-        if e.is_expected and e.laws is not None and event > 0:
+        if e.is_expected and event > 0:
             _add_hits(e, event, tally.sums[min(event, e.n_orders) - 1], hits.surface, paths, offset)
         if not keep.size:
             break
