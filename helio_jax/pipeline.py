@@ -276,8 +276,11 @@ def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = Fals
 def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
     """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
     sample, region = scene.sample, _region(scene, 0.0)
-    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or region is None:
-        raise SceneError(f"{path}: fitting a centre needs a scene with one sphere and truth.region_radius_um")
+    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or sample.is_placed or region is None:
+        raise SceneError(
+            f"{path}: fitting a centre needs a scene with one sphere, which sample.scale, rotate_deg and translate_um "
+            "leave where it is, and truth.region_radius_um"
+        )
     grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
     (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift
 

@@ -13,9 +13,14 @@ from pydantic import Field, PrivateAttr, model_validator
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Aperture, Instrument
 from helio_jax.scene.body import COSINE, Body
-from helio_jax.scene.sample import HeightMapSample, MeshSample, Sample, SeveralSamples
+from helio_jax.scene.rough import RoughSample
+from helio_jax.scene.sample import Sample
 from helio_jax.scene.scan import Raster
 from helio_jax.scene.scattering import Law, Term
+
+FINER = 4.0
+"""Truth should have this many points per pixel at least, or it is one that the fit could represent."""
+_MAX_DISTANCE = 1e7  # as plate.sample_distance_um
 
 
 class Scene(Instrument):
@@ -56,7 +61,8 @@ class Scene(Instrument):
         elif not self._overlaps_flat():
             problems.append(
                 f"scan.center_um: the raster about {list(self.scan.center_um)} um lies wholly beside the sample, whose "
-                f"flat ends at +-{0.5 * self.flat_size:g} um: move scan.center_um or enlarge sample.size_um"
+                f"flat ends {0.5 * self.flat_size:g} um from {list(self.sample.translate_um[:2])} um: move "
+                "scan.center_um or enlarge sample.size_um"
             )
         return problems
 
@@ -78,10 +84,8 @@ class Scene(Instrument):
 
     @property
     def flat_size(self) -> float:
-        """Side of the flat around the sample's structure; infinity where only a file tells [um]."""
-        if isinstance(self.sample, (HeightMapSample, MeshSample, SeveralSamples)):
-            return math.inf
-        return self.sample.size_um
+        """Side of the flat around the sample's structure; infinity where only a file tells or it is tilted [um]."""
+        return math.inf if self.sample.is_tilted else self.sample.shape_size * self.sample.scale
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the beam positions x [x] and y [y], um."""
@@ -92,12 +96,34 @@ class Scene(Instrument):
 
         Raises:
             InputFileError: the sample's file is missing or wrong.
-            SceneError: the sample is too high for the plate.
+            SceneError: the sample is too high for the plate, or does not stand where its key `place` says.
         """
         body = self.sample.build(self.base_dir)
         if body.max_height >= self.sample_distance:
             raise SceneError(f"sample: {_too_high(body.max_height, self.sample_distance)}")
+        gap = self.sample_distance - body.max_height
+        if self.sample.place != "as-given" and not math.isclose(gap, self.working_distance, rel_tol=1e-9):
+            raise SceneError(
+                f"sample.place = {self.sample.place!r} wants its top {self.working_distance:g} um below the plate, "
+                f"plate.sample_distance_um = {self.sample_distance:g} puts it {gap:g} um below: remove one of the keys"
+            )
         return body
+
+    def settled(self) -> Self:
+        """Return the scene with the plate's sample distance that `sample.place` asks for, if it is not given.
+
+        Raises:
+            InputFileError: the sample's file is missing or wrong.
+        """
+        if self.sample.place == "as-given" or self.plate.sample_distance_um is not None:
+            return self
+        distance = self.working_distance + self.sample.build(self.base_dir).max_height
+        if not 0.0 < distance <= _MAX_DISTANCE:
+            raise SceneError(
+                f"sample.place = {self.sample.place!r}: the plane z = 0 would be {distance:g} um below the plate, it "
+                f"must be 0 to {_MAX_DISTANCE:g}: correct sample.translate_um or sample.scale"
+            )
+        return self.model_copy(update={"plate": self.plate.model_copy(update={"sample_distance_um": distance})})
 
     @property
     def used_materials(self) -> dict[str, Law]:
@@ -130,18 +156,28 @@ class Scene(Instrument):
                 if aperture_contains(first, points).any() or aperture_contains(second, back).any():
                     names = self.detector_names
                     out.append(f"detectors {names[j]!r} and {names[i]!r} overlap: atoms there count for {names[j]!r}")
-        x, y = self.positions()
-        reach = max(np.abs(x).max(), np.abs(y).max())
+        reach = max(float(np.abs(a).max()) for a in self._positions_on_flat())
         if reach > 0.5 * self.flat_size:
             out.append(
-                f"the raster reaches {reach:g} um, the flat ends at {0.5 * self.flat_size:g} um: its rim misses it"
+                f"the raster reaches {reach:g} um from the middle of the flat, which ends at {0.5 * self.flat_size:g} "
+                "um: its rim misses it"
+            )
+        if isinstance(self.sample, RoughSample) and (step := self.sample.step * self.sample.scale) > (
+            coarsest := self.scan.pixel_size_um / FINER
+        ):
+            out.append(
+                f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
+                f"set sample.resolution_um to at most {coarsest:g} um"
             )
         return out
 
+    def _positions_on_flat(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the beam positions from the middle of the flat [um]."""
+        return tuple(a - middle for a, middle in zip(self.positions(), self.sample.translate_um, strict=False))  # type: ignore[return-value]
+
     def _overlaps_flat(self) -> bool:
         """Whether any beam position can lie on the flat (whichever way that is turned)."""
-        x, y = self.positions()
-        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in (x, y)))
+        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in self._positions_on_flat()))
         return nearest <= 0.5 * math.sqrt(2.0) * self.flat_size
 
 
