@@ -133,8 +133,10 @@ def simulate(
         options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, _say)
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is not None:
-        n, ny, nx = stack.shape
-        print(f"{output}: {n} micrographs of {nx} x {ny} pixels ({stack.noise})")
+        for one in getattr(stack, "stacks", (stack,)):
+            n, ny, nx = one.shape
+            view = f"{one.name}: " if one is not stack else ""
+            print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
 
 
 @app.command()
@@ -283,7 +285,9 @@ def validate(scene: SceneArg) -> None:
         print(f"  {key}: {value}")
     for warning in loaded.warnings():
         print(f"  warning: {warning}")
-    print(f"{scene}: ok ({loaded.scan.nx} x {loaded.scan.ny} pixels, {len(loaded.detector)} detectors)")
+    ny, nx = loaded.image_shape
+    views = f", {loaded.scan.n_views} views" if loaded.scan.n_views > 1 else ""
+    print(f"{scene}: ok ({nx} x {ny} pixels, {len(loaded.detector)} detectors{views})")
 
 
 @app.command()

@@ -20,6 +20,7 @@ from helio_jax.prepare.noise import NoiseSettings
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.files import read_bytes
+from helio_jax.scene.scan import named_kind
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.settings import TraceSettings
 
@@ -53,7 +54,7 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
             table, value, limit and remedy.
     """
     path = Path(path)
-    data = _merge(_read_extended(path), _nest(overrides or {}))
+    data = named_kind(_merge(_read_extended(path), _nest(overrides or {})))
     try:
         scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
@@ -143,7 +144,7 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
             for key, child in node.items()
         }
 
-    return {key: changed(node) if key in ("sample", "material") else node for key, node in tables.items()}
+    return {key: changed(node) if key in ("sample", "material", "scan") else node for key, node in tables.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -99,14 +99,13 @@ def rough_heights(n: int, step: float, rms: float, correlation_length: float, hu
         hurst: H, above 0 and at most 1.
         seed: of the random numbers.
     """
-    from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
+    from scipy.fft import next_fast_len
 
-    m = next_fast_len(n + math.ceil(_MARGIN * correlation_length / step), real=True)
-    kx, ky = 2 * np.pi * np.asarray(rfftfreq(m, step)), 2 * np.pi * np.asarray(fftfreq(m, step))
-    k = np.hypot(kx[None, :], ky[:, None])
+    m: int = next_fast_len(n + math.ceil(_MARGIN * correlation_length / step), real=True)  # type: ignore[assignment]
+    k = np.hypot(*np.meshgrid(2 * np.pi * np.fft.rfftfreq(m, step), 2 * np.pi * np.fft.fftfreq(m, step)))
     amplitude = np.sqrt(spectrum(k, np.pi / step, correlation_length, hurst))
     noise = np.random.default_rng([seed, _STREAM]).standard_normal((m, m))
-    height = np.asarray(irfft2(np.asarray(rfft2(noise)) * amplitude, s=(m, m)))[:n, :n]
+    height = np.fft.irfft2(np.fft.rfft2(noise) * amplitude, s=(m, m))[:n, :n]
     height -= height.mean()
     return height * (rms / np.sqrt(np.mean(height**2)))
 

@@ -1,11 +1,11 @@
-"""A scene: instrument, sample and raster, checked against each other. What `simulate` needs and nothing else.
+"""A scene: instrument, sample and scan, checked against each other. What `simulate` needs and nothing else.
 
 Frames and units: DESIGN.md section 1. A scene file has further tables; `helio_jax.config.SceneFile` adds them.
 """
 
 import math
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -15,8 +15,9 @@ from helio_jax.instrument import Aperture, Instrument
 from helio_jax.scene.body import COSINE, Body
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.sample import Sample
-from helio_jax.scene.scan import Raster
+from helio_jax.scene.scan import AnyScan, PositionList, named_kind
 from helio_jax.scene.scattering import Law, Term
+from helio_jax.scene.views import View, views_of
 
 FINER = 4.0
 """Truth should have this many points per pixel at least, or it is one that the fit could represent."""
@@ -24,7 +25,7 @@ _MAX_DISTANCE = 1e7  # as plate.sample_distance_um
 
 
 class Scene(Instrument):
-    """An instrument with a sample and a raster: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
+    """An instrument with a sample and a scan: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
 
     name: str = Field(default="scene", min_length=1, max_length=200)
     """Short name, shown in figures and files."""
@@ -32,11 +33,16 @@ class Scene(Instrument):
     """What the scene is and where its numbers come from."""
     sample: Sample
     """What is imaged."""
-    scan: Raster
+    scan: AnyScan
     """Which beam positions."""
     material: dict[str, Law] = Field(default={}, max_length=1000)
     """Scattering laws by the names that the sample uses for its materials."""
     _base_dir: Path = PrivateAttr(default_factory=Path)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_the_scan(cls, tables: Any) -> Any:
+        return named_kind(tables)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scene":
@@ -56,9 +62,12 @@ class Scene(Instrument):
         top = self.sample.top
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
+        problems += self.scan.view_problems(self.beam)
+        if self.sample.place != "as-given" and self.scan.sample_distances_um:
+            problems.append("scan.sample_distances_um: sets what sample.place sets: remove one of the keys")
         if (problem := self.scan.problem(self.beam)) is not None:
             problems.append(f"scan.pitch: {problem}")
-        elif not self._overlaps_flat():
+        elif not isinstance(self.scan, PositionList) and not self._overlaps_flat():
             problems.append(
                 f"scan.center_um: the raster about {list(self.scan.center_um)} um lies wholly beside the sample, whose "
                 f"flat ends {0.5 * self.flat_size:g} um from {list(self.sample.translate_um[:2])} um: move "
@@ -88,8 +97,22 @@ class Scene(Instrument):
         return math.inf if self.sample.is_tilted else self.sample.shape_size * self.sample.scale
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x [x] and y [y], um."""
-        return self.scan.positions(self.beam)
+        """Return the beam positions x [x] and y [y], um (of a list: see `PositionList.positions`)."""
+        return self.scan.positions(self.beam, self.base_dir)
+
+    def points(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the beam positions x, y of pixels [n], numbered row by row, um."""
+        return self.scan.points(self.beam, ids, self.base_dir)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        x, y = self.positions()
+        return y.size, x.size
+
+    def views(self) -> tuple[View, ...]:
+        """Return the views of the scan: one, unless it is repeated at several distances or rotations."""
+        return views_of(self.scan, self.instrument)
 
     def build_body(self) -> Body:
         """Read and build the sample's geometry (sample frame, um).
@@ -163,7 +186,7 @@ class Scene(Instrument):
                 "um: its rim misses it"
             )
         if isinstance(self.sample, RoughSample) and (step := self.sample.step * self.sample.scale) > (
-            coarsest := self.scan.pixel_size_um / FINER
+            coarsest := (self.scan.spacing or math.inf) / FINER
         ):
             out.append(
                 f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
@@ -173,7 +196,9 @@ class Scene(Instrument):
 
     def _positions_on_flat(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the beam positions from the middle of the flat [um]."""
-        return tuple(a - middle for a, middle in zip(self.positions(), self.sample.translate_um, strict=False))  # type: ignore[return-value]
+        is_list = isinstance(self.scan, PositionList)
+        x, y = self.points(np.arange(self.image_shape[1])) if is_list else self.positions()
+        return x - self.sample.translate_um[0], y - self.sample.translate_um[1]
 
     def _overlaps_flat(self) -> bool:
         """Whether any beam position can lie on the flat (whichever way that is turned)."""
