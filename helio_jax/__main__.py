@@ -140,6 +140,31 @@ def simulate(
 
 
 @app.command()
+def rays(
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz).")],
+    pixel: Annotated[tuple[int, int] | None, typer.Option(help="Row and column, from 0 (default: all).")] = None,
+    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, to write too.")] = None,
+    view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
+    n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
+    seed: Seed = None,
+) -> None:
+    """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
+    from helio_jax.config import load_scene
+    from helio_jax.formats.columns import write_columns
+    from helio_jax.trace.follow import follow_scene
+    from helio_jax.trace.tally import FATES
+
+    loaded = load_scene(scene, _given(**{"trace.rays": n, "trace.seed": seed}))
+    atoms = follow_scene(loaded, loaded.trace, pixel, view)
+    write_columns(output, atoms.columns())
+    if directions:
+        write_columns(directions, atoms.directions())
+    fates = ", ".join(f"{int((atoms.fate == i).sum())} {name}" for i, name in enumerate(FATES))
+    print(f"{output}: {atoms.fate.size} atoms: {fates}; mean order {atoms.order.mean():.3f}")
+
+
+@app.command()
 def resume(
     path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study.")],
 ) -> None:

@@ -89,7 +89,7 @@ def test_lines_and_lists_are_rasters_in_other_words(tmp_path):
 
 @pytest.mark.parametrize("scan", [ONE + "sample_distances_um = [3000.0, 5000.0]\n", "kind = 'line'\nalong = 'beam'\n"])
 def test_distances(tmp_path, scan):
-    """Single scattering off a flat at each distance is its form factor at the point that the beam meets, to 1e-6 (float32 of Embree).
+    """Single scattering off a flat at each distance is its form factor at the point the beam meets, to 1e-6.
 
     Catches a distance that moves the plate but not the spot under the oblique beam, and views in another order.
     """
