@@ -75,9 +75,10 @@ class Patch:
         return cls(**{name: arrays[name] for name in shapes}, cpu=str(arrays["cpu"]))
 
 
-def experiment_of(job: Job, body: Body) -> Experiment:
-    """Prepare what all units of a job share in one process."""
-    return make_experiment(body, job.scene.instrument, job.settings, job.scene.read_laws())
+def experiment_of(job: Job, body: Body, number: int = 0) -> Experiment:
+    """Prepare what all units of one of a job's views share in one process."""
+    view = job.views[number]
+    return make_experiment(view.turned(body), view.instrument, job.settings, job.scene.read_laws())
 
 
 def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:
@@ -117,7 +118,7 @@ def trace_unit(job: Job, unit: Unit) -> Patch:
         GuardError: rays are unaccounted for.
     """
     with _LOCK:
-        experiment = _prepared(job)
+        experiment = _prepared(job, job.view_number(unit))
     return join_pieces(experiment, [task() for task in tasks(experiment, job, unit)])
 
 
@@ -125,7 +126,7 @@ _LOCK = threading.Lock()
 
 
 @functools.lru_cache(maxsize=1)
-def _prepared(job: Job) -> Experiment:
+def _prepared(job: Job, number: int) -> Experiment:
     body = job.scene.build_body()
     here = Job.of(job.scene, job.settings, body)
     if changes := differences(job.about, here.about, ("sender", f"worker on {platform.node()}")):
@@ -133,7 +134,7 @@ def _prepared(job: Job) -> Experiment:
             "the worker does not run what was sent: " + "; ".join(changes) + "; install the same version and put the "
             "same files everywhere"
         )
-    return experiment_of(job, body)
+    return experiment_of(job, body, number)
 
 
 def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
