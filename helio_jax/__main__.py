@@ -135,6 +135,8 @@ def simulate(
     if stack is not None:
         n, ny, nx = stack.shape
         print(f"{output}: {n} micrographs of {nx} x {ny} pixels ({stack.noise})")
+        for name, share in stack.shares().items():
+            print(f"  {name}: {share:.2%} of the counts")
 
 
 @app.command()

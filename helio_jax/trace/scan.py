@@ -178,6 +178,7 @@ class Canvas:
         self.job = job
         self.by_order = np.zeros((job.settings.n_orders, n_detectors, n))
         self.total, self.variance = np.zeros((n_detectors, n)), np.zeros((n_detectors, n))
+        self.plate = np.zeros((n_detectors, n if job.scene.plate.is_scattering else 0))
         self.masked, self.shadowed = np.zeros((n_detectors, n_maps)), np.zeros(n_maps)
         self.fates = np.zeros(len(FATES), np.int64)
         self.cpus: set[str] = set()
@@ -191,7 +192,7 @@ class Canvas:
             GuardError: more rays were lost so far than the whole scan may lose.
         """
         part = slice(unit.start, unit.stop)
-        for name in ("by_order", "total", "variance", "masked", "shadowed"):
+        for name in ("by_order", "total", "variance", "plate", "masked", "shadowed"):
             if getattr(self, name).size:
                 getattr(self, name)[..., part] = getattr(patch, name)
         self.fates += patch.fates
@@ -211,19 +212,19 @@ class Canvas:
         is_expected = settings.estimator == "expected"
         scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
         n_negative = int(np.sum(self.total < 0))
-        for a, factor in ((self.by_order, scale), (self.total, scale), (self.variance, scale**2)):
+        for a, factor in ((self.by_order, scale), (self.total, scale), (self.variance, scale**2), (self.plate, scale)):
             np.maximum(a, 0.0, out=a)
             a *= factor
         x, y = scene.positions()
         shape = (y.size, x.size)
         fates = {name: int(n) for name, n in zip(FATES, self.fates, strict=True)}
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        maps = {"masked": self.masked, "shadowed": self.shadowed} if settings.maps else {}
+        maps = {"masked": self.masked, "shadowed": self.shadowed, "plate": self.plate}
         return MicrographStack(
             counts=self.total.reshape(-1, *shape),
             variance=self.variance.reshape(-1, *shape),
             by_order=self.by_order.reshape(*self.by_order.shape[:2], *shape),
-            **{name: a.reshape(*a.shape[:-1], *shape) for name, a in maps.items()},
+            **{name: a.reshape(*a.shape[:-1], *shape) for name, a in maps.items() if a.size},
             x=x,
             y=y,
             instrument=scene.instrument,
