@@ -137,6 +137,8 @@ def simulate(
             n, ny, nx = one.shape
             view = f"{one.name}: " if one is not stack else ""
             print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
+            for name, share in one.shares().items():
+                print(f"  {name}: {share:.2%} of the counts")
 
 
 @app.command()

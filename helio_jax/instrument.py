@@ -35,12 +35,47 @@ class Beam(Settings):
 class Plate(Settings):
     """The pinhole plate: the plane that holds the pinhole and the detector apertures."""
 
-    kind: Literal["transparent"] = "transparent"
-    """`transparent`: atoms that miss every aperture pass through and are gone."""
+    kind: Literal["transparent", "scattering"] = "transparent"
+    """`transparent`: atoms that miss every aperture pass through and are gone; `scattering`: its underside sends them
+    back by the law of its material, but for the apertures and the pinhole, which are holes."""
     working_distance_um: float = Field(gt=0.0, le=1e7)
     """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
     sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e7)
     """Distance D from the plate to the sample's reference plane (its substrate); default W [um]."""
+    radius_um: float | None = Field(default=None, gt=0.0, le=1e8)
+    """`scattering`: radius of a disc-shaped plate [um]."""
+    size_um: tuple[float, float] | None = None
+    """`scattering`: full sides of a rectangular plate along x and y, instead of a radius [um]."""
+    center_um: tuple[float, float] | None = None
+    """`scattering`: middle (x, y) of the plate, lab frame (default: straight above the nominal spot) [um]."""
+    material: str | None = Field(default=None, min_length=1, max_length=64)
+    """`scattering`: name of its material (default: the cosine law)."""
+
+    @model_validator(mode="after")
+    def _has_an_outline_if_it_scatters(self) -> "Plate":
+        names = ("radius_um", "size_um", "center_um", "material")
+        given = [name for name in names if getattr(self, name) is not None]
+        if self.kind == "transparent" and given:
+            raise ValueError(f'a transparent plate has no {given[0]}: set kind = "scattering" or remove the key')
+        if self.kind == "scattering" and (self.radius_um is None) == (self.size_um is None):
+            raise ValueError(
+                "a scattering plate needs its outline, either radius_um (a disc) or size_um = [x, y] (a rectangle), "
+                f"got {'both' if self.size_um else 'neither'}"
+            )
+        if self.size_um is not None and not 0.0 < min(self.size_um) <= max(self.size_um) <= 1e8:
+            raise ValueError(f"size_um must be > 0 um and <= 1e8 um, got {list(self.size_um)}")
+        return self
+
+    @property
+    def is_scattering(self) -> bool:
+        """Whether atoms that meet the plate come back."""
+        return self.kind != "transparent"
+
+    @property
+    def outline(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Middle (x, y) and half extents of a scattering plate, lab frame [um]."""
+        a, b = self.size_um if self.size_um is not None else (2.0 * (self.radius_um or 0.0),) * 2
+        return self.center_um or (0.0, 0.0), (0.5 * a, 0.5 * b)
 
 
 class Detector(Settings):

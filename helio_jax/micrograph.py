@@ -30,7 +30,8 @@ class MicrographStack:
         is_observed: True where a count was recorded; None: everywhere.
         background: counts per pixel that do not come from the sample [detector] or [detector, y, x], if known.
         by_order: counts by scattering order [order, detector, y, x], the last order being "and above".
-        effuse, plate: components from the effusive beam and from plate bounces, same shape as counts.
+        effuse: counts from the effusive beam, same shape as counts; they are not part of `counts`.
+        plate: the part of `counts` that scattered on the plate at least once before it was detected, same shape.
         masked: fraction of the aperture's solid angle hidden from the pixel's point by the sample, own horizon
             included [detector, y, x].
         shadowed: 1 where the topmost surface point above the raster position cannot be seen by the beam [y, x].
@@ -112,6 +113,15 @@ class MicrographStack:
     def multiple(self) -> np.ndarray | None:
         """Counts of order 2 and above [detector, y, x], where the orders are known."""
         return None if self.by_order is None else self.by_order[1:].sum(0)
+
+    def shares(self) -> dict[str, float]:
+        """Return what share of all counts (without background) scattered more than once, and met the plate."""
+        background = np.zeros(1) if self.background is None else self.background
+        background = background[:, None, None] if background.ndim == 1 else background
+        total = float(np.sum((self.counts - background)[self.is_observed]))
+        parts = {"multiple scattering": self.multiple, "scattered on the plate": self.plate}
+        found = {name: float(part.sum()) for name, part in parts.items() if part is not None}
+        return {name: part / total for name, part in found.items()} if total > 0 else {}
 
     def replace(self, **changes: Any) -> "MicrographStack":
         """Return a copy with some fields changed (and checked again)."""

@@ -53,11 +53,12 @@ class Scene(Instrument):
     def _problems(self) -> list[str]:
         """Return what does not fit together, each as "key: what is wrong: what to do"."""
         problems = []
-        for name in dict.fromkeys(self.sample.material_names):
+        users = dict.fromkeys(self.sample.material_names, "sample: its")
+        for name, whose in {self.plate.material or COSINE: "plate.material: its", **users}.items():
             if name != COSINE and name not in self.material:
                 known = ", ".join(map(repr, (COSINE, *self.material)))
                 problems.append(
-                    f"sample: its material {name!r} is unknown, known are {known}: add the table [material.{name}]"
+                    f"{whose} material {name!r} is unknown, known are {known}: add the table [material.{name}]"
                 )
         top = self.sample.top
         if top is not None and top >= self.sample_distance:
@@ -150,12 +151,12 @@ class Scene(Instrument):
 
     @property
     def used_materials(self) -> dict[str, Law]:
-        """Scattering laws of the materials that the sample uses, by name, but for the default one."""
-        names = set(self.sample.material_names)
+        """Scattering laws of the materials that sample and plate use, by name, but for the default one."""
+        names = {*self.sample.material_names, self.plate.material}
         return {name: law for name, law in self.material.items() if name in names}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
-        """Return the scattering laws of the materials that the sample uses, and read their files.
+        """Return the scattering laws of the materials that sample and plate use, and read their files.
 
         Raises:
             InputFileError: the table of a law is missing or wrong.
@@ -191,6 +192,27 @@ class Scene(Instrument):
             out.append(
                 f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
                 f"set sample.resolution_um to at most {coarsest:g} um"
+            )
+        return out + self._plate_warnings(apertures)
+
+    def _plate_warnings(self, apertures: tuple[Aperture, ...]) -> list[str]:
+        """Return what is probably not meant about a scattering plate's outline."""
+        if not self.plate.is_scattering:
+            return []
+        out = []
+        middle, half = (np.array(pair) for pair in self.plate.outline)
+        rims = {
+            f"detector {d.name!r}: its aperture": a.rim(64)[0] for d, a in zip(self.detector, apertures, strict=True)
+        }
+        for what, points in {**rims, "the pinhole": self.pinhole_center[None, :2]}.items():
+            share = np.abs(points - middle) / half
+            reach = np.hypot(*share.T) if self.plate.radius_um is not None else share.max(1)
+            if reach.max() > 1.0:
+                out.append(f"{what} reaches beyond the plate's outline: there is no plate around it")
+        if (end := (np.abs(middle) + half).max()) > 0.5 * self.flat_size:
+            out.append(
+                f"the plate reaches {end:g} um, the flat ends at {0.5 * self.flat_size:g} um: "
+                "atoms that the plate sends down beside the flat are gone"
             )
         return out
 

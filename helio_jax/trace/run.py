@@ -12,13 +12,14 @@ from typing import TypeVar
 import numpy as np
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.instrument import Instrument
+from helio_jax.instrument import Instrument, Plate
 from helio_jax.scene.body import COSINE, Body
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_law_table
 from helio_jax.trace.masks import axis_rays
+from helio_jax.trace.plate import FACING_DOWN, PlateTable
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import LOST, Estimate
@@ -60,7 +61,7 @@ def make_experiment(
         body: the sample.
         instrument: beam, plate and detectors.
         settings: rays, estimator, seed.
-        laws: scattering law of each of the body's materials; "cosine" need not be given.
+        laws: scattering law of each of the body's materials and the plate's; "cosine" need not be given.
 
     Raises:
         SceneError: a material has no law, or a lattice stands upright on a face.
@@ -69,6 +70,7 @@ def make_experiment(
     n_replicates = N_REPLICATES if is_expected else 0
     n_rays, n_branches = paths_of(settings)
     intersector = body if isinstance(body, Intersector) else Intersector(body)
+    plate = PlateTable.of(instrument, len(intersector.materials)) if instrument.plate.is_scattering else None
     return Experiment(
         intersector=intersector,
         instrument=instrument,
@@ -77,19 +79,22 @@ def make_experiment(
         n_orders=settings.n_orders,
         max_events=settings.max_events,
         is_expected=is_expected,
-        laws=_law_table(intersector, {COSINE: COSINE_LAW} | dict(laws or {})),
+        laws=_law_table(intersector, instrument.plate, {COSINE: COSINE_LAW} | dict(laws or {})),
+        plate=plate,
     )
 
 
-def _law_table(intersector: Intersector, laws: Mapping[str, tuple[Term, ...]]) -> LawTable | None:
-    """Return the laws in the order of the body's materials; None where all are the cosine law."""
-    names = intersector.materials
+def _law_table(intersector: Intersector, plate: Plate, laws: Mapping[str, tuple[Term, ...]]) -> LawTable | None:
+    """Return the laws of the body's materials, and at last a scattering plate's; None if all are the cosine law."""
+    names = (*intersector.materials, *((plate.material or COSINE,) if plate.is_scattering else ()))
     if missing := [name for name in names if name not in laws]:
         raise SceneError(f"material {missing[0]!r} has no law: add the table [material.{missing[0]}] to the scene")
     found = [laws[name] for name in names]
     if all(map(is_cosine, found)):
         return None
-    check_lattices(found, names, intersector.normals, intersector.material_of(np.arange(len(intersector.normals))))
+    normals = np.vstack([intersector.normals, FACING_DOWN])
+    faces = intersector.material_of(np.arange(len(intersector.normals)))
+    check_lattices(found, names, normals, np.append(faces, len(intersector.materials)))
     return make_law_table(found)
 
 

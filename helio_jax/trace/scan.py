@@ -189,6 +189,7 @@ class Canvas:
         self.job = job
         self.by_order = np.zeros((job.settings.n_orders, n_detectors, n))
         self.total, self.variance = np.zeros((n_detectors, n)), np.zeros((n_detectors, n))
+        self.plate = np.zeros((n_detectors, n if job.scene.plate.is_scattering else 0))
         self.masked, self.shadowed = np.zeros((n_detectors, n_maps)), np.zeros(n_maps)
         self.fates = np.zeros(len(FATES), np.int64)
         self.cpus: set[str] = set()
@@ -202,7 +203,7 @@ class Canvas:
             GuardError: more rays were lost so far than the whole scan may lose.
         """
         part = slice(unit.start, unit.stop)
-        for name in ("by_order", "total", "variance", "masked", "shadowed"):
+        for name in ("by_order", "total", "variance", "plate", "masked", "shadowed"):
             if getattr(self, name).size:
                 getattr(self, name)[..., part] = getattr(patch, name)
         self.fates += patch.fates
@@ -243,6 +244,7 @@ class Canvas:
             ("by_order", self.by_order, scale),
             ("counts", self.total, scale),
             ("variance", self.variance, scale**2),
+            *((("plate", self.plate, scale),) if self.plate.size else ()),
         ):
             images[name] = array[..., pixels]
             np.maximum(images[name], 0.0, out=images[name])

@@ -1,6 +1,6 @@
 """What the tracer counts: exact integer fates of all rays, analog hits, and sums of expected contributions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -19,6 +19,8 @@ class Tally:
         fates: number of rays per fate (`FATES`) [4, pixels].
         hits: detected rays (analog) [order, detector, pixels]; the last order is "and above".
         sums: expected detections summed over the rays [order, replicate, detector, pixels] (no replicates: analog).
+        plate_hits, plate_sums: those of `hits` [detector, pixels] and `sums` [replicate, detector, pixels] that met
+            the plate before.
         n_rays: beam rays launched per pixel.
         n_branches: paths followed from the first hit of each beam ray; fates and hits count paths.
     """
@@ -26,6 +28,8 @@ class Tally:
     fates: np.ndarray
     hits: np.ndarray
     sums: np.ndarray
+    plate_hits: np.ndarray
+    plate_sums: np.ndarray
     n_rays: int
     n_branches: int = 1
 
@@ -38,6 +42,8 @@ class Tally:
             np.zeros((len(FATES), n_pixels), np.int64),
             np.zeros((n_orders, n_detectors, n_pixels), np.int64),
             np.zeros((n_orders, n_replicates, n_detectors, n_pixels)),
+            np.zeros((n_detectors, n_pixels), np.int64),
+            np.zeros((n_replicates, n_detectors, n_pixels)),
             n_rays,
             n_branches,
         )
@@ -54,15 +60,19 @@ class Tally:
         of one path are correlated, so those of the total are taken from the replicates' totals. Analog: hits / rays
         with the Poisson variance hits / rays^2.
         """
-        kept = (self.fates, self.hits, self.n_rays, self.n_branches)
+        kept = (self.fates, self.hits, self.plate_hits, self.n_rays, self.n_branches)
         n_replicates, n = self.sums.shape[1], self.n_launched
         if n_replicates == 0:
-            total = self.hits.sum(0)
-            return Estimate(self.hits / n, self.hits / n**2, total / n, total / n**2, *kept)
-        means = self.sums * (n_replicates / self.n_rays)
-        totals = self.sums.sum(0) * (n_replicates / self.n_rays)
-        variance, total_variance = (m.var(-3, ddof=1) / n_replicates for m in (means, totals))
-        return Estimate(means.mean(1), variance, totals.mean(0), total_variance, *kept)
+            orders, total, plate = ((c / n, c / n**2) for c in (self.hits, self.hits.sum(0), self.plate_hits))
+        else:
+            sums = (self.sums, self.sums.sum(0), self.plate_sums)
+            orders, total, plate = (_mean_and_variance(s * (n_replicates / self.n_rays)) for s in sums)
+        return Estimate(*orders, *total, *plate, *kept)
+
+
+def _mean_and_variance(replicates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean over the replicates (third axis from the end) and the variance of that mean."""
+    return replicates.mean(-3), replicates.var(-3, ddof=1) / replicates.shape[-3]
 
 
 @dataclass(frozen=True)
@@ -72,24 +82,29 @@ class Estimate:
     Attributes:
         mean, variance: by order, the variance being that of the mean [order, detector, pixels].
         total_mean, total_variance: of all orders together [detector, pixels].
-        fates, hits, n_rays, n_branches: as in `Tally`.
+        plate_mean, plate_variance: of those of them that met the plate before [detector, pixels].
+        fates, hits, plate_hits, n_rays, n_branches: as in `Tally`.
     """
 
     mean: np.ndarray
     variance: np.ndarray
     total_mean: np.ndarray
     total_variance: np.ndarray
+    plate_mean: np.ndarray
+    plate_variance: np.ndarray
     fates: np.ndarray
     hits: np.ndarray
+    plate_hits: np.ndarray
     n_rays: int
     n_branches: int
 
     @classmethod
     def join(cls, parts: list["Estimate"]) -> "Estimate":
         """Put blocks of pixels side by side, in order."""
-        names = ("mean", "variance", "total_mean", "total_variance", "fates", "hits")
+        first = parts[0]
+        names = [f.name for f in fields(cls) if isinstance(getattr(first, f.name), np.ndarray)]
         joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
-        return cls(**joined, n_rays=parts[0].n_rays, n_branches=parts[0].n_branches)
+        return cls(**joined, n_rays=first.n_rays, n_branches=first.n_branches)
 
     @property
     def n_launched(self) -> int:

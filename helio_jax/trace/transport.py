@@ -1,14 +1,14 @@
 """Follow the atoms of a block of pixels from the pinhole to a detector or out of the scene.
 
-All rays of a block fly in step: flight e starts after e scatterings, so the scattering order is the same for
-the whole batch. Every path is walked as nature does it (re-emission by the law of the surface hit) and tallied in
-exact integers; the `expected` estimator adds, at every scattering, the probability of going straight to each
-detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus the hidden
-part; it has no variance where nothing hides the aperture. The hidden part is estimated by a shadow ray to a random
-point of the aperture or, where an aperture is so wide that this has the larger variance, by the atoms that fly on and
-do not get there (maximum heuristic); what lobes send by both at once, weighted by the balance heuristic (Veach and
-Guibas, SIGGRAPH 1995). So neither a narrow lobe nor a wide aperture makes heavy tails. Exact directions (mirrors) are
-estimated by the atoms that hit alone.
+All rays of a block fly in step: flight e starts after e events, each a scattering on the sample, which raises the
+path's order, or on the plate, which does not. Every path is walked as nature does it (re-emission by the law of the
+surface hit) and tallied in exact integers; the `expected` estimator adds, at every scattering, the probability of going
+straight to each detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus
+the hidden part; it has no variance where nothing hides the aperture. The hidden part is estimated by a shadow ray to a
+random point of the aperture or, where an aperture is so wide that this has the larger variance, by the atoms that fly
+on and do not get there (maximum heuristic); what lobes send by both at once, weighted by the balance heuristic (Veach
+and Guibas, SIGGRAPH 1995). So neither a narrow lobe nor a wide aperture makes heavy tails. Exact directions (mirrors)
+are estimated by the atoms that hit alone.
 """
 
 from dataclasses import dataclass, fields
@@ -23,13 +23,17 @@ from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
+from helio_jax.trace.plate import PLATE, PlateTable
 from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import STOPPED, Tally
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a block of work needs, shared read-only between threads; no `laws`: cosine everywhere."""
+    """Everything a block of work needs, shared read-only between threads.
+
+    No `laws`: cosine everywhere. No `plate`: a transparent one.
+    """
 
     intersector: Intersector
     instrument: Instrument
@@ -39,11 +43,20 @@ class Experiment:
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
+    plate: PlateTable | None = None
 
     @property
     def is_plain(self) -> bool:
         """Whether all that is done after the first scattering is what `analog` does in one go."""
-        return not self.is_expected and self.laws is None and self.intersector.has_embree
+        return not self.is_expected and self.laws is None and self.plate is None and self.intersector.has_embree
+
+    def material_of(self, surface: np.ndarray) -> np.ndarray:
+        """Return the number of each hit surface's law (`Hits.surface`, no misses) [n]."""
+        if self.plate is None:
+            return self.intersector.material_of(surface)
+        out, is_sample = np.full(surface.shape, self.plate.material), surface != PLATE
+        out[is_sample] = self.intersector.material_of(surface[is_sample])
+        return out
 
 
 @dataclass
@@ -51,7 +64,8 @@ class _Paths:
     """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
 
     `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
-    direction (laws.scatter_atoms) [n], `normal` that of the surface left (zero: the pinhole) [n, 3].
+    direction (laws.scatter_atoms) [n], `order` how often the sample scattered them, `met_plate` whether the plate did,
+    `normal` that of the sample where they left it (zero: pinhole or plate) [n, 3].
     """
 
     origin: np.ndarray
@@ -61,6 +75,8 @@ class _Paths:
     target: np.ndarray
     skip: np.ndarray
     density: np.ndarray
+    order: np.ndarray
+    met_plate: np.ndarray
     normal: np.ndarray
 
     def take(self, keep: np.ndarray) -> "_Paths":
@@ -70,8 +86,8 @@ class _Paths:
 
 @njit(cache=True, nogil=True)
 def _settle(
-    event, max_events, n_branches, origin, direction, pixel, surface, is_back, offset, plate_z,
-    center, semi_axes, cos_sin, fates, hits,
+    event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
+    center, semi_axes, cos_sin, fates, hits, plate_hits,
 ):  # fmt: skip
     """Tally the rays that end after this flight; return the indices of those that scatter.
 
@@ -93,7 +109,9 @@ def _settle(
         else:
             fates[fate, p] += share
             if k >= 0:
-                hits[min(event, hits.shape[0]) - 1, k, p] += 1
+                hits[min(order[i], hits.shape[0]) - 1, k, p] += 1
+                if met_plate[i]:
+                    plate_hits[k, p] += 1
     return keep[:m]
 
 
@@ -141,8 +159,18 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_
 
 
 @njit(cache=True, nogil=True)
+def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
+    """Add what detector `k` catches of path `i`, scattered `order` times."""
+    r, p = replicate[i], pixel[i]
+    sums[min(order, sums.shape[0]) - 1, r, k, p] += value
+    if met_plate[i]:
+        plate_sums[r, k, p] += value
+
+
+@njit(cache=True, nogil=True)
 def _score(
-    k, share, cosine, point, normal, pixel, replicate, offset, plate_z, weight, is_open, semi_axes, rims, sums
+    k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, semi_axes,
+    rims, sums, plate_sums,
 ):  # fmt: skip
     """Add P = n . Phi - (hidden part), times the share of cosine atoms, of every vertex to its pixel and replicate."""
     for i in range(point.shape[0]):
@@ -155,7 +183,8 @@ def _score(
         value = normal[i, 0] * fx + normal[i, 1] * fy + normal[i, 2] * fz
         if not is_open[i]:
             value -= weight[i]
-        sums[replicate[i], k, p] += share * cosine[i] * value
+        value *= share * cosine[i]
+        _add(value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
 @njit(cache=True, nogil=True)
@@ -166,8 +195,8 @@ def _balance(density, n_hits, square, cosine, area):
 
 @njit(cache=True, nogil=True)
 def _score_lobes(
-    k, share, n_hits, table, material, incoming, point, normal, pixel, replicate, direction, is_open, plate_z, area,
-    sums,
+    k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
+    plate_z, area, sums, plate_sums,
 ):  # fmt: skip
     """Add what the lobes of every vertex send to the aperture point it aims at."""
     for i in range(point.shape[0]):
@@ -175,13 +204,13 @@ def _score_lobes(
             density = lobe_density(table, material[i], incoming[i], normal[i], direction[i])
             r = (plate_z - point[i, 2]) / direction[i, 2]
             value = _balance(density, n_hits, r * r, direction[i, 2], area[k]) if density > 0.0 else 0.0
-            sums[replicate[i], k, pixel[i]] += share * value
+            _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
 @njit(cache=True, nogil=True)
 def _score_hits(
-    share, n_hits, density, origin, direction, pixel, replicate, surface, offset, plate_z, center, semi_axes, cos_sin,
-    area, sums,
+    share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, center,
+    semi_axes, cos_sin, area, sums, plate_sums,
 ):  # fmt: skip
     """Add the lobes' atoms that hit an aperture."""
     for i in range(origin.shape[0]):
@@ -190,13 +219,13 @@ def _score_hits(
             k, r = aperture_ahead(origin, direction, i, offset[p, 0], offset[p, 1], plate_z, center, semi_axes, cos_sin)
             if k >= 0:
                 value = _balance(density[i], n_hits, r * r, direction[i, 2], area[k])
-                sums[replicate[i], k, p] += share * n_hits * value
+                _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
 
 
 @njit(cache=True, nogil=True)
 def _subtract_hidden(
-    share, n_hits, density, normal, origin, direction, pixel, replicate, surface, offset, plate_z, center, semi_axes,
-    cos_sin, area, sums,
+    share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
+    center, semi_axes, cos_sin, area, sums, plate_sums,
 ):  # fmt: skip
     """Subtract the wide apertures that cosine atoms do not reach though they fly towards them: what `_score` left.
 
@@ -218,7 +247,7 @@ def _subtract_hidden(
             for k in range(center.shape[0]):
                 if is_inside(x, y, k, center, semi_axes, cos_sin):
                     if is_hidden and _aimed_weight(n_hits, r * r, cosine, dz, area[k]) == 0.0:
-                        sums[replicate[i], k, pixel[i]] -= sign * share
+                        _add(-sign * share, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
                     is_hidden = True  # where apertures overlap, the first one has it
 
 
@@ -232,49 +261,65 @@ def _bounce(normal, u):
     return out
 
 
+@njit(cache=True, nogil=True)
+def _history(surface, order, met_plate):
+    """Return what scattered each path, once this surface has."""
+    order, met_plate = order.copy(), met_plate.copy()
+    for i in range(surface.size):
+        if surface[i] == PLATE:
+            met_plate[i] = True
+        else:
+            order[i] += 1
+    return order, met_plate
+
+
 def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
     """Return the replicate of each path, with one or several paths per beam ray."""
     return path // (s.n_rays * n_branches // s.n_replicates)
 
 
-def _add_next_event(e: Experiment, event, ids, sums, hits: Hits, paths: _Paths, offset) -> None:
-    """Add the expected contribution of every vertex to every detector (the next-event estimate)."""
+def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hits: Hits, paths: _Paths, offset):
+    """Add the expected contribution of every vertex on the sample to every detector (the next-event estimate)."""
+    if e.plate is not None and (on_plate := hits.surface == PLATE).any():
+        hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
-    point, normal, pixel = hits.point, hits.normal, paths.pixel
-    replicate, n_hits = _replicate(e.sampling, paths.path, n_branches), e.sampling.n_branches if event == 0 else 1
+    point, normal = hits.point, hits.normal
+    whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    n_hits = e.sampling.n_branches if event == 0 else 1
     shape = (table.center, table.semi_axes, table.cos_sin)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
     if e.laws is not None:
-        material = e.intersector.material_of(hits.surface)
-        key = (ids[pixel], paths.path, event, e.sampling.seed)
+        material = e.material_of(hits.surface)
+        key = (ids[paths.pixel], paths.path, event, e.sampling.seed)
         cosine = cosine_shares(e.laws, material, paths.direction, normal, *key)
     for k in range(len(table.center)):
         direction, weight, is_open = _aim(
-            k, n_hits, point, normal, pixel, offset, plate_z, paths.target, *shape, table.area
+            k, n_hits, point, normal, paths.pixel, offset, plate_z, paths.target, *shape, table.area
         )
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
-            k, 1.0 / n_branches, cosine, point, normal, pixel, replicate, offset, plate_z, weight, is_open,
-            table.semi_axes, table.rims, sums,
+            k, 1.0 / n_branches, cosine, point, normal, *whose, offset, plate_z, weight, is_open, table.semi_axes,
+            table.rims, tally.sums, tally.plate_sums,
         )  # fmt: skip
         if e.laws is not None:
             _score_lobes(
-                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, pixel, replicate,
-                direction, is_open, plate_z, table.area, sums,
+                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *whose, direction,
+                is_open, plate_z, table.area, tally.sums, tally.plate_sums,
             )  # fmt: skip
 
 
-def _add_hits(e: Experiment, event: int, sums, surface: np.ndarray, paths: _Paths, offset) -> None:
-    """Add what the atoms that fly on after scattering `event` times tell: lobes' hits, and what is hidden."""
+def _add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, paths: _Paths, offset) -> None:
+    """Add what the atoms that fly on after `event` events tell: lobes' hits, and what is hidden."""
     n_branches, table = e.sampling.n_branches, e.apertures
     weight = 1.0 / n_branches, n_branches if event == 1 else 1
-    flight = paths.origin, paths.direction, paths.pixel, _replicate(e.sampling, paths.path, n_branches), surface
+    whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    flight = paths.origin, paths.direction, *whose, surface
     plate = offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, table.area
-    _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, sums)
+    _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
     if e.laws is not None:
-        _score_hits(*weight, paths.density, *flight, *plate, sums)
+        _score_hits(*weight, paths.density, *flight, *plate, tally.sums, tally.plate_sums)
 
 
 def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> _Paths:
@@ -284,8 +329,11 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     origin, direction = launch_rays(e.instrument, x, y, numbers)
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
-    skip, density, normal = np.full(flying.size, -1, np.int32), np.zeros(flying.size), np.zeros((flying.size, 3))
-    return _Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal)
+    n = flying.size
+    return _Paths(
+        origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(n, -1, np.int32), np.zeros(n),
+        np.zeros(n, np.int32), np.zeros(n, bool), np.zeros((n, 3)),
+    )  # fmt: skip
 
 
 def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, stopped: np.ndarray) -> _Paths:
@@ -302,14 +350,16 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
     per_replicate = s.n_rays * s.n_branches // s.n_replicates if s.n_replicates else 1
     u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
+    order, met_plate = _history(hits.surface, paths.order, paths.met_plate)
     if e.laws is None:
-        direction, density = _bounce(hits.normal, u), np.zeros(len(path))
-        return _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, hits.normal)
-    material, key = e.intersector.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
-    direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
-    stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
-    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, hits.normal)
-    return out if leaves.all() else out.take(leaves)
+        direction, density, leaves = _bounce(hits.normal, u), np.zeros(len(path)), None
+    else:
+        material, key = e.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
+        direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
+        stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
+    normal = hits.normal if e.plate is None else np.where((hits.surface == PLATE)[:, None], 0.0, hits.normal)
+    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, order, met_plate, normal)
+    return out if leaves is None or leaves.all() else out.take(leaves)
 
 
 def trace_block(
@@ -335,17 +385,20 @@ def trace_block(
             hits = first.take(paths.pixel)
         else:
             hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
+        if e.plate is not None and event > 0:
+            e.plate.catch(hits, paths.origin, paths.direction, paths.pixel, offset, table)
         keep = _settle(
-            event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, hits.surface, hits.is_back,
-            offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, tally.fates, tally.hits,
+            event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
+            hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes,
+            table.cos_sin, tally.fates, tally.hits, tally.plate_hits,
         )  # fmt: skip
         if e.is_expected and event > 0:
-            _add_hits(e, event, tally.sums[min(event, e.n_orders) - 1], hits.surface, paths, offset)
+            _add_hits(e, event, tally, hits.surface, paths, offset)
         if not keep.size:
             break
         hits, paths = hits.take(keep), paths.take(keep)
         if e.is_expected:
-            _add_next_event(e, event, ids, tally.sums[min(event, e.n_orders - 1)], hits, paths, offset)
+            _add_next_event(e, event, ids, tally, hits, paths, offset)
         paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
         if e.is_plain:
             flying = paths.origin, paths.direction, paths.pixel, paths.path, paths.skip

@@ -31,6 +31,7 @@ class Patch:
     Attributes:
         by_order: counts by scattering order [order, detector, pixels].
         total, variance: of all orders together, the variance being that of the mean [detector, pixels].
+        plate: counts of `total` that met a scattering plate before [detector, pixels]; empty with another plate.
         fates: rays per fate (`FATES`), summed over the pixels [4]; pixel by pixel they add up to those launched.
         masked: share of each aperture that the sample hides [detector, pixels]; empty where no maps are wanted.
         shadowed: 1 where the beam cannot see the topmost point [pixels]; empty likewise.
@@ -40,6 +41,7 @@ class Patch:
     by_order: np.ndarray
     total: np.ndarray
     variance: np.ndarray
+    plate: np.ndarray
     fates: np.ndarray
     masked: np.ndarray
     shadowed: np.ndarray
@@ -62,6 +64,7 @@ class Patch:
             "by_order": (job.settings.n_orders, n_detectors, n),
             "total": (n_detectors, n),
             "variance": (n_detectors, n),
+            "plate": (n_detectors, n if job.scene.plate.is_scattering else 0),
             "fates": (len(FATES),),
             "masked": (n_detectors, n_maps),
             "shadowed": (n_maps,),
@@ -104,10 +107,13 @@ def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
     fates = e.fates.sum(1)
     check_rays(np.zeros_like(fates), e.n_unaccounted, 1)
     masked, shadowed = maps[0] if maps else (np.zeros((e.total_mean.shape[0], 0)), np.zeros(0))
+    kept = slice(None) if experiment.plate is not None else slice(0)
+    plate = e.plate_mean if experiment.is_expected else e.plate_hits
+    rest = plate[:, kept].astype(float), fates, masked, shadowed, instruction_set()
     if experiment.is_expected:
-        return Patch(e.mean, e.total_mean, e.total_variance, fates, masked, shadowed, instruction_set())
+        return Patch(e.mean, e.total_mean, e.total_variance, *rest)
     hits = e.hits.astype(float)
-    return Patch(hits, hits.sum(0), hits.sum(0), fates, masked, shadowed, instruction_set())
+    return Patch(hits, hits.sum(0), hits.sum(0), *rest)
 
 
 def trace_unit(job: Job, unit: Unit) -> Patch:

@@ -102,6 +102,7 @@ def test_all_errors_at_once(tmp_path):
         assert expected in told
 
 
+PLATE = {"kind": "scattering", "working_distance_um": 4000}
 SPHERES = {"kind": "spheres", "spheres": [{"radius_um": 100.0}]}
 
 
@@ -148,6 +149,10 @@ SPHERES = {"kind": "spheres", "spheres": [{"radius_um": 100.0}]}
         ({"noise.background_per_pixel": -1}, "noise.background_per_pixel: must be >= 0 counts, got [-1.0]"),
         ({"trace.rays": 7}, "trace.rays = 7: must be >= 8: choose a value at least 8 and at most 10000000"),
         ({"reconstruct": 3}, "reconstruct = 3: must be a table"),
+        ({"plate.radius_um": 9}, 'plate: a transparent plate has no radius_um: set kind = "scattering" or remove'),
+        ({"plate": {**PLATE, "size_um": [9, 0]}}, "plate: size_um must be > 0 um and <= 1e8 um, got [9.0, 0.0]"),
+        ({"plate": PLATE}, "either radius_um (a disc) or size_um = [x, y] (a rectangle), got neither"),
+        ({"plate": {**PLATE, "radius_um": 9, "material": "steel"}}, "plate.material: its material 'steel' is unknown"),
     ],
 )
 def test_error_messages(tmp_path, overrides, expected):
@@ -250,6 +255,9 @@ def test_warnings_of_validate(tmp_path):
     assert "'all': its aperture contains the pinhole" in told and "'all' and 'small' overlap" in told
     assert "its rim misses it" in told
     assert load_scene(SCENES / "sphere_a.toml").warnings() == []
+    plate = {**PLATE, "size_um": [40, 9e3], "center_um": [-4000 / 3**0.5, 0]}
+    told = "\n".join(load_scene(tmp_path / "scene.toml", {"plate": plate, "beam.incidence_deg": 30}).warnings())
+    assert "reaches beyond the plate's outline" in told and "the pinhole" not in told and "beside the flat" in told
     four = load_instrument(SCENES / "instruments/bshem_4detector.toml").model_dump(mode="json", exclude_none=True)
     assert load_scene(tmp_path / "scene.toml", four).warnings() == []
 
