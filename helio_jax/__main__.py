@@ -282,6 +282,32 @@ def report(
 
 
 @app.command()
+def compare(
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5).")],
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("helio-out/comparison"),
+    explain: Annotated[bool, typer.Option(help="Add one effect at a time and tabulate what it does.")] = False,
+    rays: Rays = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
+    from helio_jax import read
+    from helio_jax.comparison import compare as compare_with_scene
+
+    found = compare_with_scene(
+        read(stack), scene, overrides=_given(**{"trace.rays": rays}), explain=explain, progress=_say
+    )
+    files = found.write(output)
+    if as_json:
+        print(json.dumps(found.as_dict() | {"files": list(map(str, files))}))
+        return
+    print(found.agreement.verdict())
+    _print_table(found.as_table())
+    for path in files:
+        print(path)
+
+
+@app.command()
 def info(file: Annotated[Path, typer.Argument(help="File written by helio (.h5).")], as_json: AsJson = False) -> None:
     """Say what a file holds, where it came from and how it was made."""
     from helio_jax.formats.hdf5 import describe
