@@ -1,6 +1,6 @@
 """What the tracer counts: exact integer fates of all rays, analog hits, and sums of expected contributions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -72,7 +72,8 @@ class Estimate:
     Attributes:
         mean, variance: by order, the variance being that of the mean [order, detector, pixels].
         total_mean, total_variance: of all orders together [detector, pixels].
-        fates, hits, n_rays, n_branches: as in `Tally`.
+        fates, hits, n_branches: as in `Tally`.
+        n_rays: beam rays launched per pixel: one number, or one for every pixel [pixels].
     """
 
     mean: np.ndarray
@@ -81,18 +82,25 @@ class Estimate:
     total_variance: np.ndarray
     fates: np.ndarray
     hits: np.ndarray
-    n_rays: int
+    n_rays: int | np.ndarray
     n_branches: int
 
     @classmethod
     def join(cls, parts: list["Estimate"]) -> "Estimate":
         """Put blocks of pixels side by side, in order."""
-        names = ("mean", "variance", "total_mean", "total_variance", "fates", "hits")
-        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
-        return cls(**joined, n_rays=parts[0].n_rays, n_branches=parts[0].n_branches)
+        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in parts[0]._arrays()}
+        return replace(parts[0], **joined)
+
+    def take(self, pixels: np.ndarray) -> "Estimate":
+        """Return some of the pixels, in the given order."""
+        return replace(self, **{name: getattr(self, name)[..., pixels] for name in self._arrays()})
+
+    def _arrays(self) -> list[str]:
+        """Return the names of what is kept per pixel."""
+        return [f.name for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)]
 
     @property
-    def n_launched(self) -> int:
+    def n_launched(self) -> int | np.ndarray:
         """Paths launched per pixel: beam rays times branches."""
         return self.n_rays * self.n_branches
 
