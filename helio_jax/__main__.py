@@ -219,6 +219,20 @@ def import_files(
 
 
 @app.command()
+def export(
+    file: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mat (the reference's layout).")],
+    view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
+) -> None:
+    """Write micrographs in the layout of another program, by the suffix of the file."""
+    from helio_jax import read
+    from helio_jax.formats.export import export as write_foreign
+
+    write_foreign(read(file), output, view)
+    print(output)
+
+
+@app.command()
 def reconstruct(
     stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
     output: OutFile,

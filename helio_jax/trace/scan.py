@@ -209,7 +209,7 @@ class Canvas:
         self.fates += patch.fates
         self.cpus.add(patch.cpu)
         self.missing.remove(unit.number)
-        check_rays(self.fates, 0, self.n_launched)
+        check_rays(self.fates, 0, max(self.n_launched, int(self.fates.sum())))
 
     def stack(self) -> Micrographs:
         """Return the micrographs, a set of stacks where there are several views. All units must have been put.
@@ -222,12 +222,14 @@ class Canvas:
         n, n_views = self.job.n_view_pixels, len(self.job.views)
         fates = {name: int(n) for name, n in zip(FATES, self.fates, strict=True)}
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        about = {
+        about: dict[str, Any] = {
             "rays": {"launched": sum(fates.values()), **fates},
             "job": self.job.key,
             "cpu": sorted(self.cpus),
             **(note if len(self.cpus) > 1 else {}),
         }
+        if self.job.settings.target_error is not None:
+            about["rays_per_pixel"] = sum(fates.values()) / self.job.settings.branches / self.job.n_pixels
         stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(n_views))
         if n_views == 1:
             return stacks[0].replace(provenance={**stacks[0].provenance, **about})
@@ -239,6 +241,8 @@ class Canvas:
         is_expected = settings.estimator == "expected"
         scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
         n_negative = int(np.sum(self.total[:, pixels] < 0))
+        limit = (settings.target_error or 0.0) * self.total[:, pixels]
+        n_above = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
         images: dict[str, Any] = {}
         for name, array, factor in (
             ("by_order", self.by_order, scale),
@@ -265,6 +269,7 @@ class Canvas:
             provenance={
                 "trace": settings.model_dump(mode="json"),
                 "n_negative": n_negative,
+                **({} if settings.target_error is None else {"n_above_target": n_above}),
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
                 **({"view": view.about} if view.about else {}),
             },
