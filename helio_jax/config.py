@@ -128,7 +128,7 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
             for key, child in node.items()
         }
 
-    return {key: changed(node) if key in ("sample", "material") else node for key, node in tables.items()}
+    return {key: changed(node) if key in ("beam", "sample", "material") else node for key, node in tables.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

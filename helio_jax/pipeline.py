@@ -4,7 +4,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Region, Scores, Truth, evaluate_height
 from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
 from helio_jax.evaluate.report import write_report
+from helio_jax.evaluate.spot import measure_spot, save_spots
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.safe import atomic_path
@@ -40,11 +41,14 @@ from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.scan import Crew, trace_scene
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.trace.source import footprint
 
 DEFAULT_CREW = Crew()
 """Threads of this process, one per CPU."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
+SPOT_RAYS = 32768
+"""Rays from which the spot is measured and drawn."""
 SUBSTRATE_RATIO = 1.35
 """Where a scene does not say: the substrate begins at this many radii of the scored region."""
 
@@ -386,6 +390,27 @@ def run(
             title = f"{scene.name}: simulated, reconstructed, scored"
             files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)
+
+
+def draw_spot(scene: SceneFile, heights: Sequence[float], path: str | Path | None) -> list[dict[str, float]]:
+    """Measure the beam's spot on planes above the reference plane, and draw it.
+
+    Args:
+        scene: from `load_scene`.
+        heights: of the planes [um].
+        path: of the figure, or None.
+
+    Raises:
+        SceneError: a height is not below the plate.
+    """
+    if wrong := [h for h in heights if not -math.inf < h < scene.sample_distance]:
+        limit = f"{scene.sample_distance:g} um above the reference plane"
+        raise SceneError(f"heights must lie below the plate, which is {limit}, got {wrong[0]:g} um: choose lower ones")
+    points = footprint(scene.instrument, np.array(heights), SPOT_RAYS, scene.trace.seed, scene.read_rays())
+    spots = [{"height_um": float(h), **measure_spot(p)} for h, p in zip(heights, points, strict=True)]
+    if path is not None:
+        save_spots(points, spots, f"{scene.name}: the beam's spot", Path(path))
+    return spots
 
 
 def diagnose() -> dict[str, Any]:

@@ -61,7 +61,7 @@ def make_predictor(
     away: steep facets see most of what is near their horizon.
     Seeds are fixed, so that successive predictions differ by the surface, not by noise.
     """
-    instrument = stack.instrument
+    instrument = stack.instrument.with_pencil()
     geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
     reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)

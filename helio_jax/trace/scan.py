@@ -22,7 +22,7 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.job import Job, Unit
-from helio_jax.trace.run import Progress, check_rays, in_order, n_cpus, paths_of
+from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
 from helio_jax.trace.units import Patch, experiment_of, join_pieces, tasks, trace_unit
@@ -179,11 +179,16 @@ class Canvas:
         self.by_order = np.zeros((job.settings.n_orders, n_detectors, n))
         self.total, self.variance = np.zeros((n_detectors, n)), np.zeros((n_detectors, n))
         self.plate = np.zeros((n_detectors, n if job.scene.plate.is_scattering else 0))
+        effusive = job.scene.beam.effusive
+        self.effuse = np.zeros((n_detectors, n if effusive else 0))
         self.masked, self.shadowed = np.zeros((n_detectors, n_maps)), np.zeros(n_maps)
-        self.fates = np.zeros(len(FATES), np.int64)
+        self.fates, self.effuse_fates = np.zeros(len(FATES), np.int64), np.zeros(len(FATES), np.int64)
         self.cpus: set[str] = set()
         self.missing = {unit.number for unit in job.units()}
         self.n_launched = job.n_pixels * math.prod(paths_of(job.settings))
+        self.n_effused = (
+            job.n_pixels * math.prod(paths_of(effusive_settings(job.settings, effusive))) if effusive else 0
+        )
 
     def put(self, unit: Unit, patch: Patch) -> None:
         """Put the patch of a unit where it belongs.
@@ -192,13 +197,15 @@ class Canvas:
             GuardError: more rays were lost so far than the whole scan may lose.
         """
         part = slice(unit.start, unit.stop)
-        for name in ("by_order", "total", "variance", "plate", "masked", "shadowed"):
+        for name in ("by_order", "total", "variance", "plate", "effuse", "masked", "shadowed"):
             if getattr(self, name).size:
                 getattr(self, name)[..., part] = getattr(patch, name)
         self.fates += patch.fates
+        self.effuse_fates += patch.effuse_fates
         self.cpus.add(patch.cpu)
         self.missing.remove(unit.number)
         check_rays(self.fates, 0, self.n_launched)
+        check_rays(self.effuse_fates, 0, self.n_effused)
 
     def stack(self) -> MicrographStack:
         """Return the micrographs; all units must have been put.
@@ -211,15 +218,21 @@ class Canvas:
         scene, settings = self.job.scene, self.job.settings
         is_expected = settings.estimator == "expected"
         scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
+        effusive = scene.beam.effusive
+        effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
         n_negative = int(np.sum(self.total < 0))
-        for a, factor in ((self.by_order, scale), (self.total, scale), (self.variance, scale**2), (self.plate, scale)):
+        scales = (self.by_order, scale), (self.total, scale), (self.variance, scale**2)
+        for a, factor in (*scales, (self.plate, scale), (self.effuse, effused)):
             np.maximum(a, 0.0, out=a)
             a *= factor
         x, y = scene.positions()
         shape = (y.size, x.size)
-        fates = {name: int(n) for name, n in zip(FATES, self.fates, strict=True)}
+        fates, effuse_fates = (
+            {"launched": int(f.sum()), **{name: int(n) for name, n in zip(FATES, f, strict=True)}}
+            for f in (self.fates, self.effuse_fates)
+        )
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        maps = {"masked": self.masked, "shadowed": self.shadowed, "plate": self.plate}
+        maps = {"masked": self.masked, "shadowed": self.shadowed, "plate": self.plate, "effuse": self.effuse}
         return MicrographStack(
             counts=self.total.reshape(-1, *shape),
             variance=self.variance.reshape(-1, *shape),
@@ -233,7 +246,8 @@ class Canvas:
             name=scene.name,
             provenance={
                 "trace": settings.model_dump(mode="json"),
-                "rays": {"launched": sum(fates.values()), **fates},
+                "rays": fates,
+                **({"effusive_rays": effuse_fates} if effusive else {}),
                 "n_negative": n_negative,
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
                 "job": self.job.key,

@@ -106,6 +106,11 @@ class Estimate:
         joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
         return cls(**joined, n_rays=first.n_rays, n_branches=first.n_branches)
 
+    def take(self, keep: slice) -> "Estimate":
+        """Return some of the pixels."""
+        kept = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Estimate(**{k: a[..., keep] if isinstance(a, np.ndarray) else a for k, a in kept.items()})
+
     @property
     def n_launched(self) -> int:
         """Paths launched per pixel: beam rays times branches."""

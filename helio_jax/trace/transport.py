@@ -23,7 +23,7 @@ from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.plate import PLATE, PlateTable
-from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
+from helio_jax.trace.source import Sampling, Source, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import STOPPED, Tally
 
 
@@ -31,18 +31,20 @@ from helio_jax.trace.tally import STOPPED, Tally
 class Experiment:
     """Everything a block of work needs, shared read-only between threads.
 
-    No `laws`: cosine everywhere. No `plate`: a transparent one.
+    No `laws`: cosine everywhere. No `plate`: a transparent one. `effusive`: the same with the effusive beam, if any.
     """
 
     intersector: Intersector
     instrument: Instrument
     apertures: ApertureTable
+    source: Source
     sampling: Sampling
     n_orders: int
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
     plate: PlateTable | None = None
+    effusive: "Experiment | None" = None
 
     @property
     def is_plain(self) -> bool:
@@ -283,7 +285,7 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     """Return the beam rays of a block of pixels."""
     s = e.sampling
     numbers = beam_numbers(ids, s.n_rays, s.n_replicates, s.points, s.seed)
-    origin, direction = launch_rays(e.instrument, x, y, numbers)
+    origin, direction = launch_rays(e.instrument, x, y, numbers, e.source)
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
     n = flying.size
