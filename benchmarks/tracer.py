@@ -1,13 +1,15 @@
 """How exact and how fast the tracer is: closed forms, Embree against float64, scales, and time per bounce.
 
-python benchmarks/tracer.py [--output benchmarks/out] [--rows 3,4,5,8,10,11,12] [--tiny]
+python benchmarks/tracer.py [--output benchmarks/out] [--rows 3,4,5,8,10,11,12,14] [--tiny]
 
 Row numbers are those of the tracer's issue. Times are CPU times of one thread; ratios are taken within one run.
 """
 
 import argparse
+import importlib.util
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +63,17 @@ def upward(points: np.ndarray) -> Hits:
 
 
 def tube_transmission(ratio: float, n_points: int, rays: int) -> tuple[float, float]:
-    """Return the share of atoms that pass a tube of a length over radius, and its standard error."""
+    """Return the share of atoms that pass a tube of a length over radius, and its standard error.
+
+    They start in rings of equal area, one point in each; the error is taken from differences of neighbouring rings.
+    """
     tube = around(np.array([0.0, ratio * RADIUS]), np.full(2, RADIUS), 720)
     rng = np.random.default_rng(1)
-    r, turn = RADIUS * np.sqrt(rng.random(n_points)), 2.0 * np.pi * rng.random(n_points)
+    ring = (np.arange(n_points) + rng.random(n_points)) / n_points
+    r, turn = RADIUS * np.sqrt(ring), 2.0 * np.pi * rng.random(n_points)
     entrance = upward(np.stack([r * np.cos(turn), r * np.sin(turn), np.zeros(n_points)], -1))
     share = analog(tube, above(ratio * RADIUS, RADIUS), entrance, rays).hits.sum((0, 1)) / rays
-    return float(share.mean()), float(share.std() / np.sqrt(n_points))
+    return float(share.mean()), float(np.sqrt(0.5 * np.mean(np.diff(share) ** 2) / n_points))
 
 
 def above(height: float, radius: float) -> Instrument:
@@ -95,7 +101,7 @@ def closed_forms(scale: int) -> list[Row]:
     rows = []
     for ratio, exact in CLAUSING.items():
         n = 4000 // scale
-        rays = max(int(3.4e6 * (1.0 / exact - 1.0) / n) + 1, 64) if scale == 1 else 64
+        rays = max(int(1.2e6 * (1.0 / exact - 1.0) / n) + 1, 64) if scale == 1 else 64
         rows.append(judged(f"Clausing tube, length / radius {ratio}", *tube_transmission(ratio, n, rays), exact))
     open_share, n, rays = 0.1, 100, 150_000 // scale
     body, bottom, hole = cavity(open_share, 400)
@@ -259,6 +265,10 @@ def scales(rays: int) -> list[Row]:
     return rows
 
 
+MISSED = np.uint32(2**32 - 1)
+"""Embree's triangle of a ray that meets none."""
+
+
 class Spy:
     """An Embree scene that keeps the rays it is asked about."""
 
@@ -270,37 +280,85 @@ class Spy:
         return self.scene.run(origins, directions, **how)
 
 
+def bounced(n: int, n_rays: int) -> tuple[Intersector, Callable[[], None], Callable[[], list], list]:
+    """Return a cavity, what traces analog atoms in it, what asks Embree alone about all their rays, and these rays."""
+    body, start, hole = cavity(0.05, n)
+    settings = TraceSettings(rays=n_rays, estimator="analog", max_events=30, maps=False)
+    experiment = make_experiment(body, hole, settings)
+    embree: Any = experiment.intersector._embree
+    seen, zero = [], np.zeros(1)
+
+    def trace() -> None:
+        trace_pixels(experiment, zero, zero, workers=1, first=start)
+
+    trace()
+    experiment.intersector._embree = Spy(embree, seen)
+    trace()
+    experiment.intersector._embree = embree
+    return experiment.intersector, trace, lambda: [embree.run(o, d, output=True) for o, d in seen], seen
+
+
+def cpu_seconds(work: Callable[[], Any]) -> float:
+    """Return the CPU time that a call takes."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
 def bounce_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
     """Row 8: the analog bounce loop against the bare embreex call on the same rays."""
     rows = []
     for n in sizes:
-        body, start, hole = cavity(0.05, n)
-        settings = TraceSettings(rays=n_rays, estimator="analog", max_events=30, maps=False)
-        experiment = make_experiment(body, hole, settings)
-        embree: Any = experiment.intersector._embree
-        seen, kept = [], []
-
-        zero = np.zeros(1)
-        trace_pixels(experiment, zero, zero, workers=1, first=start)
-        experiment.intersector._embree = Spy(embree, seen)
-        trace_pixels(experiment, zero, zero, workers=1, first=start)
-        experiment.intersector._embree = embree
+        surface, trace, ask, seen = bounced(n, n_rays)
         flights = sum(len(o) for o, _ in seen)
-        for _ in range(5):
-            t = time.process_time()
-            trace_pixels(experiment, zero, zero, workers=1, first=start)
-            ours = time.process_time() - t
-            t = time.process_time()
-            for o, d in seen:
-                embree.run(o, d, output=True)
-            kept.append((ours, time.process_time() - t))
+        kept = [(cpu_seconds(trace), cpu_seconds(ask)) for _ in range(5)]
         ratio = float(np.median([a / b for a, b in kept]))
         ours, bare = (1e9 * float(np.median(v)) / flights for v in zip(*kept, strict=True))
-        target = 1.6 if len(body.faces) < 20_000 else 1.4
+        n_faces = len(surface.triangles)
+        target = 1.6 if n_faces < 20_000 else 1.4
         text = f"{ours:.0f} / {bare:.0f} ns = {ratio:.2f}"
-        what = f"bounce loop / bare embreex, {len(body.faces)} triangles"
+        what = f"bounce loop / bare embreex, {n_faces} triangles"
         rows.append(row("8", what, text, f"<= {target}", ratio <= target, flights=flights))
     return rows
+
+
+def mitsuba_rows(n: int, n_rays: int) -> list[Row]:
+    """Row 14: the same rays through Mitsuba 3 (LLVM backend, one thread), and whether it meets the same triangles."""
+    what = "the same rays through Mitsuba 3"
+    if importlib.util.find_spec("mitsuba") is None:
+        return [row("14", what, "not measured: pip install 'helio-jax[bench]'", "report", None)]
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(0)
+    surface, trace, ask, seen = bounced(n, n_rays)
+    mesh = mi.Mesh("cavity", len(surface.vertices), len(surface.triangles))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = (
+        ((surface.vertices - surface.center) / surface.half_size).astype(np.float32).ravel()
+    )
+    parameters["faces"] = surface.triangles.astype(np.uint32).ravel()
+    parameters.update()
+    scene = mi.load_dict({"type": "scene", "cavity": mesh})
+    rays = [mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T)) for o, d in seen]
+    dr.eval(rays)
+
+    def query(ray: Any) -> Any:
+        hit = scene.ray_intersect_preliminary(ray, coherent=False)
+        dr.eval(hit.prim_index, hit.prim_uv, hit.t)
+        dr.sync_thread()
+        return hit
+
+    hits = list(map(query, rays))  # compiles, too
+    found = np.concatenate([np.where(np.isfinite(np.array(h.t)), np.array(h.prim_index), MISSED) for h in hits])
+    ours = np.concatenate([answer["primID"] for answer in ask()]).astype(np.uint32)
+    same = float(np.mean(found == ours))
+    kept = [[cpu_seconds(work) for work in (trace, lambda: list(map(query, rays)), ask)] for _ in range(5)]
+    flights = sum(len(o) for o, _ in seen)
+    whole, theirs, bare = (1e9 * float(np.median(v)) / flights for v in zip(*kept, strict=True))
+    text = f"{theirs:.0f} ns, bare embreex {bare:.0f} ns, our bounce {whole:.0f} ns; {same:.2%} the same triangle"
+    return [row("14", f"{what}, {len(surface.triangles)} triangles", text, "report", None, ratio=theirs / bare)]
 
 
 def image_row(tiny: bool) -> list[Row]:
@@ -395,7 +453,7 @@ def size_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
-    parser.add_argument("--rows", default="3,4,5,8,10,11,12")
+    parser.add_argument("--rows", default="3,4,5,8,10,11,12,14")
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()
     tiny = args.tiny
@@ -407,6 +465,7 @@ def main() -> None:
         "10": lambda: image_row(tiny),
         "11": lambda: efficiency_rows(3 if tiny else 21),
         "12": lambda: size_rows((24,) if tiny else (24, 72, 224, 708), 8 if tiny else 256),
+        "14": lambda: mitsuba_rows(20 if tiny else 201, 1000 if tiny else 60_000),
     }
     rows = [r for name in args.rows.split(",") for r in work[name]()]
     write(args.output / ("tracer_tiny.json" if tiny else "tracer.json"), rows, seed=1)

@@ -63,13 +63,19 @@ def form_factor(x, y, depth, k, semi_axes, rims):
 
 
 @njit(cache=True, nogil=True)
+def is_inside(x, y, k, center, semi_axes, cos_sin):
+    """Whether the plate point (x, y) lies in aperture `k`."""
+    dx, dy = x - center[k, 0], y - center[k, 1]
+    c, s = cos_sin[k, 0], cos_sin[k, 1]
+    p, q = (dx * c + dy * s) / semi_axes[k, 0], (dy * c - dx * s) / semi_axes[k, 1]
+    return p * p + q * q <= 1.0
+
+
+@njit(cache=True, nogil=True)
 def find_aperture(x, y, center, semi_axes, cos_sin):
     """Return the first aperture that contains the plate point (x, y), or -1."""
     for k in range(center.shape[0]):
-        dx, dy = x - center[k, 0], y - center[k, 1]
-        c, s = cos_sin[k, 0], cos_sin[k, 1]
-        p, q = (dx * c + dy * s) / semi_axes[k, 0], (dy * c - dx * s) / semi_axes[k, 1]
-        if p * p + q * q <= 1.0:
+        if is_inside(x, y, k, center, semi_axes, cos_sin):
             return k
     return -1
 

@@ -4,10 +4,11 @@ All rays of a block fly in step: flight e starts after e events, each a scatteri
 path's order, or on the plate, which does not. Every path is walked as nature does it (re-emission by the law of the
 surface hit) and tallied in exact integers; the `expected` estimator adds, at every scattering, the probability of going
 straight to each detector (next-event estimation). For atoms of the cosine law that is the closed-form form factor minus
-the hidden part, which one shadow ray to a random point of the aperture estimates; it has no variance where nothing
-hides the aperture, and heavy tails where a hidden aperture is many times wider than it is away. Lobes are estimated by
-the same shadow ray and by the atoms that hit, weighted by the balance heuristic (Veach and Guibas, SIGGRAPH 1995);
-exact directions (mirrors) by the atoms that hit alone.
+the hidden part; it has no variance where nothing hides the aperture. The hidden part is estimated by a shadow ray to a
+random point of the aperture or, where an aperture is so wide that this has the larger variance, by the atoms that fly
+on and do not get there (maximum heuristic); what lobes send by both at once, weighted by the balance heuristic (Veach
+and Guibas, SIGGRAPH 1995). So neither a narrow lobe nor a wide aperture makes heavy tails. Exact directions (mirrors)
+are estimated by the atoms that hit alone.
 """
 
 from dataclasses import dataclass, fields
@@ -17,7 +18,7 @@ from numba import njit
 
 from helio_jax.instrument import Instrument
 from helio_jax.trace.analog import fly_to_the_end, land
-from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor
+from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor, is_inside
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
@@ -65,7 +66,8 @@ class _Paths:
     """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
 
     `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
-    direction (laws.scatter_atoms) [n], `order` how often the sample scattered them, `met_plate` whether the plate did.
+    direction (laws.scatter_atoms) [n], `normal` that of the sample left (zero: pinhole or plate) [n, 3], `order` how
+    often the sample scattered them, `met_plate` whether the plate did [n].
     """
 
     origin: np.ndarray
@@ -75,12 +77,13 @@ class _Paths:
     target: np.ndarray
     skip: np.ndarray
     density: np.ndarray
+    normal: np.ndarray
     order: np.ndarray
     met_plate: np.ndarray
 
     def take(self, keep: np.ndarray) -> "_Paths":
         """Return some of the rays."""
-        return _Paths(*(getattr(self, f.name)[keep] for f in fields(self)))
+        return _Paths(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 @njit(cache=True, nogil=True)
@@ -129,7 +132,17 @@ def lift_off(point, normal, surface, restart):
 
 
 @njit(cache=True, nogil=True)
-def _aim(k, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
+def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
+    """Return the chance that an atom goes to an aperture as small as a point and `area` large, if aiming may tell it.
+
+    It is 0 where `n_hits` atoms that fly on tell it with less variance. Signed as the cosine at the surface.
+    """
+    weight = area * cosine_surface * cosine_plate / square / np.pi
+    return weight if n_hits * abs(weight) <= 1.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
     """Aim at a random point of aperture `k`: direction, weight of that point, and whether it can count at all."""
     n = point.shape[0]
     direction, weight, is_open = np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
@@ -141,9 +154,9 @@ def _aim(k, point, normal, pixel, offset, plate_z, target, center, semi_axes, co
         r2 = dx * dx + dy * dy + dz * dz
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
-        cos_surface = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
-        weight[i] = area[k] * cos_surface * dz / r / r2 / np.pi
-        is_open[i] = cos_surface > 0.0 and find_aperture(x, y, center, semi_axes, cos_sin) == k
+        cosine = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
+        weight[i] = _aimed_weight(n_hits, r2, cosine, dz / r, area[k])
+        is_open[i] = cosine > 0.0 and find_aperture(x, y, center, semi_axes, cos_sin) == k
     return direction, weight, is_open
 
 
@@ -212,6 +225,35 @@ def _score_hits(
 
 
 @njit(cache=True, nogil=True)
+def _subtract_hidden(
+    share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
+    center, semi_axes, cos_sin, area, sums, plate_sums,
+):  # fmt: skip
+    """Subtract the wide apertures that cosine atoms do not reach though they fly towards them: what `_score` left.
+
+    The mirror image of an atom's direction below the surface it leaves tells of the parts below the horizon there.
+    """
+    for i in range(origin.shape[0]):
+        if density[i] != 0.0:
+            continue
+        n, d = normal[i], direction[i]
+        cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+        for sign in (1.0, -1.0):
+            dz = d[2] if sign > 0.0 else d[2] - 2.0 * cosine * n[2]
+            is_hidden = sign < 0.0 or surface[i] != MISS
+            if dz <= 0.0 or cosine <= 0.0:
+                continue
+            r = (plate_z - origin[i, 2]) / dz
+            x = origin[i, 0] - offset[pixel[i], 0] + r * (d[0] if sign > 0.0 else d[0] - 2.0 * cosine * n[0])
+            y = origin[i, 1] - offset[pixel[i], 1] + r * (d[1] if sign > 0.0 else d[1] - 2.0 * cosine * n[1])
+            for k in range(center.shape[0]):
+                if is_inside(x, y, k, center, semi_axes, cos_sin):
+                    if is_hidden and _aimed_weight(n_hits, r * r, cosine, dz, area[k]) == 0.0:
+                        _add(-sign * share, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
+                    is_hidden = True  # where apertures overlap, the first one has it
+
+
+@njit(cache=True, nogil=True)
 def _bounce(normal, u):
     """Draw cosine-distributed directions about the normals [n, 3]."""
     out = np.empty(normal.shape)
@@ -222,15 +264,16 @@ def _bounce(normal, u):
 
 
 @njit(cache=True, nogil=True)
-def _history(surface, order, met_plate):
-    """Return what scattered each path, once this surface has."""
-    order, met_plate = order.copy(), met_plate.copy()
+def _history(surface, normal, order, met_plate):
+    """Return what is kept of each path's past once this surface has scattered it: `normal`, `order`, `met_plate`."""
+    normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
     for i in range(surface.size):
         if surface[i] == PLATE:
             met_plate[i] = True
+            normal[i] = 0.0
         else:
             order[i] += 1
-    return order, met_plate
+    return normal, order, met_plate
 
 
 def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
@@ -243,7 +286,7 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
     if e.plate is not None and (on_plate := hits.surface == PLATE).any():
         hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
-    point, normal = hits.point, hits.normal
+    point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
     whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
     shape = (table.center, table.semi_axes, table.cos_sin)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
@@ -254,7 +297,7 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
         cosine = cosine_shares(e.laws, material, paths.direction, normal, *key)
     for k in range(len(table.center)):
         direction, weight, is_open = _aim(
-            k, point, normal, paths.pixel, offset, plate_z, paths.target, *shape, table.area
+            k, n_hits, point, normal, paths.pixel, offset, plate_z, paths.target, *shape, table.area
         )
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
@@ -263,7 +306,6 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
             table.rims, tally.sums, tally.plate_sums,
         )  # fmt: skip
         if e.laws is not None:
-            n_hits = e.sampling.n_branches if event == 0 else 1
             _score_lobes(
                 k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *whose, direction,
                 is_open, plate_z, table.area, tally.sums, tally.plate_sums,
@@ -271,14 +313,15 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
 
 
 def _add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, paths: _Paths, offset) -> None:
-    """Add the atoms of lobes that hit a detector after `event` events."""
+    """Add what the atoms that fly on after `event` events tell: lobes' hits, and what is hidden."""
     n_branches, table = e.sampling.n_branches, e.apertures
-    _score_hits(
-        1.0 / n_branches, n_branches if event == 1 else 1, paths.density, paths.origin, paths.direction, paths.pixel,
-        paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches), surface, offset,
-        e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, table.area, tally.sums,
-        tally.plate_sums,
-    )  # fmt: skip
+    weight = 1.0 / n_branches, n_branches if event == 1 else 1
+    whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    flight = paths.origin, paths.direction, *whose, surface
+    plate = offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, table.area
+    _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
+    if e.laws is not None:
+        _score_hits(*weight, paths.density, *flight, *plate, tally.sums, tally.plate_sums)
 
 
 def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> _Paths:
@@ -289,10 +332,9 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
     n = flying.size
-    return _Paths(
-        origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(n, -1, np.int32), np.zeros(n),
-        np.zeros(n, np.int32), np.zeros(n, bool),
-    )  # fmt: skip
+    skip, density, normal = np.full(n, -1, np.int32), np.zeros(n), np.zeros((n, 3))
+    history = np.zeros(n, np.int32), np.zeros(n, bool)
+    return _Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal, *history)
 
 
 def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, stopped: np.ndarray) -> _Paths:
@@ -309,14 +351,14 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
     per_replicate = s.n_rays * s.n_branches // s.n_replicates if s.n_replicates else 1
     u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
-    order, met_plate = _history(hits.surface, paths.order, paths.met_plate)
+    history = _history(hits.surface, hits.normal, paths.order, paths.met_plate)
     if e.laws is None:
         direction, density, leaves = _bounce(hits.normal, u), np.zeros(len(path)), None
     else:
         material, key = e.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
         direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
         stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
-    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, order, met_plate)
+    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, *history)
     return out if leaves is None or leaves.all() else out.take(leaves)
 
 
@@ -350,7 +392,7 @@ def trace_block(
             hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes,
             table.cos_sin, tally.fates, tally.hits, tally.plate_hits,
         )  # fmt: skip
-        if e.is_expected and e.laws is not None and event > 0:
+        if e.is_expected and event > 0:
             _add_hits(e, event, tally, hits.surface, paths, offset)
         if not keep.size:
             break

@@ -11,41 +11,29 @@ import pytest
 from stats import assert_likely, pooled_chi2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from benchmarks.reference_counts import TRENCH_ORDERS, order_p_values
 from benchmarks.reference_sets import broad_sets, flat_sets, sphere_set, trench_sets
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 
-ORDERS = [[0], [1], [2], list(range(3, 13))]
-
-
-def p_values(count_set, settings, orders=ORDERS):
-    """Return p [detector, order group]."""
-    mean, variance = count_set.expect(settings)
-    out = np.empty((mean.shape[1], len(orders)))
-    for k in range(mean.shape[1]):
-        for j, group in enumerate(orders):
-            columns = (a[:, k][:, group].sum(-1) for a in (count_set.counts, mean, variance))
-            out[k, j] = pooled_chi2(*columns)
-    return out
-
 
 def test_sphere_orders(shared):
     """Orders 1, 2, 3, 4+ of sphere A; catches wrong bounce laws, next-event weights and order labels."""
-    p = p_values(sphere_set(shared), TraceSettings(rays=256, branches=32, n_orders=13))
+    p = order_p_values(sphere_set(shared), TraceSettings(rays=256, branches=32, n_orders=13))
     assert p.min() > 1e-4, p
 
 
 @pytest.mark.parametrize("wrong", [{"mirror": True}, {"cap_height_um": 700.0}])
 def test_sphere_rejects_wrong_models(shared, wrong):
     """The same test must fail for mirrored columns and for a burial wrong by 0.02 mm."""
-    p = p_values(sphere_set(shared, **wrong), TraceSettings(rays=64, branches=8, n_orders=13))
+    p = order_p_values(sphere_set(shared, **wrong), TraceSettings(rays=64, branches=8, n_orders=13))
     assert p[:, 0].max() < 1e-9
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_broad_sources(shared, number):
     """Gaussian and uniform source with a 50 um pinhole; catches a wrong angular law or pinhole position."""
-    p = p_values(broad_sets(shared)[number], TraceSettings(rays=8192, branches=16, n_orders=13))
+    p = order_p_values(broad_sets(shared)[number], TraceSettings(rays=8192, branches=16, n_orders=13))
     assert p.min() > 1e-4, p
 
 
@@ -75,8 +63,7 @@ def test_flat_at_twelve_distances(shared):
 def test_trench_every_order(shared, number):
     """Twelve orders and above in a deep slot (mesh), first ellipse wins; analog and expected, and the stopped rays."""
     count_set, stopped = trench_sets(shared)[number]
-    orders = [[i] for i in range(13)]
-    p = p_values(count_set, TraceSettings(rays=8192, branches=4, n_orders=13), orders)
+    p = order_p_values(count_set, TraceSettings(rays=8192, branches=4, n_orders=13), TRENCH_ORDERS)
     assert p.min() > 1e-4, p
     settings = TraceSettings(rays=60_000, estimator="analog", n_orders=13)
     tally = trace_pixels(make_experiment(count_set.body, count_set.instrument, settings), count_set.x, count_set.y)
