@@ -118,7 +118,9 @@ def fit(scene: SceneFile, stack: MicrographStack, **refine: object) -> Case:
 def own(name: str, seed: int, **overrides: object) -> tuple[SceneFile, MicrographStack]:
     """Return a scene and its simulated counts."""
     scene = load_scene(SCENES / f"{name}.toml", overrides)
-    return scene, pipeline.record(scene, pipeline.simulate(scene, seed=seed))
+    stack = pipeline.record(scene, pipeline.simulate(scene, seed=seed))
+    assert isinstance(stack, MicrographStack)  # one view
+    return scene, stack
 
 
 def height_rows(record: Record, shared: Path | None, seed: int, size: int, rows: set[str]) -> None:

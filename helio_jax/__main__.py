@@ -133,10 +133,37 @@ def simulate(
         options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, _say)
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is not None:
-        n, ny, nx = stack.shape
-        print(f"{output}: {n} micrographs of {nx} x {ny} pixels ({stack.noise})")
-        for name, share in stack.shares().items():
-            print(f"  {name}: {share:.2%} of the counts")
+        for one in getattr(stack, "stacks", (stack,)):
+            n, ny, nx = one.shape
+            view = f"{one.name}: " if one is not stack else ""
+            print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
+            for name, share in one.shares().items():
+                print(f"  {name}: {share:.2%} of the counts")
+
+
+@app.command()
+def rays(
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz).")],
+    pixel: Annotated[tuple[int, int] | None, typer.Option(help="Row and column, from 0 (default: all).")] = None,
+    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, to write too.")] = None,
+    view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
+    n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
+    seed: Seed = None,
+) -> None:
+    """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
+    from helio_jax.config import load_scene
+    from helio_jax.formats.columns import write_columns
+    from helio_jax.trace.follow import follow_scene
+    from helio_jax.trace.tally import FATES
+
+    loaded = load_scene(scene, _given(**{"trace.rays": n, "trace.seed": seed}))
+    atoms = follow_scene(loaded, loaded.trace, pixel, view)
+    write_columns(output, atoms.columns())
+    if directions:
+        write_columns(directions, atoms.directions())
+    fates = ", ".join(f"{int((atoms.fate == i).sum())} {name}" for i, name in enumerate(FATES))
+    print(f"{output}: {atoms.fate.size} atoms: {fates}; mean order {atoms.order.mean():.3f}")
 
 
 @app.command()
@@ -285,7 +312,9 @@ def validate(scene: SceneArg) -> None:
         print(f"  {key}: {value}")
     for warning in loaded.warnings():
         print(f"  warning: {warning}")
-    print(f"{scene}: ok ({loaded.scan.nx} x {loaded.scan.ny} pixels, {len(loaded.detector)} detectors)")
+    ny, nx = loaded.image_shape
+    views = f", {loaded.scan.n_views} views" if loaded.scan.n_views > 1 else ""
+    print(f"{scene}: ok ({nx} x {ny} pixels, {len(loaded.detector)} detectors{views})")
 
 
 @app.command()
@@ -298,7 +327,7 @@ def spot(
     """Measure the beam's spot at one or more heights above the reference plane, and draw it."""
     from helio_jax.config import load_scene
     from helio_jax.errors import SceneError
-    from helio_jax.pipeline import draw_spot
+    from helio_jax.spot import draw_spot
 
     try:
         at = [float(text) for text in heights.split(",")]

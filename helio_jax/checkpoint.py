@@ -17,7 +17,7 @@ import numpy as np
 
 from helio_jax.errors import GuardError, InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.formats.parts import Parts
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import Micrographs
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.job import Job, Unit, differences
 from helio_jax.trace.run import Progress
@@ -70,7 +70,7 @@ class Keeper:
     restart: bool = False
     say: Callable[[str], None] = lambda text: None
 
-    def trace(self, scene: Scene, settings: TraceSettings, progress: Progress | None = None) -> MicrographStack | None:
+    def trace(self, scene: Scene, settings: TraceSettings, progress: Progress | None = None) -> Micrographs | None:
         """Return the micrographs, or None where other shards are not finished. The parts are left to the caller.
 
         Raises:
@@ -150,7 +150,7 @@ class Keeper:
         except ValueError as e:
             raise InputFileError(f"{self.parts.path(unit.number)} is damaged ({e})") from None
 
-    def _complete(self, job: Job, units: list[Unit], canvas: Canvas) -> MicrographStack | None:
+    def _complete(self, job: Job, units: list[Unit], canvas: Canvas) -> Micrographs | None:
         """Return the micrographs, once, when all shards are finished."""
         if self.shard is not None:
             n_there = sum(self.parts.has(unit.number) for unit in units)

@@ -12,13 +12,15 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from helio_jax.errors import SceneError
+from helio_jax.errors import InputFileError, SceneError
 from helio_jax.evaluate.settings import TruthSettings
 from helio_jax.explain import explain_errors
 from helio_jax.instrument import Instrument
 from helio_jax.prepare.noise import NoiseSettings
 from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.files import read_bytes
+from helio_jax.scene.scan import named_kind
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.settings import TraceSettings
 
@@ -52,12 +54,26 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
             table, value, limit and remedy.
     """
     path = Path(path)
-    data = _merge(_read_extended(path), _nest(overrides or {}))
+    data = named_kind(_merge(_read_extended(path), _nest(overrides or {})))
     try:
-        scene = SceneFile.model_validate(data)
+        scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
         raise SceneError(explain_errors(str(path), e, SceneFile, data)) from None
-    return scene.at(path.parent)
+    return scene.at(path.parent).settled()
+
+
+def read_reconstruction(path: Path) -> Reconstruction:
+    """Read a reconstruction, for samples that are one.
+
+    Raises:
+        InputFileError: missing, damaged, or something else.
+    """
+    from helio_jax.formats.hdf5 import read
+
+    found = read(path)
+    if not isinstance(found, Reconstruction):
+        raise InputFileError(f"{path}: a sample must be a reconstruction, the file holds a {type(found).__name__}")
+    return found
 
 
 def load_instrument(path: str | os.PathLike) -> Instrument:
@@ -128,7 +144,8 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
             for key, child in node.items()
         }
 
-    return {key: changed(node) if key in ("beam", "sample", "material") else node for key, node in tables.items()}
+    tables_with_files = ("beam", "sample", "material", "scan")
+    return {key: changed(node) if key in tables_with_files else node for key, node in tables.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -22,6 +22,8 @@ class MicrographStack:
     Attributes:
         counts: expected or measured counts per pixel [detector, y, x].
         x, y: beam positions [um], increasing, equally spaced.
+        positions: beam positions (x, y) [x, 2], um, of a scan that is no raster: `x` then only counts them, and `y` is
+            a single 0; None for rasters and lines.
         instrument: beam, plate and detectors, in the order of the detector axis.
         variance: variance of `counts` as data (counting noise included where the counts are noisy), or of the
             Monte Carlo mean where they are expectations; same shape, or None when unknown.
@@ -49,6 +51,7 @@ class MicrographStack:
     instrument: Instrument
     variance: np.ndarray | None = None
     is_observed: np.ndarray = None  # type: ignore[assignment]  # filled when made
+    positions: np.ndarray | None = None
     background: np.ndarray | None = None
     by_order: np.ndarray | None = None
     effuse: np.ndarray | None = None
@@ -78,6 +81,10 @@ class MicrographStack:
                 put(name, as_float_array(name, getattr(self, name), shape, error))
         if self.shadowed is not None:
             put("shadowed", as_float_array("shadowed", self.shadowed, shape[1:], error))
+        if self.positions is not None:
+            put("positions", as_float_array("positions", self.positions, (self.x.size, 2), error))
+            if self.y.size != 1 or not np.all(np.isfinite(self.positions)):
+                raise error(f"positions must be finite and belong to images of one row, got {self.y.size} rows")
         if self.by_order is not None:
             put("by_order", as_float_array("by_order", self.by_order, (None, *shape), error))
         if self.background is not None:
@@ -144,3 +151,7 @@ class MicrographSet:
                 f"({', '.join(s.name for s in self.stacks)}): align them first (helio align)"
             )
         return self.stacks[0]
+
+
+Micrographs = MicrographStack | MicrographSet
+"""What a scan gives: one stack, or one for each of its views."""

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,17 +15,16 @@ from pydantic import ValidationError
 
 from helio_jax.checkpoint import Keeper, Shard
 from helio_jax.config import SceneFile, load_scene
-from helio_jax.errors import ResumeError, SceneError
+from helio_jax.errors import InputFileError, ResumeError, SceneError
 from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Region, Scores, Truth, evaluate_height
 from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
 from helio_jax.evaluate.report import write_report
-from helio_jax.evaluate.spot import measure_spot, save_spots
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.safe import atomic_path
 from helio_jax.instrument import Detector, Instrument, Plate
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
@@ -41,14 +40,11 @@ from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.scan import Crew, trace_scene
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.source import footprint
 
 DEFAULT_CREW = Crew()
 """Threads of this process, one per CPU."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
-SPOT_RAYS = 32768
-"""Rays from which the spot is measured and drawn."""
 SUBSTRATE_RATIO = 1.35
 """Where a scene does not say: the substrate begins at this many radii of the scored region."""
 
@@ -57,8 +53,10 @@ def _silent(label: str) -> Any:
     return nullcontext()
 
 
-def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> MicrographStack:
+def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> Micrographs:
     """Trace a scene's micrographs: expected counts, or analog ones with `estimator="analog"`.
+
+    A stack, or a set of stacks where the scan has several views (distances, rotations).
 
     Args:
         scene: from `load_scene`.
@@ -100,7 +98,7 @@ def simulate_file(
     overrides: dict[str, Any] | None = None,
     options: SimulateOptions = SimulateOptions(),
     verb: str = "simulate",
-) -> MicrographStack | None:
+) -> Micrographs | None:
     """Trace a scene's micrographs into a file; finished units are kept in OUTPUT.parts until it is written.
 
     Where such parts are found, the run goes on from there.
@@ -180,8 +178,16 @@ def _changed(settings, changes: dict[str, Any]):
         raise SceneError(f"setting not accepted: {problems}") from None
 
 
-def record(scene: SceneFile, stack: MicrographStack) -> MicrographStack:
-    """Return the stack as the scene's experiment would record it: with counting noise, if the scene asks for it."""
+def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
+    """Return micrographs as the scene's experiment would record them: with counting noise, if the scene asks for it.
+
+    Every view has noise of its own.
+    """
+    if isinstance(stack, MicrographSet):
+        noise = (scene.noise.model_copy(update={"seed": scene.noise.seed + i}) for i in range(len(stack.stacks)))
+        views = zip(stack.stacks, noise, strict=True)
+        seen = (add_noise(s, n) if n.enabled and s.noise == "expected" else s for s, n in views)
+        return replace(stack, stacks=tuple(seen))
     return add_noise(stack, scene.noise) if scene.noise.enabled and stack.noise == "expected" else stack
 
 
@@ -213,6 +219,10 @@ def reconstruct(
         InputFileError: a set of several scans, which must be aligned first.
     """
     one = stack.only() if isinstance(stack, MicrographSet) else stack
+    if one.positions is not None:
+        raise InputFileError(
+            f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
+        )
     if one.noise == "measured" and one.n_rays is None:
         one = calibrate(one)
     wanted = changes | ({"method": method} if method else {})
@@ -280,8 +290,11 @@ def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = Fals
 def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
     """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
     sample, region = scene.sample, _region(scene, 0.0)
-    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or region is None:
-        raise SceneError(f"{path}: fitting a centre needs a scene with one sphere and truth.region_radius_um")
+    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or sample.is_placed or region is None:
+        raise SceneError(
+            f"{path}: fitting a centre needs a scene with one sphere, which sample.scale, rotate_deg and translate_um "
+            "leave where it is, and truth.region_radius_um"
+        )
     grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
     (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift
 
@@ -366,6 +379,11 @@ def run(
         InterruptedRun, StoppedRun: stopped while tracing; what was finished is kept.
     """
     scene = load_scene(scene_path, overrides)
+    if scene.scan.kind != "raster" or scene.scan.n_views > 1:
+        raise SceneError(
+            f"{scene_path}: heights come from one raster, scan.kind is {scene.scan.kind!r} with {scene.scan.n_views} "
+            "view(s): use helio simulate, which writes any scan"
+        )
     out = Path(folder) if folder else Path("helio-out") / scene.name
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -377,7 +395,7 @@ def run(
     with stage("simulating micrographs") as progress:
         options = SimulateOptions(noise=True, crew=crew, restart=restart, progress=progress, say=say)
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
-    assert stack is not None  # no shards here
+    assert isinstance(stack, MicrographStack)  # no shards here, and one view
     with stage("reconstructing heights") as progress:
         rec = reconstruct(stack, settings=scene.reconstruct, report=progress)
     write(rec, files["height map"])
@@ -390,27 +408,6 @@ def run(
             title = f"{scene.name}: simulated, reconstructed, scored"
             files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)
-
-
-def draw_spot(scene: SceneFile, heights: Sequence[float], path: str | Path | None) -> list[dict[str, float]]:
-    """Measure the beam's spot on planes above the reference plane, and draw it.
-
-    Args:
-        scene: from `load_scene`.
-        heights: of the planes [um].
-        path: of the figure, or None.
-
-    Raises:
-        SceneError: a height is not below the plate.
-    """
-    if wrong := [h for h in heights if not -math.inf < h < scene.sample_distance]:
-        limit = f"{scene.sample_distance:g} um above the reference plane"
-        raise SceneError(f"heights must lie below the plate, which is {limit}, got {wrong[0]:g} um: choose lower ones")
-    points = footprint(scene.instrument, np.array(heights), SPOT_RAYS, scene.trace.seed, scene.read_rays())
-    spots = [{"height_um": float(h), **measure_spot(p)} for h, p in zip(heights, points, strict=True)]
-    if path is not None:
-        save_spots(points, spots, f"{scene.name}: the beam's spot", Path(path))
-    return spots
 
 
 def diagnose() -> dict[str, Any]:

@@ -5,15 +5,16 @@ import platform
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from helio_jax.config import SceneFile, resolved
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import Micrographs
 
 
-def with_provenance(stack: MicrographStack, scene: SceneFile, scene_path: str | Path) -> MicrographStack:
-    """Return the stack with what is needed to make it again: scene text, versions, commit, command line, time."""
+def with_provenance(stack: Micrographs, scene: SceneFile, scene_path: str | Path) -> Micrographs:
+    """Return the micrographs with what is needed to make it again: scene text, versions, commit, command line, time."""
     path = Path(scene_path)
     names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
     about = {
@@ -26,7 +27,7 @@ def with_provenance(stack: MicrographStack, scene: SceneFile, scene_path: str | 
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
-    return stack.replace(provenance={**stack.provenance, **about})
+    return replace(stack, provenance={**stack.provenance, **about})
 
 
 def package_version(name: str) -> str:

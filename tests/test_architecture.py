@@ -1,7 +1,7 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > study > pipeline > predict, checkpoint, provenance > config > explain > stages > scene > nouns > settings,
+__main__ > study > pipeline > predict, checkpoint, provenance, spot > config > explain > stages > scene > nouns > settings,
 arrays, errors.
 """
 
@@ -23,7 +23,7 @@ LEVELS = [
     {"trace", "prepare", "reconstruct", "evaluate", "formats"},
     {"explain"},
     {"config"},
-    {"predict", "checkpoint", "provenance"},
+    {"predict", "checkpoint", "provenance", "spot"},
     {"pipeline"},
     {"study"},
     {"__main__", "__init__"},

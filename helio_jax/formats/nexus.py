@@ -46,6 +46,7 @@ STACK_FIELDS = (
     Field("counts", "micrographs/counts", "counts", "counts per pixel"),
     Field("x", "micrographs/x", "um", "beam position x on the sample plane"),
     Field("y", "micrographs/y", "um", "beam position y on the sample plane"),
+    Field("positions", "positions", "um", "beam position (x, y) of every column, where the scan is no raster"),
     Field("variance", "micrographs/variance", "counts^2", "variance of the counts"),
     Field("is_observed", "is_observed", "", "1 where a count was recorded"),
     Field("background", "background", "counts", "counts per pixel that do not come from the sample"),

@@ -66,6 +66,12 @@ class Body:
         index = np.array([names.index(name) for name in sphere], np.int64) if sphere else None
         return replace(self, materials=names, face_material=None, sphere_material=index)
 
+    def transformed(self, rotation: np.ndarray, scale: float, shift: tuple[float, float, float]) -> "Body":
+        """Return the body scaled about the origin, turned by a rotation matrix [3, 3], then moved [um]."""
+        vertices = rotation.dot((self.vertices * scale).T).T + np.asarray(shift)
+        centers = rotation.dot((self.spheres[:, :3] * scale).T).T + np.asarray(shift)
+        return replace(self, vertices=vertices, spheres=np.column_stack([centers, self.spheres[:, 3] * scale]))
+
     def moved(self, shift: tuple[float, float, float]) -> "Body":
         """Return the body at another place [um]."""
         spheres = self.spheres + np.array([*shift, 0.0])

@@ -15,6 +15,8 @@ from helio_jax.heightmap import HeightMap
 
 MAX_HEIGHT_MAP_MB = 512.0
 """Largest height map file, and largest content of an .npz after decompression."""
+MAX_POSITIONS_MB = 64.0
+"""Largest list of beam positions."""
 MAX_SCATTERING_TABLE_MB = 64.0
 """Largest table of scattered intensities."""
 
@@ -103,6 +105,31 @@ def _read_grid(path: Path, data: bytes, kind: str) -> np.ndarray:
     if min(grid.shape) < 2:
         raise InputFileError(f"{path}: a grid needs at least 2 x 2 values, got {grid.shape}")
     return grid
+
+
+def read_positions(path: Path) -> np.ndarray:
+    """Read beam positions [n, 2], um: x and y on each line, separated by a comma; # begins a comment.
+
+    The first line may name the columns: "x_um,y_um".
+
+    Raises:
+        InputFileError: as `read_bytes`; not two numbers on each line; none at all; not finite.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputFileError(f"{path}: a list of positions must be .csv, got {path.suffix or 'no suffix'!r}")
+    data = read_bytes(path, MAX_POSITIONS_MB)
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+        has_names = bool(lines) and lines[0].replace(" ", "") == "x_um,y_um"
+        points = np.loadtxt(lines[has_names:], delimiter=",", ndmin=2)
+    except (UnicodeDecodeError, ValueError) as e:
+        raise InputFileError(f"{path}: is not a list of positions, x and y in um on each line: {e}") from None
+    if points.ndim != 2 or not len(points) or points.shape[1] != 2 or not np.all(np.isfinite(points)):
+        raise InputFileError(
+            f"{path}: must hold two finite numbers (x, y in um) on each line, got {len(points)} lines of "
+            f"{points.shape[-1] if points.size else 0}"
+        )
+    return points
 
 
 def read_scattering_table(path: Path) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:

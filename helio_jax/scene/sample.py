@@ -1,22 +1,25 @@
 """Sample models: what is imaged. Settings table `[sample]`, chosen by `kind`; the only door to trimesh.
 
-The samples given by numbers are in shapes.py, those that read files here. Each turns itself into a `Body`
-(surfaces.py) with `build(base_dir)`: sample frame, z up, z = 0 on the reference plane, um. trimesh is imported where
+The samples given by numbers are in shapes.py and rough.py, height maps in maps.py, meshes here. Each turns itself into
+a `Body` with `build(base_dir)`: sample frame, z up, z = 0 on the reference plane, um. trimesh is imported where
 it is needed, so loading a scene stays cheap. Files are untrusted: size and number of faces are limited, contents
 are checked, every failure is an `InputFileError` that names the file.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field, model_validator
 
 from helio_jax.errors import InputFileError
-from helio_jax.heightmap import HeightMap
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
-from helio_jax.scene.files import read_bytes, read_height_map
+from helio_jax.scene.files import read_bytes
+from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
+from helio_jax.scene.placement import UNITS_UM, PlaceableSample, Unit
+from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.shapes import (
     FlatSample,
     Length,
@@ -28,65 +31,9 @@ from helio_jax.scene.shapes import (
 )
 from helio_jax.settings import Settings
 
-UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
 MAX_FACES = 5_000_000
 MESH_EXTENT_UM = (1e-2, 1e6)
 """Smallest and largest sensible extent of a mesh [um]."""
-
-
-class HeightMapSample(PaintedSample):
-    """A height map from a file (.npz with x, y, height; .csv, .txt, .tsv: a grid), or from Python: `of`."""
-
-    kind: Literal["height_map"] = "height_map"
-    file: str = Field(min_length=1, max_length=4096)
-    """File name, relative to the scene file."""
-    pixel_size_um: Length | None = None
-    """Grid pitch of a text file, whose rows start at the lowest y; the grid is then centred [um]."""
-    unit: Literal["nm", "um", "mm", "cm", "m", "inch"] = "um"
-    """Unit of the lengths in the file (of the heights alone for a text file)."""
-    size_um: Length | None = None
-    """Side of a flat around the map; default: none [um]."""
-    level_um: float | None = None
-    """Height of that flat; default: the median height of the map's border [um]."""
-    _map: HeightMap | None = PrivateAttr(None)
-
-    @classmethod
-    def of(cls, height_map: HeightMap, size_um: float | None = None) -> "HeightMapSample":
-        """Make a sample of a height map in memory; `file` then holds the fingerprint of its data."""
-        import hashlib
-
-        digest = hashlib.sha256(b"".join(a.tobytes() for a in (height_map.x, height_map.y, height_map.height)))
-        sample = cls(file=f"memory:{digest.hexdigest()[:32]}", size_um=size_um)
-        sample._map = height_map
-        return sample
-
-    @property
-    def top(self) -> float | None:
-        """Height of the highest point, None before the file is read [um]."""
-        return None if self._map is None else float(np.max(self._map.height))
-
-    def build(self, base_dir: Path = Path()) -> Body:
-        """Read the file, if any, and triangulate it.
-
-        Raises:
-            InputFileError: the file is missing, of an unknown kind or holds no complete height map.
-        """
-        height_map = self._map
-        if height_map is None and self.file.startswith("memory:"):
-            raise InputFileError(
-                f"sample.file = {self.file!r}: this height map was given from Python and is stored in no file: save it "
-                "as .npz and name that file"
-            )
-        if height_map is None:
-            height_map = read_height_map(base_dir / self.file, UNITS_UM[self.unit], self.pixel_size_um)
-        if not np.all(np.isfinite(height_map.height)):
-            raise InputFileError(
-                f"{self.file}: a sample's heights must be finite, got {int(np.sum(~np.isfinite(height_map.height)))} "
-                "gaps: fill them first"
-            )
-        x, y = np.meshgrid(height_map.x, height_map.y)
-        reach = None if self.size_um is None else 0.5 * self.size_um
-        return surfaces.surface_body(x, y, height_map.height, reach, level=self.level_um).painted(self.material)
 
 
 class MeshSample(PaintedSample):
@@ -95,16 +42,10 @@ class MeshSample(PaintedSample):
     kind: Literal["mesh"] = "mesh"
     file: str = Field(min_length=1, max_length=4096)
     """STL, OBJ, PLY or GLB file, relative to the scene file. (GLB has its y axis up: rotate_deg = [90, 0, 0].)"""
-    unit: Literal["nm", "um", "mm", "cm", "m", "inch"]
+    unit: Unit
     """Unit of the file's coordinates (STL and OBJ do not say; GLB is in m)."""
-    scale: float = Field(default=1.0, gt=0.0, le=1e9)
-    """Further factor on all lengths."""
-    rotate_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Rotations about the fixed x, then y, then z axis [deg]."""
-    translate_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Shift after scaling and turning [um]."""
     flat_size_um: Length | None = None
-    """Side of a flat added at z = 0 under the mesh; the mesh's faces in that plane are left out [um]."""
+    """Side of a flat added at z = 0 under the placed mesh; the mesh's faces in that plane are left out [um]."""
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
     materials: dict[str, str] = Field(default={}, max_length=1000)
@@ -115,58 +56,77 @@ class MeshSample(PaintedSample):
         """Names of all materials that the sample asks for."""
         return (self.material, *self.materials.values())
 
-    @property
-    def top(self) -> float | None:
-        """Height of the highest point: known only to the file."""
-        return None
-
-    def build(self, base_dir: Path = Path()) -> Body:
-        """Read, check and place the mesh.
+    def shape(self, base_dir: Path = Path()) -> Body:
+        """Read and check the mesh; its lengths stay in the file's unit.
 
         Raises:
-            InputFileError: the file is missing, too large, unreadable, empty, non-finite or of absurd size.
+            InputFileError: the file is missing, too large, unreadable, empty or non-finite.
         """
-        path = base_dir / self.file
-        vertices, faces, parts = load_mesh(path, self.max_file_mb, tuple(self.materials))
-        vertices = _rotation(self.rotate_deg).dot((vertices * (UNITS_UM[self.unit] * self.scale)).T).T
-        vertices = vertices + np.asarray(self.translate_um)
-        extent, (low, high) = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
-        if not low <= extent <= high:
-            raise InputFileError(
-                f"{path}: the mesh is {extent:g} um across, sensible are {low:g} to {high:g} um: check sample.unit "
-                f"(now {self.unit!r}) and sample.scale (now {self.scale:g})"
-            )
+        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials))
         names = tuple(dict.fromkeys(self.material_names))
         index = np.array([names.index(name) for name in self.material_names])[parts]
+        return Body(vertices, faces, materials=names, face_material=index)
+
+    def build(self, base_dir: Path = Path()) -> Body:
+        """Read, check and place the mesh, and put the flat under it.
+
+        Raises:
+            InputFileError: as `shape`; the mesh is of absurd size.
+        """
+        mesh = self.put(self.shape(base_dir), UNITS_UM[self.unit])
+        extent, (low, high) = float(np.ptp(mesh.triangles.reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
+        if not low <= extent <= high:
+            raise InputFileError(
+                f"{base_dir / self.file}: the mesh is {extent:g} um across, sensible are {low:g} to {high:g} um: check "
+                f"sample.unit (now {self.unit!r}) and sample.scale (now {self.scale:g})"
+            )
         if self.flat_size_um is None:
-            return Body(vertices, faces, materials=names, face_material=index)
-        in_plane = np.all(np.abs(vertices[faces][..., 2]) <= 1e-6 * extent, axis=1)
-        mesh = Body(vertices, faces[~in_plane], materials=names, face_material=index[~in_plane])
+            return mesh
+        is_free = np.any(np.abs(mesh.triangles[..., 2]) > 1e-6 * extent, axis=1)
+        mesh = replace(mesh, faces=mesh.faces[is_free], face_material=mesh.face_material[is_free])
         return Body.join([mesh, surfaces.flat_body(self.flat_size_um).painted(self.material)])
 
 
 OneSample = Annotated[
-    FlatSample | SpheresSample | StepSample | TrenchSample | PyramidSample | HeightMapSample | MeshSample,
+    FlatSample
+    | SpheresSample
+    | StepSample
+    | TrenchSample
+    | PyramidSample
+    | RoughSample
+    | HeightMapSample
+    | ReconstructionSample
+    | MeshSample,
     Field(discriminator="kind"),
 ]
 """Any single sample."""
 
 
 class PlacedSample(Settings):
-    """A sample and where it stands."""
+    """A sample among several; like any other it may be scaled, turned and moved by its own keys."""
 
     sample: OneSample
     """The sample, with its own flat and materials."""
     shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Shift of the sample [um]."""
+    """Further shift of the sample [um]."""
 
 
-class SeveralSamples(Settings):
+class SeveralSamples(PlaceableSample):
     """Several samples at once; their flats should not overlap: the highest surface hides the others."""
 
     kind: Literal["several"] = "several"
     parts: tuple[PlacedSample, ...] = Field(min_length=1, max_length=1000)
     """The samples and where they stand."""
+
+    @model_validator(mode="after")
+    def _is_placed_as_a_whole(self) -> "SeveralSamples":
+        for i, part in enumerate(self.parts):
+            if part.sample.place != "as-given":
+                raise ValueError(
+                    f"parts[{i}].sample.place must be 'as-given', got {part.sample.place!r}: only the whole can be "
+                    "placed by the plate: move the key to [sample]"
+                )
+        return self
 
     @property
     def material_names(self) -> tuple[str, ...]:
@@ -174,12 +134,12 @@ class SeveralSamples(Settings):
         return tuple(name for part in self.parts for name in part.sample.material_names)
 
     @property
-    def top(self) -> float | None:
+    def shape_top(self) -> float | None:
         """Height of the highest point whose height is known [um]."""
         tops = [part.sample.top + part.shift_um[2] for part in self.parts if part.sample.top is not None]
         return max(tops, default=None)
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Build and join the samples (errors as theirs)."""
         return Body.join([part.sample.build(base_dir).moved(part.shift_um) for part in self.parts])
 
@@ -190,7 +150,9 @@ Sample = Annotated[
     | StepSample
     | TrenchSample
     | PyramidSample
+    | RoughSample
     | HeightMapSample
+    | ReconstructionSample
     | MeshSample
     | SeveralSamples,
     Field(discriminator="kind"),
@@ -315,11 +277,3 @@ def _pieces(data: bytes, kind: str, label: str) -> list[tuple[np.ndarray, np.nda
         mesh.apply_transform(matrix)
         out.append((np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), label or str(name)))
     return out
-
-
-def _rotation(angles_deg: tuple[float, float, float]) -> np.ndarray:
-    """Return the matrix of rotations about the fixed x, then y, then z axis [3, 3]."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(angles_deg)), np.sin(np.radians(angles_deg))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    return np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ about_y @ about_x

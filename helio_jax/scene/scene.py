@@ -1,11 +1,11 @@
-"""A scene: instrument, sample and raster, checked against each other. What `simulate` needs and nothing else.
+"""A scene: instrument, sample and scan, checked against each other. What `simulate` needs and nothing else.
 
 Frames and units: DESIGN.md section 1. A scene file has further tables; `helio_jax.config.SceneFile` adds them.
 """
 
 import math
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
@@ -14,13 +14,19 @@ from helio_jax.errors import SceneError
 from helio_jax.instrument import Aperture, Instrument
 from helio_jax.scene.body import COSINE, Body
 from helio_jax.scene.rays import read_rays
-from helio_jax.scene.sample import HeightMapSample, MeshSample, Sample, SeveralSamples
-from helio_jax.scene.scan import Raster
+from helio_jax.scene.rough import RoughSample
+from helio_jax.scene.sample import Sample
+from helio_jax.scene.scan import AnyScan, PositionList, named_kind
 from helio_jax.scene.scattering import Law, Term
+from helio_jax.scene.views import View, views_of
+
+FINER = 4.0
+"""Truth should have this many points per pixel at least, or it is one that the fit could represent."""
+_MAX_DISTANCE = 1e7  # as plate.sample_distance_um
 
 
 class Scene(Instrument):
-    """An instrument with a sample and a raster: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
+    """An instrument with a sample and a scan: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
 
     name: str = Field(default="scene", min_length=1, max_length=200)
     """Short name, shown in figures and files."""
@@ -28,11 +34,16 @@ class Scene(Instrument):
     """What the scene is and where its numbers come from."""
     sample: Sample
     """What is imaged."""
-    scan: Raster
+    scan: AnyScan
     """Which beam positions."""
     material: dict[str, Law] = Field(default={}, max_length=1000)
     """Scattering laws by the names that the sample uses for its materials."""
     _base_dir: Path = PrivateAttr(default_factory=Path)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_the_scan(cls, tables: Any) -> Any:
+        return named_kind(tables)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scene":
@@ -53,12 +64,16 @@ class Scene(Instrument):
         top = self.sample.top
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
+        problems += self.scan.view_problems(self.beam)
+        if self.sample.place != "as-given" and self.scan.sample_distances_um:
+            problems.append("scan.sample_distances_um: sets what sample.place sets: remove one of the keys")
         if (problem := self.scan.problem(self.beam)) is not None:
             problems.append(f"scan.pitch: {problem}")
-        elif not self._overlaps_flat():
+        elif not isinstance(self.scan, PositionList) and not self._overlaps_flat():
             problems.append(
                 f"scan.center_um: the raster about {list(self.scan.center_um)} um lies wholly beside the sample, whose "
-                f"flat ends at +-{0.5 * self.flat_size:g} um: move scan.center_um or enlarge sample.size_um"
+                f"flat ends {0.5 * self.flat_size:g} um from {list(self.sample.translate_um[:2])} um: move "
+                "scan.center_um or enlarge sample.size_um"
             )
         return problems
 
@@ -80,26 +95,60 @@ class Scene(Instrument):
 
     @property
     def flat_size(self) -> float:
-        """Side of the flat around the sample's structure; infinity where only a file tells [um]."""
-        if isinstance(self.sample, (HeightMapSample, MeshSample, SeveralSamples)):
-            return math.inf
-        return self.sample.size_um
+        """Side of the flat around the sample's structure; infinity where only a file tells or it is tilted [um]."""
+        return math.inf if self.sample.is_tilted else self.sample.shape_size * self.sample.scale
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x [x] and y [y], um."""
-        return self.scan.positions(self.beam)
+        """Return the beam positions x [x] and y [y], um (of a list: see `PositionList.positions`)."""
+        return self.scan.positions(self.beam, self.base_dir)
+
+    def points(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the beam positions x, y of pixels [n], numbered row by row, um."""
+        return self.scan.points(self.beam, ids, self.base_dir)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the images."""
+        x, y = self.positions()
+        return y.size, x.size
+
+    def views(self) -> tuple[View, ...]:
+        """Return the views of the scan: one, unless it is repeated at several distances or rotations."""
+        return views_of(self.scan, self.instrument)
 
     def build_body(self) -> Body:
         """Read and build the sample's geometry (sample frame, um).
 
         Raises:
             InputFileError: the sample's file is missing or wrong.
-            SceneError: the sample is too high for the plate.
+            SceneError: the sample is too high for the plate, or does not stand where its key `place` says.
         """
         body = self.sample.build(self.base_dir)
         if body.max_height >= self.sample_distance:
             raise SceneError(f"sample: {_too_high(body.max_height, self.sample_distance)}")
+        gap = self.sample_distance - body.max_height
+        if self.sample.place != "as-given" and not math.isclose(gap, self.working_distance, rel_tol=1e-9):
+            raise SceneError(
+                f"sample.place = {self.sample.place!r} wants its top {self.working_distance:g} um below the plate, "
+                f"plate.sample_distance_um = {self.sample_distance:g} puts it {gap:g} um below: remove one of the keys"
+            )
         return body
+
+    def settled(self) -> Self:
+        """Return the scene with the plate's sample distance that `sample.place` asks for, if it is not given.
+
+        Raises:
+            InputFileError: the sample's file is missing or wrong.
+        """
+        if self.sample.place == "as-given" or self.plate.sample_distance_um is not None:
+            return self
+        distance = self.working_distance + self.sample.build(self.base_dir).max_height
+        if not 0.0 < distance <= _MAX_DISTANCE:
+            raise SceneError(
+                f"sample.place = {self.sample.place!r}: the plane z = 0 would be {distance:g} um below the plate, it "
+                f"must be 0 to {_MAX_DISTANCE:g}: correct sample.translate_um or sample.scale"
+            )
+        return self.model_copy(update={"plate": self.plate.model_copy(update={"sample_distance_um": distance})})
 
     @property
     def used_materials(self) -> dict[str, Law]:
@@ -140,11 +189,18 @@ class Scene(Instrument):
                 if aperture_contains(first, points).any() or aperture_contains(second, back).any():
                     names = self.detector_names
                     out.append(f"detectors {names[j]!r} and {names[i]!r} overlap: atoms there count for {names[j]!r}")
-        x, y = self.positions()
-        reach = max(np.abs(x).max(), np.abs(y).max())
+        reach = max(float(np.abs(a).max()) for a in self._positions_on_flat())
         if reach > 0.5 * self.flat_size:
             out.append(
-                f"the raster reaches {reach:g} um, the flat ends at {0.5 * self.flat_size:g} um: its rim misses it"
+                f"the raster reaches {reach:g} um from the middle of the flat, which ends at {0.5 * self.flat_size:g} "
+                "um: its rim misses it"
+            )
+        if isinstance(self.sample, RoughSample) and (step := self.sample.step * self.sample.scale) > (
+            coarsest := (self.scan.spacing or math.inf) / FINER
+        ):
+            out.append(
+                f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
+                f"set sample.resolution_um to at most {coarsest:g} um"
             )
         return out + self._plate_warnings(apertures)
 
@@ -169,10 +225,15 @@ class Scene(Instrument):
             )
         return out
 
+    def _positions_on_flat(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the beam positions from the middle of the flat [um]."""
+        is_list = isinstance(self.scan, PositionList)
+        x, y = self.points(np.arange(self.image_shape[1])) if is_list else self.positions()
+        return x - self.sample.translate_um[0], y - self.sample.translate_um[1]
+
     def _overlaps_flat(self) -> bool:
         """Whether any beam position can lie on the flat (whichever way that is turned)."""
-        x, y = self.positions()
-        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in (x, y)))
+        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in self._positions_on_flat()))
         return nearest <= 0.5 * math.sqrt(2.0) * self.flat_size
 
 

@@ -1,7 +1,7 @@
 """Samples given by numbers: flat, spheres, step, trench, pyramid. Models of the `[sample]` table.
 
-`sample.py` joins them with those that read files. Each turns itself into a `Body` with `build`: sample frame, z up,
-z = 0 on the reference plane, um. The geometry itself is in surfaces.py.
+`sample.py` joins them with those that read files. Each gives its `shape` as a `Body`: z up, z = 0 on the reference
+plane, um; placement.py puts it where it stands. The geometry itself is in surfaces.py.
 """
 
 import math
@@ -13,13 +13,14 @@ from pydantic import Field, model_validator
 
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.placement import PlaceableSample
 from helio_jax.settings import Settings
 
 Length = Annotated[float, Field(gt=0.0, le=1e6)]
 """A length of a sample [um]."""
 
 
-class PaintedSample(Settings):
+class PaintedSample(PlaceableSample):
     """What all samples of one material share."""
 
     material: str = Field(default=COSINE, min_length=1, max_length=200)
@@ -32,19 +33,20 @@ class PaintedSample(Settings):
 
 
 class SampleModel(PaintedSample):
-    """What samples given by numbers share: a flat of side `size_um` about the z axis, and a way to become a `Body`."""
+    """What samples given by numbers share: a flat of side `size_um` about the z axis."""
 
     size_um: Length = 8000.0
     """Side of the square flat around the structure [um]."""
 
     @property
-    def top(self) -> float | None:
-        """Height of the highest point [um]; None where only the file tells."""
+    def shape_top(self) -> float | None:
+        """Height of the highest point [um]."""
         return 0.0
 
-    def build(self, base_dir: Path = Path()) -> Body:
-        """Return the geometry; relative file names start at `base_dir`."""
-        raise NotImplementedError
+    @property
+    def shape_size(self) -> float:
+        """Side of the flat [um]."""
+        return self.size_um
 
 
 class FlatSample(SampleModel):
@@ -52,7 +54,7 @@ class FlatSample(SampleModel):
 
     kind: Literal["flat"] = "flat"
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         return surfaces.flat_body(self.size_um).painted(self.material)
 
@@ -147,11 +149,11 @@ class SpheresSample(SampleModel):
         return np.array([s.row for s in self.spheres])
 
     @property
-    def top(self) -> float | None:
+    def shape_top(self) -> float | None:
         """Height of the highest point [um]."""
         return max(s.cap_height for s in self.spheres)
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         body = surfaces.moated_body(self.size_um, self._moats(), self.sphere_array)
         return body.painted(self.material, [s.material or self.material for s in self.spheres])
@@ -181,11 +183,11 @@ class StepSample(SampleModel):
         return self
 
     @property
-    def top(self) -> float | None:
+    def shape_top(self) -> float | None:
         """Height of the highest point [um]."""
         return self.height_um
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         angles = map(math.radians, (self.facing_deg, self.slope_deg))
         return surfaces.step_body(self.size_um, self.height_um, self.position_um, *angles).painted(self.material)
@@ -211,7 +213,7 @@ class TrenchSample(SampleModel):
         _check_on_flat("trench", self.size_um, (self.length_um, self.width_um), self.center_um, self.azimuth_deg)
         return self
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         slot = (self.width_um, self.length_um, self.depth_um)
         body = surfaces.trench_body(self.size_um, *slot, math.radians(self.azimuth_deg), self.center_um)
@@ -241,11 +243,11 @@ class PyramidSample(SampleModel):
         return self
 
     @property
-    def top(self) -> float | None:
+    def shape_top(self) -> float | None:
         """Height of the highest point [um]."""
         return self.height_um
 
-    def build(self, base_dir: Path = Path()) -> Body:
+    def shape(self, base_dir: Path = Path()) -> Body:
         """Return the geometry."""
         shape = (self.base_um, self.height_um, self.top_um)
         body = surfaces.pyramid_body(self.size_um, *shape, math.radians(self.azimuth_deg), self.center_um)

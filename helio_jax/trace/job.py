@@ -21,7 +21,9 @@ from llvmlite import binding as llvm
 
 import helio_jax
 from helio_jax.scene.body import Body
+from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
+from helio_jax.scene.views import View
 from helio_jax.trace.run import paths_of
 from helio_jax.trace.settings import TraceSettings
 
@@ -68,6 +70,7 @@ class Job:
             "the materials' laws": _hash(scene.read_laws(), LAW_STEP),
             "the beam's rays": _hash(scene.read_rays(), LAW_STEP),
             "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
+            **_list_of_positions(scene),
             "program": {
                 "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
                 **{name: _version(name) for name in _LIBRARIES},
@@ -88,20 +91,42 @@ class Job:
 
     @property
     def n_pixels(self) -> int:
-        """Pixels of the scan."""
-        return self.scene.scan.nx * self.scene.scan.ny
+        """Pixels of all views; those of one view follow those of the one before."""
+        return self.n_view_pixels * len(self.views)
+
+    @functools.cached_property
+    def views(self) -> tuple[View, ...]:
+        """Views of the scan."""
+        return self.scene.views()
+
+    @functools.cached_property
+    def n_view_pixels(self) -> int:
+        """Pixels of one view."""
+        return math.prod(self.scene.image_shape)
 
     def units(self) -> list[Unit]:
-        """Return the units of the scan; they depend on the job alone, not on who runs them."""
+        """Return the units of the scan, none across two views; they depend on the job alone, not on who runs them."""
         size = min(max(1, self.settings.paths_per_unit // math.prod(paths_of(self.settings))), MAX_PIXELS)
-        starts = range(0, self.n_pixels, size)
-        return [Unit(i, start, min(start + size, self.n_pixels)) for i, start in enumerate(starts)]
+        n = self.n_view_pixels
+        runs = [
+            (s, min(s + size, first + n)) for first in range(0, self.n_pixels, n) for s in range(first, first + n, size)
+        ]
+        return [Unit(i, start, stop) for i, (start, stop) in enumerate(runs)]
+
+    def view_number(self, unit: Unit) -> int:
+        """Return which of the views a unit is of."""
+        return unit.start // self.n_view_pixels
 
     def pixels(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return numbers and beam positions x, y [um] of a run of pixels."""
-        x, y = self.scene.positions()
+        """Return numbers and beam positions x, y [um] of a run of pixels of one view."""
         ids = np.arange(start, stop)
-        return ids, x[ids % x.size], y[ids // x.size]
+        return ids, *self.scene.points(ids % self.n_view_pixels)
+
+
+def _list_of_positions(scene: Scene) -> dict[str, str]:
+    """Return what tells a list of positions that is in a file."""
+    is_list = isinstance(scene.scan, PositionList)
+    return {"the scan's positions": _hash(scene.scan.read(scene.base_dir), LAW_STEP)} if is_list else {}  # type: ignore[union-attr]
 
 
 def differences(then: Any, now: Any, names: tuple[str, str], place: str = "") -> list[str]:

@@ -12,19 +12,23 @@ from collections.abc import Generator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 from multiprocessing import connection, get_context, parent_process
+from typing import Any
 
 import numpy as np
 
 from helio_jax.errors import MissingDependencyError, SceneError, StoppedRun
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.scene.body import Body
+from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.job import Job, Unit
 from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
+from helio_jax.trace.transport import Experiment
 from helio_jax.trace.units import Patch, experiment_of, join_pieces, tasks, trace_unit
 
 MAX_DEATHS = 3
@@ -82,17 +86,24 @@ def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | 
 
 def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None) -> Results:
     """Run the pieces of all units on threads, in order, so that all CPUs work on one or two units at a time."""
-    experiment = experiment_of(job, body)
+
+    @lru_cache(maxsize=2)  # work is begun on the next view before the last one is finished
+    def prepared(number: int) -> Experiment:
+        return experiment_of(job, body, number)
+
+    def tasks_of(unit: Unit) -> list:
+        return tasks(prepared(job.view_number(unit)), job, unit)
+
     done = job.n_pixels - sum(unit.stop - unit.start for unit in units)
-    with closing(in_order(workers, (task for unit in units for task in tasks(experiment, job, unit)))) as results:
+    with closing(in_order(workers, (task for unit in units for task in tasks_of(unit)))) as results:
         for unit in units:
             pieces = []
-            for piece in islice(results, len(tasks(experiment, job, unit))):
+            for piece in islice(results, len(tasks_of(unit))):
                 pieces.append(piece)
                 done += piece.total_mean.shape[1] if isinstance(piece, Estimate) else 0
                 if progress:
                     progress(done, job.n_pixels)
-            yield unit, join_pieces(experiment, pieces)
+            yield unit, join_pieces(prepared(job.view_number(unit)), pieces)
 
 
 def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
@@ -207,60 +218,79 @@ class Canvas:
         check_rays(self.fates, 0, self.n_launched)
         check_rays(self.effuse_fates, 0, self.n_effused)
 
-    def stack(self) -> MicrographStack:
-        """Return the micrographs; all units must have been put.
+    def stack(self) -> Micrographs:
+        """Return the micrographs, a set of stacks where there are several views. All units must have been put.
 
         The estimate of a nearly dark pixel may fall below zero by its own error; it is then set to 0, and the number
         of such pixels is recorded in the provenance (`trace_pixels` gives the unclipped values).
         """
         if self.missing:
             raise ValueError(f"units {sorted(self.missing)} are missing")
-        scene, settings = self.job.scene, self.job.settings
-        is_expected = settings.estimator == "expected"
-        scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
-        effusive = scene.beam.effusive
-        effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
-        n_negative = int(np.sum(self.total < 0))
-        scales = (self.by_order, scale), (self.total, scale), (self.variance, scale**2)
-        for a, factor in (*scales, (self.plate, scale), (self.effuse, effused)):
-            np.maximum(a, 0.0, out=a)
-            a *= factor
-        x, y = scene.positions()
-        shape = (y.size, x.size)
+        n, n_views = self.job.n_view_pixels, len(self.job.views)
         fates, effuse_fates = (
             {"launched": int(f.sum()), **{name: int(n) for name, n in zip(FATES, f, strict=True)}}
             for f in (self.fates, self.effuse_fates)
         )
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        maps = {"masked": self.masked, "shadowed": self.shadowed, "plate": self.plate, "effuse": self.effuse}
+        about = {
+            "rays": fates,
+            **({"effusive_rays": effuse_fates} if self.job.scene.beam.effusive else {}),
+            "job": self.job.key,
+            "cpu": sorted(self.cpus),
+            **(note if len(self.cpus) > 1 else {}),
+        }
+        stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(n_views))
+        if n_views == 1:
+            return stacks[0].replace(provenance={**stacks[0].provenance, **about})
+        return MicrographSet(stacks, about)
+
+    def _stack_of(self, number: int, pixels: slice) -> MicrographStack:
+        """Return the micrographs of one view."""
+        scene, settings, view = self.job.scene, self.job.settings, self.job.views[number]
+        is_expected = settings.estimator == "expected"
+        scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
+        effusive = scene.beam.effusive
+        effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
+        n_negative = int(np.sum(self.total[:, pixels] < 0))
+        images: dict[str, Any] = {}
+        for name, array, factor in (
+            ("by_order", self.by_order, scale),
+            ("counts", self.total, scale),
+            ("variance", self.variance, scale**2),
+            ("plate", self.plate, scale),
+            ("effuse", self.effuse, effused),
+        ):
+            if not array.size:
+                continue
+            images[name] = array[..., pixels]
+            np.maximum(images[name], 0.0, out=images[name])
+            images[name] *= factor
+        images |= {"masked": self.masked[:, pixels], "shadowed": self.shadowed[pixels]} if settings.maps else {}
+        x, y = scene.positions()
+        is_list = isinstance(scene.scan, PositionList)
         return MicrographStack(
-            counts=self.total.reshape(-1, *shape),
-            variance=self.variance.reshape(-1, *shape),
-            by_order=self.by_order.reshape(*self.by_order.shape[:2], *shape),
-            **{name: a.reshape(*a.shape[:-1], *shape) for name, a in maps.items() if a.size},
+            **{name: a.reshape(*a.shape[:-1], y.size, x.size) for name, a in images.items()},
             x=x,
             y=y,
-            instrument=scene.instrument,
+            positions=np.stack(scene.points(np.arange(x.size)), -1) if is_list else None,
+            instrument=view.instrument,
+            sample_rotation=view.sample_rotation,
             n_rays=scale if is_expected else float(settings.rays),
             noise="expected" if is_expected else "poisson",
-            name=scene.name,
+            name=f"{scene.name}, {view.label}" if len(self.job.views) > 1 else scene.name,
             provenance={
                 "trace": settings.model_dump(mode="json"),
-                "rays": fates,
-                **({"effusive_rays": effuse_fates} if effusive else {}),
                 "n_negative": n_negative,
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
-                "job": self.job.key,
-                "cpu": sorted(self.cpus),
-                **(note if len(self.cpus) > 1 else {}),
+                **({"view": view.about} if view.about else {}),
             },
         )
 
 
 def trace_scene(
     scene: Scene, settings: TraceSettings, progress: Progress | None = None, body: Body | None = None
-) -> MicrographStack:
-    """Simulate the micrographs of a scene in memory, on threads.
+) -> Micrographs:
+    """Simulate the micrographs of a scene in memory, on threads: a stack, or a set where the scan has several views.
 
     The `expected` estimator gives the expected counts for `scene.scan.atoms_per_pixel` atoms and the variance of
     its own mean; `analog` gives the integer counts of `settings.rays` atoms and their Poisson variance.

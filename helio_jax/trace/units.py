@@ -84,10 +84,10 @@ class Patch:
         return cls(**{name: arrays[name] for name in shapes}, cpu=str(arrays["cpu"]))
 
 
-def experiment_of(job: Job, body: Body) -> Experiment:
-    """Prepare what all units of a job share in one process."""
-    scene = job.scene
-    return make_experiment(body, scene.instrument, job.settings, scene.read_laws(), scene.read_rays())
+def experiment_of(job: Job, body: Body, number: int = 0) -> Experiment:
+    """Prepare what all units of one of a job's views share in one process."""
+    view, scene = job.views[number], job.scene
+    return make_experiment(view.turned(body), view.instrument, job.settings, scene.read_laws(), scene.read_rays())
 
 
 def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:
@@ -143,7 +143,7 @@ def trace_unit(job: Job, unit: Unit) -> Patch:
         GuardError: rays are unaccounted for.
     """
     with _LOCK:
-        experiment = _prepared(job)
+        experiment = _prepared(job, job.view_number(unit))
     return join_pieces(experiment, [task() for task in tasks(experiment, job, unit)])
 
 
@@ -151,7 +151,7 @@ _LOCK = threading.Lock()
 
 
 @functools.lru_cache(maxsize=1)
-def _prepared(job: Job) -> Experiment:
+def _prepared(job: Job, number: int) -> Experiment:
     body = job.scene.build_body()
     here = Job.of(job.scene, job.settings, body)
     if changes := differences(job.about, here.about, ("sender", f"worker on {platform.node()}")):
@@ -159,7 +159,7 @@ def _prepared(job: Job) -> Experiment:
             "the worker does not run what was sent: " + "; ".join(changes) + "; install the same version and put the "
             "same files everywhere"
         )
-    return experiment_of(job, body)
+    return experiment_of(job, body, number)
 
 
 def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:

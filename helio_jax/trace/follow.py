@@ -1,0 +1,176 @@
+"""Follow single atoms: where each last scattered, how it flies off, how often it scattered and what became of it.
+
+The analog tracer ray by ray, with the random numbers of `transport`: the atoms found here are the very ones that an
+analog simulation counts (tests/physics/test_follow.py). Slower, and it keeps everything: for looking closely at a
+pixel, and for the directions in which a surface scatters. Transparent plates only.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from helio_jax.errors import SceneError
+from helio_jax.scene.scattering import COSINE_LAW
+from helio_jax.scene.scene import Scene
+from helio_jax.trace.analog import land
+from helio_jax.trace.laws import scatter_atoms
+from helio_jax.trace.lawtable import make_law_table
+from helio_jax.trace.run import make_experiment
+from helio_jax.trace.settings import TraceSettings
+from helio_jax.trace.source import beam_numbers, bounce_numbers, launch_rays
+from helio_jax.trace.tally import DETECTED, ESCAPED, FATES, STOPPED
+from helio_jax.trace.transport import Experiment, lift_off
+
+MAX_ATOMS = 5_000_000
+"""Atoms kept at most."""
+
+
+@dataclass(frozen=True)
+class Atoms:
+    """What became of single atoms (sample frame, um).
+
+    Attributes:
+        pixel: number of each atom's pixel, row by row [n].
+        point: where it last scattered, or the pinhole if it never did [n, 3].
+        direction: in which it flew from there (an atom that stuck: to there), unit vectors [n, 3].
+        plate_point: (x, y) where that line meets the plate, lab frame; NaN for atoms that fly down [n, 2].
+        order: how often it scattered [n].
+        fate: index into `tally.FATES` [n].
+        detector: which one it hit, from 0; -1: none [n].
+    """
+
+    pixel: np.ndarray
+    point: np.ndarray
+    direction: np.ndarray
+    plate_point: np.ndarray
+    order: np.ndarray
+    fate: np.ndarray
+    detector: np.ndarray
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return all of it as named columns [n]; fates as words."""
+        names = {"pixel": self.pixel}
+        names |= {f"{a}_um": self.point[:, i] for i, a in enumerate("xyz")}
+        names |= {f"direction_{a}": self.direction[:, i] for i, a in enumerate("xyz")}
+        names |= {f"plate_{a}_um": self.plate_point[:, i] for i, a in enumerate("xy")}
+        return names | {"order": self.order, "fate": np.array(FATES)[self.fate], "detector": self.detector}
+
+    def directions(self, n_theta: int = 45, n_phi: int = 72) -> dict[str, np.ndarray]:
+        """Return the histogram of the directions of all atoms that left the sample upwards, as named columns.
+
+        Bins are equal steps of theta (from the plate normal, 0 to 90 deg) and phi (counter-clockwise from +x); the
+        density per steradian is normalised to all atoms that scattered, its standard error is Poisson's.
+        """
+        has_left = np.isin(self.fate, (DETECTED, ESCAPED)) & (self.order > 0) & (self.direction[:, 2] > 0)
+        x, y, z = self.direction[has_left].T
+        theta, phi = np.arccos(np.minimum(z, 1.0)), np.mod(np.arctan2(y, x), 2 * np.pi)
+        edges = np.linspace(0.0, np.pi / 2, n_theta + 1), np.linspace(0.0, 2 * np.pi, n_phi + 1)
+        counts = np.histogram2d(theta, phi, edges)[0]
+        solid_angle = -np.diff(np.cos(edges[0]))[:, None] * np.diff(edges[1])
+        n = max(1, int(np.sum(self.order > 0)))
+        middle = [np.degrees(0.5 * (e[1:] + e[:-1])) for e in edges]
+        theta_deg, phi_deg = np.meshgrid(*middle, indexing="ij")
+        columns = {"theta_deg": theta_deg, "phi_deg": phi_deg, "solid_angle_sr": solid_angle, "counts": counts}
+        columns["density_per_sr"] = counts / (n * solid_angle)
+        columns["std_error"] = np.sqrt(counts) / (n * solid_angle)
+        return {name: column.ravel() for name, column in columns.items()}
+
+
+def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] | None = None, view: int = 0) -> Atoms:
+    """Follow the atoms of one pixel of a scene, or of all.
+
+    Args:
+        scene: beam, plate, detectors, sample and scan.
+        settings: atoms per pixel (`rays`), seed and the cap on events; the estimator is analog whatever it says.
+        pixel: row and column; None: all pixels.
+        view: number of the view, from 0.
+
+    Raises:
+        SceneError: there is no such pixel or view; too many atoms; the plate scatters.
+    """
+    (ny, nx), views = scene.image_shape, scene.views()
+    i, j = pixel or (0, 0)
+    if not (0 <= i < ny and 0 <= j < nx):
+        raise SceneError(f"pixel must be a row from 0 to {ny - 1} and a column from 0 to {nx - 1}, got {i} {j}")
+    if not 0 <= view < len(views):
+        raise SceneError(f"view must be 0 to {len(views) - 1}, got {view}")
+    if scene.plate.kind != "transparent":
+        raise SceneError(f"single atoms are followed between sample and a transparent plate, got {scene.plate.kind!r}")
+    inner = np.array([i * nx + j]) if pixel else np.arange(nx * ny)
+    if inner.size * settings.rays > MAX_ATOMS:
+        raise SceneError(
+            f"at most {MAX_ATOMS} atoms can be followed, got {inner.size} pixels of {settings.rays}: name one pixel or "
+            "trace fewer rays"
+        )
+    analog = settings.model_copy(update={"estimator": "analog"})
+    body = views[view].turned(scene.build_body())
+    experiment = make_experiment(body, views[view].instrument, analog, scene.read_laws(), scene.read_rays())
+    return follow_atoms(experiment, inner + view * nx * ny, *scene.points(inner))
+
+
+def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Atoms:
+    """Follow all atoms of some pixels with an analog experiment.
+
+    Args:
+        experiment: sample, instrument and settings.
+        ids: number of each pixel, the key of its random numbers [pixels].
+        x, y: beam positions [pixels], um.
+    """
+    e, s = experiment, experiment.sampling
+    laws = e.laws if e.laws is not None else make_law_table([COSINE_LAW] * len(e.intersector.materials))
+    ids = np.ascontiguousarray(ids, np.int64)
+    offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
+    numbers = beam_numbers(ids, s.n_rays, 0, s.points, s.seed)
+    origin, direction = launch_rays(e.instrument, x, y, numbers, e.source)
+    n = len(origin)
+    pixel, path = np.repeat(np.arange(len(ids)), s.n_rays), np.tile(np.arange(s.n_rays), len(ids))
+    atoms, skip = np.arange(n), np.full(n, -1, np.int32)
+    point_last, direction_last = np.empty((n, 3)), np.empty((n, 3))
+    order, fate, detector = np.zeros(n, np.int64), np.full(n, -1), np.full(n, -1)
+    start = origin
+    for event in range(e.max_events + 1):
+        hits = e.intersector.nearest(origin, direction, skip)
+        point_last[atoms], direction_last[atoms], order[atoms] = start, direction, event
+        fate[atoms], detector[atoms] = _land(
+            event, event >= e.max_events, origin, direction, hits.surface, hits.is_back, offset[pixel[atoms]],
+            e.instrument.sample_distance, e.apertures.center, e.apertures.semi_axes, e.apertures.cos_sin,
+        )  # fmt: skip
+        goes_on = fate[atoms] < 0
+        if not goes_on.any():
+            break
+        hits, incoming, atoms = hits.take(goes_on), direction[goes_on], atoms[goes_on]
+        u = bounce_numbers(ids[pixel[atoms]], path[atoms], 1, s.bounces, event, s.seed, False)
+        material = e.intersector.material_of(hits.surface)
+        key = (ids[pixel[atoms]], path[atoms], event, s.seed, False)
+        direction, _, leaves = scatter_atoms(laws, material, incoming, hits.normal, u, *key)
+        origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
+        stuck = atoms[~leaves]
+        fate[stuck], order[stuck], point_last[stuck] = STOPPED, event + 1, hits.point[~leaves]
+        start, atoms = hits.point[leaves], atoms[leaves]
+        origin, direction, skip = origin[leaves], direction[leaves], skip[leaves]
+    plate_point = _on_plate(point_last, direction_last, offset[pixel], e.instrument.sample_distance)
+    return Atoms(ids[pixel], point_last, direction_last, plate_point, order, fate, detector)
+
+
+@njit(cache=True, nogil=True)
+def _land(event, is_last, origin, direction, surface, is_back, offset, plate_z, center, semi_axes, cos_sin):
+    """Return fate (-1: it scatters) and detector of every atom after a flight [n]."""
+    n = origin.shape[0]
+    fate, detector = np.empty(n, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        fate[i], detector[i] = land(
+            event, is_last, origin, direction, i, surface[i], is_back[i], offset[i, 0], offset[i, 1], plate_z, center,
+            semi_axes, cos_sin,
+        )  # fmt: skip
+    return fate, detector
+
+
+def _on_plate(point: np.ndarray, direction: np.ndarray, offset: np.ndarray, plate_z: float) -> np.ndarray:
+    """Return where lines meet the plate, lab frame [n, 2]; NaN where they do not."""
+    up = direction[:, 2] > 0
+    out = np.full((len(point), 2), math.nan)
+    r = (plate_z - point[up, 2]) / direction[up, 2]
+    out[up] = point[up, :2] + r[:, None] * direction[up, :2] - offset[up]
+    return out
