@@ -208,10 +208,10 @@ class Instrument(Settings):
             raise ValueError(f"detector names must differ, got {names}: rename one of them")
         return self
 
-    def with_pencil(self) -> "Instrument":
-        """Return this instrument with a parallel beam along its axis and nothing besides."""
-        beam = {"source": "pencil", "file": None, "effusive": None}
-        return self.model_copy(update={"beam": self.beam.model_copy(update=beam)})
+    def with_cosine_plate(self) -> "Instrument":
+        """Return what can be told without the scene: a parallel beam along the axis, and a plate of the cosine law."""
+        beam = self.beam.model_copy(update={"source": "pencil", "file": None, "effusive": None})
+        return self.model_copy(update={"beam": beam, "plate": self.plate.model_copy(update={"material": None})})
 
     @property
     def working_distance(self) -> float:

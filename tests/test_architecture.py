@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > study > pipeline > predict, checkpoint, provenance, spot > config > explain > stages > scene > nouns > settings,
-arrays, errors.
+__main__ > study > pipeline > predict, checkpoint, provenance, spot > config > explain > stages > scene > nouns >
+settings, arrays, errors.
 """
 
 import ast
