@@ -358,6 +358,30 @@ def validate(scene: SceneArg) -> None:
 
 
 @app.command()
+def spot(
+    scene: SceneArg,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg).")] = None,
+    heights: Annotated[str, typer.Option(help="Heights above the reference plane [um], commas between.")] = "0",
+    as_json: AsJson = False,
+) -> None:
+    """Measure the beam's spot at one or more heights above the reference plane, and draw it."""
+    from helio_jax.config import load_scene
+    from helio_jax.errors import SceneError
+    from helio_jax.spot import draw_spot
+
+    try:
+        at = [float(text) for text in heights.split(",")]
+    except ValueError:
+        raise SceneError(f"--heights must be numbers with commas between them, got {heights!r}") from None
+    found = draw_spot(load_scene(scene), at, output)
+    if as_json:
+        print(json.dumps(found))
+        return
+    for row in found:
+        print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of scene files, for editors."""
     from helio_jax.config import json_schema

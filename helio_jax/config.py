@@ -144,7 +144,8 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
             for key, child in node.items()
         }
 
-    return {key: changed(node) if key in ("sample", "material", "scan") else node for key, node in tables.items()}
+    tables_with_files = ("beam", "sample", "material", "scan")
+    return {key: changed(node) if key in tables_with_files else node for key, node in tables.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -17,6 +17,17 @@ from pydantic import Field, model_validator
 from helio_jax.settings import Settings
 
 
+class Effusive(Settings):
+    """Atoms that leave the pinhole by effusion, in all directions: cos^n about the plate normal."""
+
+    exponent: float = Field(default=1.0, ge=0.0, le=1000.0)
+    """n of cos^n per steradian; 1: a thin orifice."""
+    atoms_per_pixel: float = Field(gt=0.0, le=1e18)
+    """Effusive atoms per pixel that `effuse` stands for (as scan.atoms_per_pixel for the beam)."""
+    rays: int = Field(default=64, ge=8, le=10_000_000)
+    """Effusive rays per pixel; with `analog` the whole counts are those of so many atoms."""
+
+
 class Beam(Settings):
     """The incident helium beam."""
 
@@ -26,10 +37,24 @@ class Beam(Settings):
     """Direction in which the beam travels across the sample, counter-clockwise from +x seen from above [deg]."""
     pinhole_radius_um: float = Field(default=1.0, ge=0.0, le=1000.0)
     """Radius of the pinhole disc, which lies in the plate plane [um]."""
-    source: Literal["uniform", "gaussian", "pencil"] = "uniform"
-    """Angular distribution about the beam axis; `pencil` is parallel."""
+    source: Literal["uniform", "gaussian", "pencil", "rays"] = "uniform"
+    """Angular distribution about the beam axis; `pencil` is parallel; `rays`: positions and directions from a file."""
     source_size_mrad: float = Field(default=0.5, ge=0.0, le=500.0)
-    """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; `pencil`: ignored [mrad]."""
+    """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; else ignored [mrad]."""
+    file: str | None = Field(default=None, min_length=1, max_length=4096)
+    """`rays`: file of rays (.csv, .npy, .npz), relative to the scene file: position (x, y, z) relative to the pinhole's
+    centre [um], direction (x, y, z) and, if given, weight of every ray; lab axes, z up to the plate's outer side."""
+    effusive: Effusive | None = None
+    """Effusive beam, traced besides the beam and counted apart; default: none."""
+
+    @model_validator(mode="after")
+    def _has_a_file_for_rays(self) -> "Beam":
+        if (self.file is None) == (self.source == "rays"):
+            wrong = (
+                "source = 'rays' needs a file: add the key" if self.file is None else "only source = 'rays' reads it"
+            )
+            raise ValueError(f"file: {wrong}")
+        return self
 
 
 class Plate(Settings):
@@ -182,6 +207,11 @@ class Instrument(Settings):
         if len(set(names)) != len(names):
             raise ValueError(f"detector names must differ, got {names}: rename one of them")
         return self
+
+    def with_cosine_plate(self) -> "Instrument":
+        """Return what can be told without the scene: a parallel beam along the axis, and a plate of the cosine law."""
+        beam = self.beam.model_copy(update={"source": "pencil", "file": None, "effusive": None})
+        return self.model_copy(update={"beam": beam, "plate": self.plate.model_copy(update={"material": None})})
 
     @property
     def working_distance(self) -> float:

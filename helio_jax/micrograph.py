@@ -115,11 +115,15 @@ class MicrographStack:
         return None if self.by_order is None else self.by_order[1:].sum(0)
 
     def shares(self) -> dict[str, float]:
-        """Return what share of all counts (without background) scattered more than once, and met the plate."""
+        """Return what share of all counts (without background) scattered more than once, and met the plate.
+
+        The effusive beam's counts, which are not part of them, are given relative to them.
+        """
         background = np.zeros(1) if self.background is None else self.background
         background = background[:, None, None] if background.ndim == 1 else background
         total = float(np.sum((self.counts - background)[self.is_observed]))
         parts = {"multiple scattering": self.multiple, "scattered on the plate": self.plate}
+        parts["effusive beam, besides"] = self.effuse
         found = {name: float(part.sum()) for name, part in parts.items() if part is not None}
         return {name: part / total for name, part in found.items()} if total > 0 else {}
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from helio_jax.arrays import pitch
-from helio_jax.errors import GuardError
+from helio_jax.errors import GuardError, SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
@@ -59,9 +59,18 @@ def make_predictor(
 
     The surface is continued by a flat at z = 0 of side `substrate_um`, or as far beyond each border as the plate is
     away: steep facets see most of what is near their horizon.
-    Seeds are fixed, so that successive predictions differ by the surface, not by noise.
+    Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
+    what is traced, by the cosine law.
+
+    Raises:
+        SceneError: radiosity is asked for below a scattering plate, which it does not know.
     """
-    instrument = stack.instrument
+    if multiple == "radiosity" and stack.instrument.plate.is_scattering:
+        raise SceneError(
+            "reconstruct.refine.multiple = 'radiosity': it does not know the atoms that the scattering plate sends back: "
+            "set it to 'traced'"
+        )
+    instrument = stack.instrument.with_cosine_plate()
     geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
     reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)

@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > study, comparison > pipeline > predict, checkpoint, provenance > config > explain > stages > scene > nouns >
-settings, arrays, errors.
+__main__ > study, comparison > pipeline > predict, checkpoint, provenance, spot > config > explain > stages > scene >
+nouns > settings, arrays, errors.
 """
 
 import ast
@@ -23,7 +23,7 @@ LEVELS = [
     {"trace", "prepare", "reconstruct", "evaluate", "formats"},
     {"explain"},
     {"config"},
-    {"predict", "checkpoint", "provenance"},
+    {"predict", "checkpoint", "provenance", "spot"},
     {"pipeline"},
     {"study", "comparison"},
     {"__main__", "__init__"},
@@ -36,7 +36,7 @@ DOORS = {
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {"evaluate/figures.py", "evaluate/agreement_figure.py", "evaluate/sweep.py"},
+    "matplotlib": {"evaluate/figures.py", "evaluate/agreement_figure.py", "evaluate/sweep.py", "evaluate/spot.py"},
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},
     "lineax": {"reconstruct/refiner.py"},

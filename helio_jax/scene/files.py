@@ -70,13 +70,18 @@ def read_height_map(path: Path, unit: float, pixel_size: float | None) -> Height
         raise InputFileError(f"{path}: {e}") from None
 
 
+def check_unpacked(path: Path, data: bytes, max_mb: float) -> None:
+    """Refuse an .npz whose content is larger than `max_mb` megabytes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > max_mb * 1e6:
+        raise InputFileError(f"{path}: unpacks to {size / 1e6:.0f} MB, the limit is {max_mb:g} MB")
+
+
 def _read_npz(path: Path, data: bytes) -> list[np.ndarray]:
     """Return x, y and height as float64 arrays."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > MAX_HEIGHT_MAP_MB * 1e6:
-            raise InputFileError(f"{path}: unpacks to {size / 1e6:.0f} MB, the limit is {MAX_HEIGHT_MAP_MB:g} MB")
+        check_unpacked(path, data, MAX_HEIGHT_MAP_MB)
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             missing = [name for name in ("x", "y", "height") if name not in arrays.files]
             if missing:

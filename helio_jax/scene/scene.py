@@ -13,6 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Aperture, Instrument
 from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.rays import read_rays
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.sample import Sample
 from helio_jax.scene.scan import AnyScan, PositionList, named_kind
@@ -162,6 +163,14 @@ class Scene(Instrument):
             InputFileError: the table of a law is missing or wrong.
         """
         return {name: law.terms(self.base_dir) for name, law in self.used_materials.items()}
+
+    def read_rays(self) -> np.ndarray | None:
+        """Return position [um], unit direction and weight of the beam's rays [n, 7], where it is made of such.
+
+        Raises:
+            InputFileError: the file of the rays is missing or wrong.
+        """
+        return None if self.beam.file is None else read_rays(self.base_dir / self.beam.file)
 
     def warnings(self) -> list[str]:
         """Return what is allowed but probably not meant, for `helio validate`."""

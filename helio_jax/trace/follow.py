@@ -106,7 +106,7 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
         )
     analog = settings.model_copy(update={"estimator": "analog"})
     body = views[view].turned(scene.build_body())
-    experiment = make_experiment(body, views[view].instrument, analog, scene.read_laws())
+    experiment = make_experiment(body, views[view].instrument, analog, scene.read_laws(), scene.read_rays())
     return follow_atoms(experiment, inner + view * nx * ny, *scene.points(inner))
 
 
@@ -122,7 +122,8 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
     laws = e.laws if e.laws is not None else make_law_table([COSINE_LAW] * len(e.intersector.materials))
     ids = np.ascontiguousarray(ids, np.int64)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
-    origin, direction = launch_rays(e.instrument, x, y, beam_numbers(ids, s.n_rays, 0, s.points, s.seed))
+    numbers = beam_numbers(ids, s.n_rays, 0, s.points, s.seed)
+    origin, direction = launch_rays(e.instrument, x, y, numbers, e.source)
     n = len(origin)
     pixel, path = np.repeat(np.arange(len(ids)), s.n_rays), np.tile(np.arange(s.n_rays), len(ids))
     atoms, skip = np.arange(n), np.full(n, -1, np.int32)

@@ -68,6 +68,7 @@ class Job:
             "scene": scene.model_dump(mode="json", include=set(Scene.model_fields) - {"description"}),
             "trace": settings.model_dump(mode="json", exclude={"workers"}),
             "the materials' laws": _hash(scene.read_laws(), LAW_STEP),
+            "the beam's rays": _hash(scene.read_rays(), LAW_STEP),
             "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
             **_list_of_positions(scene),
             "program": {

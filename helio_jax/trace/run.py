@@ -7,12 +7,13 @@ result is bitwise the same for any number of worker threads. Whole scans: `scan`
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.instrument import Instrument, Plate
+from helio_jax.instrument import Effusive, Instrument, Plate
 from helio_jax.scene.body import COSINE, Body
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.trace.direct import ApertureTable
@@ -21,7 +22,7 @@ from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_l
 from helio_jax.trace.masks import axis_rays
 from helio_jax.trace.plate import FACING_DOWN, PlateTable
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.source import Sampling
+from helio_jax.trace.source import Sampling, Source
 from helio_jax.trace.tally import LOST, Estimate
 from helio_jax.trace.transport import Experiment, trace_block
 
@@ -54,6 +55,7 @@ def make_experiment(
     instrument: Instrument,
     settings: TraceSettings,
     laws: Mapping[str, tuple[Term, ...]] | None = None,
+    rays: np.ndarray | None = None,
 ) -> Experiment:
     """Prepare the shared state of a run.
 
@@ -62,26 +64,39 @@ def make_experiment(
         instrument: beam, plate and detectors.
         settings: rays, estimator, seed.
         laws: scattering law of each of the body's materials and the plate's; "cosine" need not be given.
+        rays: position [um], direction and weight of the beam's rays, where it is made of such [n, 7].
 
     Raises:
-        SceneError: a material has no law, or a lattice stands upright on a face.
+        SceneError: a material has no law, the beam's rays are missing, or a lattice stands upright on a face.
     """
-    is_expected = settings.estimator == "expected"
-    n_replicates = N_REPLICATES if is_expected else 0
-    n_rays, n_branches = paths_of(settings)
     intersector = body if isinstance(body, Intersector) else Intersector(body)
     plate = PlateTable.of(instrument, len(intersector.materials)) if instrument.plate.is_scattering else None
-    return Experiment(
+    experiment = Experiment(
         intersector=intersector,
         instrument=instrument,
         apertures=ApertureTable(instrument),
-        sampling=Sampling.make(n_rays, n_branches, n_replicates, settings.seed),
+        source=Source.beam(instrument, rays),
+        sampling=_sampling(settings, settings.seed),
         n_orders=settings.n_orders,
         max_events=settings.max_events,
-        is_expected=is_expected,
+        is_expected=settings.estimator == "expected",
         laws=_law_table(intersector, instrument.plate, {COSINE: COSINE_LAW} | dict(laws or {})),
         plate=plate,
     )
+    if (effusive := instrument.beam.effusive) is None:
+        return experiment
+    source = Source.effusive(instrument, effusive.exponent)
+    sampling = _sampling(effusive_settings(settings, effusive), settings.seed - 2**63)  # no seed of a beam is negative
+    return replace(experiment, effusive=replace(experiment, source=source, sampling=sampling))
+
+
+def effusive_settings(settings: TraceSettings, effusive: Effusive) -> TraceSettings:
+    """Return how the effusive beam is traced: as the beam, with its own number of rays."""
+    return settings.model_copy(update={"rays": effusive.rays})
+
+
+def _sampling(settings: TraceSettings, seed: int) -> Sampling:
+    return Sampling.make(*paths_of(settings), N_REPLICATES if settings.estimator == "expected" else 0, seed)
 
 
 def _law_table(intersector: Intersector, plate: Plate, laws: Mapping[str, tuple[Term, ...]]) -> LawTable | None:

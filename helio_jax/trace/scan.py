@@ -25,7 +25,7 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.job import Job, Unit
-from helio_jax.trace.run import Progress, check_rays, in_order, n_cpus, paths_of
+from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
 from helio_jax.trace.transport import Experiment
@@ -190,11 +190,16 @@ class Canvas:
         self.by_order = np.zeros((job.settings.n_orders, n_detectors, n))
         self.total, self.variance = np.zeros((n_detectors, n)), np.zeros((n_detectors, n))
         self.plate = np.zeros((n_detectors, n if job.scene.plate.is_scattering else 0))
+        effusive = job.scene.beam.effusive
+        self.effuse = np.zeros((n_detectors, n if effusive else 0))
         self.masked, self.shadowed = np.zeros((n_detectors, n_maps)), np.zeros(n_maps)
-        self.fates = np.zeros(len(FATES), np.int64)
+        self.fates, self.effuse_fates = np.zeros(len(FATES), np.int64), np.zeros(len(FATES), np.int64)
         self.cpus: set[str] = set()
         self.missing = {unit.number for unit in job.units()}
         self.n_launched = job.n_pixels * math.prod(paths_of(job.settings))
+        self.n_effused = (
+            job.n_pixels * math.prod(paths_of(effusive_settings(job.settings, effusive))) if effusive else 0
+        )
 
     def put(self, unit: Unit, patch: Patch) -> None:
         """Put the patch of a unit where it belongs.
@@ -203,13 +208,15 @@ class Canvas:
             GuardError: more rays were lost so far than the whole scan may lose.
         """
         part = slice(unit.start, unit.stop)
-        for name in ("by_order", "total", "variance", "plate", "masked", "shadowed"):
+        for name in ("by_order", "total", "variance", "plate", "effuse", "masked", "shadowed"):
             if getattr(self, name).size:
                 getattr(self, name)[..., part] = getattr(patch, name)
         self.fates += patch.fates
+        self.effuse_fates += patch.effuse_fates
         self.cpus.add(patch.cpu)
         self.missing.remove(unit.number)
         check_rays(self.fates, 0, max(self.n_launched, int(self.fates.sum())))
+        check_rays(self.effuse_fates, 0, self.n_effused)
 
     def stack(self) -> Micrographs:
         """Return the micrographs, a set of stacks where there are several views. All units must have been put.
@@ -220,10 +227,14 @@ class Canvas:
         if self.missing:
             raise ValueError(f"units {sorted(self.missing)} are missing")
         n, n_views = self.job.n_view_pixels, len(self.job.views)
-        fates = {name: int(n) for name, n in zip(FATES, self.fates, strict=True)}
+        fates, effuse_fates = (
+            {"launched": int(f.sum()), **{name: int(n) for name, n in zip(FATES, f, strict=True)}}
+            for f in (self.fates, self.effuse_fates)
+        )
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
         about: dict[str, Any] = {
-            "rays": {"launched": sum(fates.values()), **fates},
+            "rays": fates,
+            **({"effusive_rays": effuse_fates} if self.job.scene.beam.effusive else {}),
             "job": self.job.key,
             "cpu": sorted(self.cpus),
             **(note if len(self.cpus) > 1 else {}),
@@ -240,6 +251,8 @@ class Canvas:
         scene, settings, view = self.job.scene, self.job.settings, self.job.views[number]
         is_expected = settings.estimator == "expected"
         scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
+        effusive = scene.beam.effusive
+        effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
         n_negative = int(np.sum(self.total[:, pixels] < 0))
         limit = (settings.target_error or 0.0) * self.total[:, pixels]
         n_above = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
@@ -248,8 +261,11 @@ class Canvas:
             ("by_order", self.by_order, scale),
             ("counts", self.total, scale),
             ("variance", self.variance, scale**2),
-            *((("plate", self.plate, scale),) if self.plate.size else ()),
+            ("plate", self.plate, scale),
+            ("effuse", self.effuse, effused),
         ):
+            if not array.size:
+                continue
             images[name] = array[..., pixels]
             np.maximum(images[name], 0.0, out=images[name])
             images[name] *= factor

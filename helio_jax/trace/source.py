@@ -1,20 +1,21 @@
 """The beam: where the atoms of each pixel start and in which direction (numba), and their first random numbers.
 
 Source models: `uniform` within a cone (theta = theta_max sqrt(u)), `gaussian` (theta = sigma sqrt(-2 ln(1 - u)))
-and `pencil` (parallel), all from a disc-shaped pinhole in the plate plane. Directions are drawn about
-the beam axis. Knows nothing of the sample.
+and `pencil` (parallel) about the beam axis, `effusive` (cos(theta) = (1 - u)^(1/(n + 1)), which is cos^n per steradian)
+about the plate normal, all from a disc-shaped pinhole in the plate plane; `rays` draws from a list by weight.
+Knows nothing of the sample.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.trace.random import N_BEAM_DIMENSIONS, low_discrepancy_points, philox
 
-_MODELS = {"pencil": 0, "uniform": 1, "gaussian": 2}
+_MODELS = {"pencil": 0, "uniform": 1, "gaussian": 2, "effusive": 3, "rays": 4}
 _SHIFT_STREAM, _RAY_STREAM, _BOUNCE_STREAM, _BRANCH_STREAM = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 
 
@@ -46,6 +47,50 @@ class Sampling:
         n = n_rays // n_replicates if n_replicates else 1
         points = low_discrepancy_points(n, N_BEAM_DIMENSIONS)
         return cls(n_rays, n_branches, n_replicates, seed, points, low_discrepancy_points(n * n_branches, 2))
+
+
+@dataclass(frozen=True)
+class Source:
+    """How atoms leave the plate plane.
+
+    Attributes:
+        model: number in `_MODELS`.
+        size: angular size [rad], or the exponent of an effusive beam.
+        frame: axes of the directions, the last one along the source's axis [3, 3].
+        radius: of the pinhole [um].
+        rays: position [um], unit direction and cumulative weight, 1 at last, of given rays [n, 7].
+    """
+
+    model: int
+    size: float
+    frame: np.ndarray
+    radius: float
+    rays: np.ndarray
+
+    @classmethod
+    def beam(cls, instrument: Instrument, rays: np.ndarray | None = None) -> "Source":
+        """Return the beam of an instrument.
+
+        Args:
+            instrument: with the beam.
+            rays: position [um], unit direction and weight of the given rays [n, 7], where the beam is made of such.
+
+        Raises:
+            SceneError: the beam is made of rays, and they are not given.
+        """
+        beam = instrument.beam
+        if beam.source == "rays" and rays is None:
+            raise SceneError(f"beam.file: the rays of {beam.file} are not known here: trace from the scene file")
+        given = np.zeros((0, 7)) if rays is None else np.column_stack([rays[:, :6], np.cumsum(rays[:, 6])])
+        given[:, 6] /= given[-1, 6] if len(given) else 1.0
+        size, frame = beam.source_size_mrad * 1e-3, axis_frame(instrument.beam_direction)
+        return cls(_MODELS[beam.source], size, frame, beam.pinhole_radius_um, given)
+
+    @classmethod
+    def effusive(cls, instrument: Instrument, exponent: float) -> "Source":
+        """Return the effusive beam of an instrument."""
+        frame = axis_frame(np.array([0.0, 0.0, -1.0]))
+        return cls(_MODELS["effusive"], exponent, frame, instrument.beam.pinhole_radius_um, np.zeros((0, 7)))
 
 
 @njit(cache=True, nogil=True)
@@ -98,9 +143,16 @@ def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, i
 
 
 @njit(cache=True, nogil=True)
-def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, origins, directions):
+def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, rays, origins, directions):
     for i in range(numbers.shape[0]):
         p = i // n_rays
+        if model == 4:
+            row = min(np.searchsorted(rays[:, 6], numbers[i, 0], side="right"), rays.shape[0] - 1)
+            for a in range(3):
+                origins[i, a], directions[i, a] = pinhole[a] + rays[row, a], rays[row, 3 + a]
+            origins[i, 0] += x[p]
+            origins[i, 1] += y[p]
+            continue
         r, angle = radius * np.sqrt(numbers[i, 0]), 2.0 * np.pi * numbers[i, 1]
         origins[i, 0] = pinhole[0] + x[p] + r * np.cos(angle)
         origins[i, 1] = pinhole[1] + y[p] + r * np.sin(angle)
@@ -109,12 +161,38 @@ def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, origins,
             theta = 0.0
         elif model == 1:
             theta = size * np.sqrt(numbers[i, 2])
+        elif model == 3:
+            theta = np.arccos((1.0 - numbers[i, 2]) ** (1.0 / (size + 1.0)))
         else:
             theta = size * np.sqrt(-2.0 * np.log(1.0 - numbers[i, 2]))
         turn = 2.0 * np.pi * numbers[i, 3]
         s, c = np.sin(theta), np.cos(theta)
         for a in range(3):
             directions[i, a] = s * np.cos(turn) * frame[0, a] + s * np.sin(turn) * frame[1, a] + c * frame[2, a]
+
+
+def footprint(
+    instrument: Instrument, heights: np.ndarray, n_rays: int, seed: int, rays: np.ndarray | None = None
+) -> np.ndarray:
+    """Return where the beam's rays cross planes above the reference plane, along and across the beam [height, n, 2].
+
+    Positions are relative to where the beam's axis crosses the plane; the first one is along the beam's azimuth, um.
+
+    Args:
+        instrument: with the beam.
+        heights: of the planes above the sample's reference plane [height], um; below the plate.
+        n_rays: how many rays.
+        seed: of the random numbers.
+        rays: of a beam that is made of such [n, 7].
+    """
+    points = Sampling.make(n_rays, 1, 1, seed).points
+    numbers = beam_numbers(np.zeros(1, np.int64), n_rays, 1, points, seed)
+    origin, d = launch_rays(instrument, np.zeros(1), np.zeros(1), numbers, Source.beam(instrument, rays))
+    axis, azimuth = np.array(instrument.beam_shift), np.radians(instrument.beam.azimuth_deg)
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    h = np.asarray(heights, float)[:, None, None]
+    flown = origin[:, :2] + (h - origin[:, 2:]) / d[:, 2:] * d[:, :2] + h * axis
+    return flown @ np.array([[c, -s], [s, c]])
 
 
 def axis_frame(axis: np.ndarray) -> np.ndarray:
@@ -126,7 +204,7 @@ def axis_frame(axis: np.ndarray) -> np.ndarray:
 
 
 def launch_rays(
-    instrument: Instrument, x: np.ndarray, y: np.ndarray, numbers: np.ndarray
+    instrument: Instrument, x: np.ndarray, y: np.ndarray, numbers: np.ndarray, source: Source | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return origins [um] and unit directions of the rays, sample frame, both [pixels * rays, 3].
 
@@ -134,8 +212,9 @@ def launch_rays(
         instrument: beam and plate.
         x, y: beam position of each pixel [pixels], um.
         numbers: from `beam_numbers`, rays of one pixel together.
+        source: of the atoms; default: the instrument's beam.
     """
-    beam = instrument.beam
+    source = source or Source.beam(instrument)
     dx, dy, dz = instrument.sample_origin(0.0, 0.0)
     pinhole = instrument.pinhole_center + np.array([dx, dy, dz])
     origins, directions = np.empty((len(numbers), 3)), np.empty((len(numbers), 3))
@@ -145,19 +224,12 @@ def launch_rays(
         np.ascontiguousarray(y, float),
         len(numbers) // len(x),
         pinhole,
-        axis_frame(instrument.beam_direction),
-        beam.pinhole_radius_um,
-        _MODELS[beam.source],
-        beam.source_size_mrad * 1e-3,
+        source.frame,
+        source.radius,
+        source.model,
+        source.size,
+        source.rays,
         origins,
         directions,
     )
     return origins, directions
-
-
-def spot_radius(instrument: Instrument) -> float:
-    """Return the radius of the beam on the reference plane, across the beam [um] (Gaussian: one sigma)."""
-    beam = instrument.beam
-    length = instrument.sample_distance / math.cos(math.radians(beam.incidence_deg))
-    size = 0.0 if beam.source == "pencil" else beam.source_size_mrad * 1e-3
-    return beam.pinhole_radius_um + length * math.tan(size)

@@ -113,6 +113,11 @@ class Estimate:
         """Return the names of what is kept per pixel."""
         return [f.name for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)]
 
+    def take(self, keep: slice) -> "Estimate":
+        """Return some of the pixels."""
+        kept = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Estimate(**{k: a[..., keep] if isinstance(a, np.ndarray) else a for k, a in kept.items()})
+
     @property
     def n_launched(self) -> int | np.ndarray:
         """Paths launched per pixel: beam rays times branches."""

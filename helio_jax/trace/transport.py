@@ -24,7 +24,7 @@ from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.plate import PLATE, PlateTable
-from helio_jax.trace.source import Sampling, beam_numbers, bounce_numbers, launch_rays
+from helio_jax.trace.source import Sampling, Source, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import STOPPED, Tally
 
 
@@ -32,18 +32,20 @@ from helio_jax.trace.tally import STOPPED, Tally
 class Experiment:
     """Everything a block of work needs, shared read-only between threads.
 
-    No `laws`: cosine everywhere. No `plate`: a transparent one.
+    No `laws`: cosine everywhere. No `plate`: a transparent one. `effusive`: the same with the effusive beam, if any.
     """
 
     intersector: Intersector
     instrument: Instrument
     apertures: ApertureTable
+    source: Source
     sampling: Sampling
     n_orders: int
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
     plate: PlateTable | None = None
+    effusive: "Experiment | None" = None
 
     @property
     def is_plain(self) -> bool:
@@ -64,8 +66,8 @@ class _Paths:
     """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
 
     `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
-    direction (laws.scatter_atoms) [n], `order` how often the sample scattered them, `met_plate` whether the plate did,
-    `normal` that of the sample where they left it (zero: pinhole or plate) [n, 3].
+    direction (laws.scatter_atoms) [n], `normal` that of the sample left (zero: pinhole or plate) [n, 3], `order` how
+    often the sample scattered them, `met_plate` whether the plate did [n].
     """
 
     origin: np.ndarray
@@ -75,9 +77,9 @@ class _Paths:
     target: np.ndarray
     skip: np.ndarray
     density: np.ndarray
+    normal: np.ndarray
     order: np.ndarray
     met_plate: np.ndarray
-    normal: np.ndarray
 
     def take(self, keep: np.ndarray) -> "_Paths":
         """Return some of the rays."""
@@ -262,15 +264,16 @@ def _bounce(normal, u):
 
 
 @njit(cache=True, nogil=True)
-def _history(surface, order, met_plate):
-    """Return what scattered each path, once this surface has."""
-    order, met_plate = order.copy(), met_plate.copy()
+def _history(surface, normal, order, met_plate):
+    """Return what is kept of each path's past once this surface has scattered it: `normal`, `order`, `met_plate`."""
+    normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
     for i in range(surface.size):
         if surface[i] == PLATE:
             met_plate[i] = True
+            normal[i] = 0.0
         else:
             order[i] += 1
-    return order, met_plate
+    return normal, order, met_plate
 
 
 def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
@@ -283,9 +286,8 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
     if e.plate is not None and (on_plate := hits.surface == PLATE).any():
         hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
-    point, normal = hits.point, hits.normal
+    point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
     whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
-    n_hits = e.sampling.n_branches if event == 0 else 1
     shape = (table.center, table.semi_axes, table.cos_sin)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
@@ -326,14 +328,13 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     """Return the beam rays of a block of pixels."""
     s = e.sampling
     numbers = beam_numbers(ids, s.n_rays, s.n_replicates, s.points, s.seed)
-    origin, direction = launch_rays(e.instrument, x, y, numbers)
+    origin, direction = launch_rays(e.instrument, x, y, numbers, e.source)
     flying = np.arange(len(numbers))
     pixel, path = (flying // s.n_rays).astype(np.int32), (flying % s.n_rays).astype(np.int64)
     n = flying.size
-    return _Paths(
-        origin, direction, pixel, path, numbers[:, 4:].copy(), np.full(n, -1, np.int32), np.zeros(n),
-        np.zeros(n, np.int32), np.zeros(n, bool), np.zeros((n, 3)),
-    )  # fmt: skip
+    skip, density, normal = np.full(n, -1, np.int32), np.zeros(n), np.zeros((n, 3))
+    history = np.zeros(n, np.int32), np.zeros(n, bool)
+    return _Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal, *history)
 
 
 def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, stopped: np.ndarray) -> _Paths:
@@ -350,15 +351,14 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
     per_replicate = s.n_rays * s.n_branches // s.n_replicates if s.n_replicates else 1
     u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
-    order, met_plate = _history(hits.surface, paths.order, paths.met_plate)
+    history = _history(hits.surface, hits.normal, paths.order, paths.met_plate)
     if e.laws is None:
         direction, density, leaves = _bounce(hits.normal, u), np.zeros(len(path)), None
     else:
         material, key = e.material_of(hits.surface), (ids[pixel], path, event, s.seed, e.is_expected)
         direction, density, leaves = scatter_atoms(e.laws, material, paths.direction, hits.normal, u, *key)
         stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
-    normal = hits.normal if e.plate is None else np.where((hits.surface == PLATE)[:, None], 0.0, hits.normal)
-    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, order, met_plate, normal)
+    out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, *history)
     return out if leaves is None or leaves.all() else out.take(leaves)
 
 

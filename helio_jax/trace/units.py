@@ -8,7 +8,7 @@ give the same bits on CPUs of one instruction set, which every patch names. Who 
 import functools
 import platform
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -33,6 +33,8 @@ class Patch:
         by_order: counts by scattering order [order, detector, pixels].
         total, variance: of all orders together, the variance being that of the mean [detector, pixels].
         plate: counts of `total` that met a scattering plate before [detector, pixels]; empty with another plate.
+        effuse: counts from the effusive beam [detector, pixels]; empty without one.
+        effuse_fates: of its rays, as `fates`.
         fates: rays per fate (`FATES`), summed over the pixels [4]; pixel by pixel they add up to those launched.
         masked: share of each aperture that the sample hides [detector, pixels]; empty where no maps are wanted.
         shadowed: 1 where the beam cannot see the topmost point [pixels]; empty likewise.
@@ -43,6 +45,8 @@ class Patch:
     total: np.ndarray
     variance: np.ndarray
     plate: np.ndarray
+    effuse: np.ndarray
+    effuse_fates: np.ndarray
     fates: np.ndarray
     masked: np.ndarray
     shadowed: np.ndarray
@@ -66,6 +70,8 @@ class Patch:
             "total": (n_detectors, n),
             "variance": (n_detectors, n),
             "plate": (n_detectors, n if job.scene.plate.is_scattering else 0),
+            "effuse": (n_detectors, n if job.scene.beam.effusive else 0),
+            "effuse_fates": (len(FATES),),
             "fates": (len(FATES),),
             "masked": (n_detectors, n_maps),
             "shadowed": (n_maps,),
@@ -81,19 +87,31 @@ class Patch:
 
 def experiment_of(job: Job, body: Body, number: int = 0) -> Experiment:
     """Prepare what all units of one of a job's views share in one process."""
-    view = job.views[number]
-    return make_experiment(view.turned(body), view.instrument, job.settings, job.scene.read_laws())
+    view, scene = job.views[number], job.scene
+    return make_experiment(view.turned(body), view.instrument, job.settings, scene.read_laws(), scene.read_rays())
 
 
 def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:
     """Return the independent pieces of a unit, for `join_pieces`: its blocks of rays, and its maps of cause."""
-    size = pixels_per_block(experiment)
-    starts = range(unit.start, unit.stop, size)
-    out: list[Callable[[], Any]] = [
-        functools.partial(_trace, experiment, job, start, min(start + size, unit.stop)) for start in starts
-    ]
+    out: list[Callable[[], Any]] = list(_blocks(experiment, job, unit, _trace))
+    if experiment.effusive is not None:
+        out += _blocks(experiment.effusive, job, unit, _trace_effusive)
     maps = functools.partial(_maps, experiment, *job.pixels(unit.start, unit.stop)[1:])
     return [maps, *out] if job.settings.maps else out
+
+
+def _blocks(experiment: Experiment, job: Job, unit: Unit, trace: Callable[..., Any]) -> Iterator[Callable[[], Any]]:
+    """Yield the blocks of rays of a unit."""
+    size = pixels_per_block(experiment)
+    for start in range(unit.start, unit.stop, size):
+        yield functools.partial(trace, experiment, job, start, min(start + size, unit.stop))
+
+
+@dataclass(frozen=True)
+class _Effuse:
+    """What came of a block's effusive beam."""
+
+    estimate: Estimate
 
 
 def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
@@ -102,15 +120,16 @@ def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
     Raises:
         GuardError: rays are unaccounted for.
     """
-    blocks = [p for p in pieces if isinstance(p, Estimate)]
-    maps = [p for p in pieces if not isinstance(p, Estimate)]
-    e = Estimate.join(blocks)
-    fates = e.fates.sum(1)
-    check_rays(np.zeros_like(fates), e.n_unaccounted, 1)
+    maps = [p for p in pieces if not isinstance(p, (Estimate, _Effuse))]
+    e = Estimate.join([p for p in pieces if isinstance(p, Estimate)])
+    effuse = Estimate.join([p.estimate for p in pieces if isinstance(p, _Effuse)] or [e.take(slice(0))])
+    fates, effuse_fates = e.fates.sum(1), effuse.fates.sum(1)
+    check_rays(np.zeros_like(fates), e.n_unaccounted + effuse.n_unaccounted, 1)
     masked, shadowed = maps[0] if maps else (np.zeros((e.total_mean.shape[0], 0)), np.zeros(0))
     kept = slice(None) if experiment.plate is not None else slice(0)
-    plate = e.plate_mean if experiment.is_expected else e.plate_hits
-    rest = plate[:, kept].astype(float), fates, masked, shadowed, instruction_set()
+    plate = e.plate_mean if experiment.is_expected else e.plate_hits.astype(float)
+    counted = effuse.total_mean if experiment.is_expected else effuse.hits.sum(0).astype(float)
+    rest = plate[:, kept], counted, effuse_fates, fates, masked, shadowed, instruction_set()
     if experiment.is_expected:
         return Patch(e.mean, e.total_mean, e.total_variance, *rest)
     hits = e.hits.astype(float)
@@ -149,6 +168,11 @@ def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
     if job.settings.target_error is not None:
         return trace_to_target(experiment, job.settings, *job.pixels(start, stop))
     return trace_block(experiment, *job.pixels(start, stop)).estimate()
+
+
+def _trace_effusive(experiment: Experiment, job: Job, start: int, stop: int) -> _Effuse:
+    """Trace the effusive beam of a block of pixels."""
+    return _Effuse(_trace(experiment, job, start, stop))
 
 
 def _maps(experiment: Experiment, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

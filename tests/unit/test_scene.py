@@ -91,7 +91,7 @@ def test_all_errors_at_once(tmp_path):
     for expected in (
         "8 errors:",
         "beam.incidence_deg = 81: must be <= 80 deg: choose a value at least 0 deg and at most 80 deg",
-        "beam.source = 'unifrm': must be one of 'uniform', 'gaussian' or 'pencil': did you mean 'uniform'?",
+        "beam.source = 'unifrm': must be one of 'uniform', 'gaussian', 'pencil' or 'rays': did you mean 'uniform'?",
         "plate.working_distance_um = 0: must be > 0 um",
         "plate.working_distanc: unknown key 'working_distanc' (value 3): did you mean 'working_distance_um'?",
         "detector[0].polar_deg = -30: must be >= 0 deg",
