@@ -19,134 +19,22 @@ from scipy.optimize import minimize_scalar
 from helio_jax import pipeline
 from helio_jax.arrays import pitch
 from helio_jax.config import SceneFile, load_scene
+from helio_jax.effects import EFFECTS, LAG, Images
 from helio_jax.errors import HelioError, SceneError
 from helio_jax.evaluate.agreement import REACH, Agreement, Terms, contrast_by_cause, find_shift, normalise
 from helio_jax.evaluate.agreement_figure import save_agreement, save_effects
 from helio_jax.formats.safe import atomic_path
-from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.scene.shapes import SpheresSample
+from helio_jax.reconstruct.formfactor import SpotGeometry
 
+TOP = 0.99
+"""Quantile of the scene's heights from which on pixels are its top."""
+MAX_PASSES, NEAR = 5, 0.05
+"""The sample is moved and simulated anew so often, or until it moves by less than this [pixels]."""
 MAX_LAG = 5.0
 """Longest response time of a detector that `explain` looks for [pixels]."""
 Progress = Callable[[str], Any]
 """Called with what is done next."""
-
-
-@dataclass(frozen=True)
-class Images:
-    """A simulated experiment, as detection probabilities per beam atom, with the variance of their sum.
-
-    All images [detector, y, x].
-    """
-
-    instrument: Instrument
-    single: np.ndarray
-    multiple: np.ndarray
-    unmasked: np.ndarray
-    variance: np.ndarray
-
-    @property
-    def total(self) -> np.ndarray:
-        """All that is detected."""
-        return self.single + self.multiple
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Something that a simulation may lack.
-
-    Attributes:
-        name: what it is.
-        changes: of the scene's settings, from the scene and a typical length of it; None: it does not apply.
-        terms: of the normalisation, instead of the usual ones.
-        total: which of the images' parts are added up.
-        is_geometry: whether heights are to be computed with the changed instrument, instead of taking away what the
-            effect does to the images.
-    """
-
-    name: str
-    changes: Callable[[SceneFile], Mapping[str, Any] | None] = lambda scene: {}
-    terms: Terms = field(default_factory=Terms)
-    total: Callable[[Images], np.ndarray] = lambda images: images.total
-    is_geometry: bool = False
-
-
-def _distance(factor: float) -> Callable[[SceneFile], Mapping[str, Any]]:
-    return lambda scene: {"plate.sample_distance_um": factor * scene.sample_distance}
-
-
-def _larger_instrument(scene: SceneFile) -> Mapping[str, Any]:
-    """All distances between plate and sample 4/3 as long, and the apertures as much larger: 4 mm instead of 3."""
-    f = 4.0 / 3.0
-    out: dict[str, Any] = {
-        "plate.working_distance_um": f * scene.working_distance,
-        "plate.sample_distance_um": scene.sample_distance + (f - 1.0) * scene.working_distance,
-    }
-    for k, d in enumerate(scene.detector):
-        if d.center_um is not None and d.axes_um is not None:
-            out |= {f"detector.{k}.center_um": [f * v for v in d.center_um]}
-            out |= {f"detector.{k}.axes_um": [f * v for v in d.axes_um]}
-    return out
-
-
-def _tilt(axis: int) -> Callable[[SceneFile], Mapping[str, Any]]:
-    def change(scene: SceneFile) -> Mapping[str, Any]:
-        angles = list(scene.sample.rotate_deg)
-        angles[axis] += 1.0
-        return {"sample.rotate_deg": angles}
-
-    return change
-
-
-def _moat(scene: SceneFile) -> Mapping[str, Any] | None:
-    if not isinstance(scene.sample, SpheresSample) or any(s.moat is not None for s in scene.sample.spheres):
-        return None
-    return {
-        f"sample.spheres.{i}.moat": {"width_um": 0.1 * s.radius_um, "depth_um": 0.1 * s.radius_um}
-        for i, s in enumerate(scene.sample.spheres)
-    }
-
-
-def _scattering_plate(scene: SceneFile) -> Mapping[str, Any] | None:
-    if scene.plate.kind != "transparent":
-        return None
-    return {"plate.kind": "scattering", "plate.radius_um": 3.0 * scene.working_distance}
-
-
-def _rough_law(scene: SceneFile) -> Mapping[str, Any] | None:
-    if scene.used_materials:
-        return None
-    law = {"material.rough": {"kind": "rough_diffuse", "roughness": 0.3}}
-    if isinstance(scene.sample, SpheresSample):
-        law |= {f"sample.spheres.{i}.material": "rough" for i in range(len(scene.sample.spheres))}
-    return law | {"sample.material": "rough"}
-
-
-def _wide_spot(scene: SceneFile) -> Mapping[str, Any]:
-    return {"beam.pinhole_radius_um": 0.5 * (scene.scan.spacing or 0.0)}
-
-
-LAG = "detector lag"
-BARE = Terms(offset=False, drift=0, along=False)
-EFFECTS = (
-    Effect("offset: a constant background", terms=replace(BARE, offset=True)),
-    Effect("slow drift of the background", terms=replace(BARE, offset=True, drift=3)),
-    Effect("slope along the fast axis", terms=Terms()),
-    Effect(LAG),
-    Effect("sample 10 % nearer to the plate", _distance(0.9), is_geometry=True),
-    Effect("sample 10 % farther from the plate", _distance(1.1), is_geometry=True),
-    Effect("instrument at 4/3 of its distance", _larger_instrument, is_geometry=True),
-    Effect("sample tilted by 1 deg about x", _tilt(0)),
-    Effect("sample tilted by 1 deg about y", _tilt(1)),
-    Effect("moat around the spheres, a tenth of a radius", _moat),
-    Effect("plate scatters", _scattering_plate),
-    Effect("rough-diffuse law, roughness 0.3", _rough_law),
-    Effect("spot as wide as a pixel", _wide_spot),
-    Effect("no multiple scattering", total=lambda images: images.single),
-    Effect("no masks", total=lambda images: images.unmasked + images.multiple),
-)
-"""What `explain` tries: the first three build up the usual normalisation, the others start from that."""
 
 
 @dataclass(frozen=True)
@@ -251,12 +139,18 @@ def _images(path: Path, changes: Mapping[str, Any]) -> Images:
         found = found.only(SceneError)
     assert found.by_order is not None and found.variance is not None and found.n_rays is not None  # simulated
     single, multiple = found.by_order[0] / found.n_rays, found.by_order[1:].sum(0) / found.n_rays
-    unmasked = pipeline.unmasked_signal(scene, found)
-    return Images(found.instrument, single, multiple, unmasked, found.variance / found.n_rays**2)
+    truth = pipeline.true_surface(scene, found.x, found.y)
+    assert truth.normals is not None  # of a scene
+    phi = SpotGeometry(found.instrument).form_factor(truth.height)
+    unmasked = np.maximum(np.einsum("kiyx,yxi->kyx", phi, truth.normals), 0.0)
+    return Images(found.instrument, single, multiple, unmasked, found.variance / found.n_rays**2, truth.height)
 
 
 def _height(stack: MicrographStack, fit: Agreement, images: Images, lacking: np.ndarray, scene: SceneFile) -> float:
-    """Return the height that `nearfield` finds in the data, normalised, without what an effect adds to them [um]."""
+    """Return how high `nearfield` finds the scene's top in the data, normalised, without what an effect adds [um].
+
+    The median over the highest (or deepest) hundredth of the scene's pixels, above the median of all.
+    """
     gain = fit.gain[:, None, None]
     signal = (stack.counts - fit.model) / gain + images.total - lacking
     variance = None if stack.variance is None else stack.variance / gain**2
@@ -265,8 +159,8 @@ def _height(stack: MicrographStack, fit: Agreement, images: Images, lacking: np.
         instrument=images.instrument,
     )  # fmt: skip
     rec = pipeline.reconstruct(clean, "nearfield", settings=scene.reconstruct)
-    level = float(np.median(rec.height))
-    return float(rec.height.ravel()[np.argmax(np.abs(rec.height - level))] - level)
+    away = np.abs(images.height - np.median(images.height))
+    return float(np.median(rec.height[away >= np.quantile(away, TOP)]) - np.median(rec.height))
 
 
 def compare(
@@ -299,13 +193,14 @@ def compare(
             f"{list(data.instrument.detector_names)}: import the scan with this scene as its --instrument"
         )
     progress("simulating the scene, looking for the sample")
-    shift = (0.0, 0.0)
-    for reach in (REACH, 0.0):  # moved by interpolation first, then simulated there
-        images = _images(path, given | _raster(data, scene, shift))
+    shift, reach = (0.0, 0.0), REACH
+    for last in (False,) * (MAX_PASSES - 1) + (True,):  # moved by interpolation first, then simulated there
+        here = given | _raster(data, scene, shift)
+        images = _images(path, here)
         found = find_shift(data, images.total, reach=reach)
-        shift = shift[0] + found[0], shift[1] + found[1]
-    here = given | _raster(data, scene, shift)
-    images = _images(path, here)
+        if last or np.hypot(*found) < NEAR * pitch(data.x):
+            break
+        shift, reach = (shift[0] + found[0], shift[1] + found[1]), 0.0
     agreement = normalise(data, images.total, own_variance=images.variance, shift=shift)
     contrast = contrast_by_cause(images.unmasked, images.single, images.multiple)
     height = _height(data, agreement, images, 0.0 * images.total, scene)

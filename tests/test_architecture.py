@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > study, comparison > pipeline > predict, checkpoint, provenance, spot > config > explain > stages > scene >
-nouns > settings, arrays, errors.
+__main__ > study, comparison > pipeline > predict, checkpoint, provenance, spot, effects > config > explain >
+stages > scene > nouns > settings, arrays, errors.
 """
 
 import ast
@@ -23,7 +23,7 @@ LEVELS = [
     {"trace", "prepare", "reconstruct", "evaluate", "formats"},
     {"explain"},
     {"config"},
-    {"predict", "checkpoint", "provenance", "spot"},
+    {"predict", "checkpoint", "provenance", "spot", "effects"},
     {"pipeline"},
     {"study", "comparison"},
     {"__main__", "__init__"},

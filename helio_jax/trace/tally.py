@@ -105,18 +105,13 @@ class Estimate:
         joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in parts[0]._arrays()}
         return replace(parts[0], **joined)
 
-    def take(self, pixels: np.ndarray) -> "Estimate":
+    def take(self, pixels: np.ndarray | slice) -> "Estimate":
         """Return some of the pixels, in the given order."""
         return replace(self, **{name: getattr(self, name)[..., pixels] for name in self._arrays()})
 
     def _arrays(self) -> list[str]:
         """Return the names of what is kept per pixel."""
         return [f.name for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)]
-
-    def take(self, keep: slice) -> "Estimate":
-        """Return some of the pixels."""
-        kept = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Estimate(**{k: a[..., keep] if isinstance(a, np.ndarray) else a for k, a in kept.items()})
 
     @property
     def n_launched(self) -> int | np.ndarray:
