@@ -25,14 +25,14 @@ _PILOT = 1 << 62  # added to the pixels' numbers, the key of their random number
 def trace_to_target(
     experiment: Experiment, settings: TraceSettings, ids: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> Estimate:
-    """Trace pixels until every detector's standard error is at most the wanted share of its count; or to the cap.
+    """Trace pixels until every detector's standard error is as small as wanted; or to the cap.
 
     A pure function of its arguments, pixel by pixel. About nine pixels in ten reach the target, the others come close;
     those that the cap stops (dark ones, mostly) keep their larger, honest error.
 
     Args:
         experiment: with `settings.rays` rays per pixel: the pilot, and the smallest number of the second pass.
-        settings: `target_error`, `max_rays`, `branches`, `seed`.
+        settings: `target_error` or `target_atoms`, `max_rays`, `branches`, `seed`.
         ids, x, y: number and beam position [um] of every pixel [n].
 
     Raises:
@@ -61,10 +61,14 @@ def doublings_needed(pilot: Estimate, settings: TraceSettings) -> np.ndarray:
 
     The error is taken to fall as the root of the number of rays, which low-discrepancy points better.
     """
-    assert settings.target_error is not None
-    wanted = (settings.target_error * pilot.total_mean) ** 2
+    if settings.target_error is not None:
+        variance, wanted = pilot.total_variance, (settings.target_error * pilot.total_mean) ** 2
+    else:  # a count of so many atoms, a mean below its own error being no smaller than that
+        assert settings.target_atoms is not None
+        least = np.maximum(pilot.mean, np.sqrt(pilot.variance))
+        variance, wanted = np.concatenate(pilot.variance), np.concatenate(least) / settings.target_atoms
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(pilot.total_variance > 0, SAFETY * pilot.total_variance / wanted, 0.0).max(0)
+        share = np.where(variance > 0, SAFETY * variance / wanted, 0.0).max(0)
     most = int(np.floor(np.log2(max(1.0, settings.max_rays / float(np.max(pilot.n_rays))))))
     return np.ceil(np.log2(np.clip(share, 1.0, 2.0**most))).astype(np.int64)
 

@@ -239,8 +239,8 @@ class Canvas:
             "cpu": sorted(self.cpus),
             **(note if len(self.cpus) > 1 else {}),
         }
-        if self.job.settings.target_error is not None:
-            about["rays_per_pixel"] = sum(fates.values()) / self.job.settings.branches / self.job.n_pixels
+        if self.job.settings.has_target:
+            about["rays_per_pixel"] = fates["launched"] / self.job.settings.branches / self.job.n_pixels
         stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(n_views))
         if n_views == 1:
             return stacks[0].replace(provenance={**stacks[0].provenance, **about})

@@ -15,8 +15,11 @@ class TraceSettings(Settings):
     target_error: float | None = Field(default=None, gt=0.0, lt=1.0)
     """Wanted standard error of every detector in every pixel, as a share of its count: pixels that need more than
     `rays` get more, up to `max_rays`; default: `rays` everywhere."""
+    target_atoms: float | None = Field(default=None, gt=0.0, le=1e15)
+    """Wanted instead: every scattering order that is kept apart at least as well known, in every detector and pixel, as
+    counting this many beam atoms would tell (35000: the reference program's usual number)."""
     max_rays: int = Field(default=16_384, ge=8, le=10_000_000)
-    """Most beam rays per pixel where there is a target error."""
+    """Most beam rays per pixel where there is a target."""
     branches: int = Field(default=8, ge=1, le=1024)
     """`expected`: paths followed from the first hit of every beam ray, for the multiple scattering."""
     estimator: Literal["expected", "analog"] = "expected"
@@ -34,13 +37,23 @@ class TraceSettings(Settings):
     maps: bool = True
     """Also make the masking and shadowing maps."""
 
+    @property
+    def has_target(self) -> bool:
+        """Whether pixels get as many rays as they need."""
+        return self.target_error is not None or self.target_atoms is not None
+
     @model_validator(mode="after")
     def _has_a_target_it_can_reach(self) -> "TraceSettings":
-        if self.target_error is not None and self.estimator == "analog":
+        if not self.has_target:
+            return self
+        if self.target_error is not None and self.target_atoms is not None:
+            raise ValueError("target_error and target_atoms are two ways to say one thing: remove one of both")
+        name = "target_atoms" if self.target_error is None else "target_error"
+        if self.estimator == "analog":
             raise ValueError(
-                "target_error needs estimator = 'expected': analog counts are those of `rays` atoms in every pixel; "
+                f"{name} needs estimator = 'expected': analog counts are those of `rays` atoms in every pixel; "
                 "remove one of both"
             )
-        if self.target_error is not None and self.max_rays < self.rays:
+        if self.max_rays < self.rays:
             raise ValueError(f"max_rays must be >= rays = {self.rays}, got {self.max_rays}: raise it")
         return self

@@ -165,7 +165,7 @@ def _prepared(job: Job, number: int) -> Experiment:
 
 def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
     """Trace a block of pixels."""
-    if job.settings.target_error is not None:
+    if job.settings.has_target:
         return trace_to_target(experiment, job.settings, *job.pixels(start, stop))
     return trace_block(experiment, *job.pixels(start, stop)).estimate()
 
