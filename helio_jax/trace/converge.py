@@ -1,9 +1,9 @@
 """Trace every pixel until its error is small enough: rays are spent where they are needed.
 
 Two passes. A pilot tells from the spread of its replicates how many rays a pixel needs; a second pass with that many,
-and with other random numbers, gives the counts and their error. Nothing of the pilot is kept: whoever stops on the
-estimate that he reports stops too early where it happens to be small, and his mean and his error are both biased. So
-each pixel is what a run of its number of rays gives, to the bit, and its standard error is as honest as always.
+and with other random numbers, gives the counts and their error. Nothing of the pilot is kept: who stops on the very
+estimate that is reported stops too early where its error happens to look small, which biases mean and error. So each
+pixel is what a run of its number of rays gives, to the bit, and its standard error is as honest as always.
 """
 
 from dataclasses import replace
