@@ -17,7 +17,7 @@ from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import Estimate
 from helio_jax.trace.transport import Experiment, trace_block
 
-SAFETY = 2.0
+SAFETY = 1.4
 """The pilot's variance is known to 50 % only (7 degrees of freedom): so many times the rays that it asks for."""
 _PILOT = 1 << 62  # added to the pixels' numbers, the key of their random numbers
 
@@ -27,7 +27,7 @@ def trace_to_target(
 ) -> Estimate:
     """Trace pixels until every detector's standard error is at most the wanted share of its count; or to the cap.
 
-    A pure function of its arguments, pixel by pixel. About nine pixels in ten reach the target, the others come close;
+    A pure function of its arguments, pixel by pixel. Nine pixels in ten reach the target, most others come close;
     those that the cap stops (dark ones, mostly) keep their larger, honest error.
 
     Args:
