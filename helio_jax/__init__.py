@@ -7,15 +7,17 @@ Scene - trace -> MicrographStack - prepare -> MicrographStack - reconstruct -> R
 Reading order: `arrays` (conventions), the nouns `instrument`, `micrograph`, `heightmap`, `reconstruction`, then one
 folder per verb. Which file does what:
 
-* `scene/` what is imaged: `sample` (kinds of samples), `surfaces` (their geometry), `scan` (raster), `scene`.
+* `scene/` what is imaged: `sample` (kinds of samples), `placement` (where they stand), `surfaces` (their geometry),
+  `scan` (positions), `views` (distances, rotations), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
   `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `denoise`, `run`
-  (blocks on threads), `job`, `units` (units of work), `scan` (threads, processes, cluster).
-* `prepare/` `noise` (counting noise), `calibrate` (first background and gain of a measured scan).
+  (blocks on threads), `converge` (a wanted error), `job`, `units` (units of work), `scan` (threads, processes,
+  cluster), `follow` (single atoms).
+* `prepare/` `noise` (counting noise), `response` (lag, drift), `calibrate` (first background and gain).
 * `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
   -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
 * `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
-* `formats/` `hdf5` (NeXus), `parts` (finished units), `matlab` (import), `safe` (untrusted files).
+* `formats/` `hdf5` (NeXus), `parts` (finished units), `matlab` (import), `export`, `safe` (untrusted files).
 * `config` (scene files), `predict` (tracer and masks for the fit), `checkpoint` (long simulations), `pipeline` (joins
   the stages), `study` (sweeps), `__main__` (command line).
 

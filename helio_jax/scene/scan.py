@@ -176,7 +176,7 @@ class PositionList(Scan):
 
     kind: Literal["list"] = "list"
     file: str | None = Field(default=None, min_length=1, max_length=4096)
-    """Text file (.csv) relative to the scene file: x and y of one beam position on each line [um]."""
+    """Text file (.csv) relative to the scene file: x and y in um of one beam position on each line."""
     points_um: tuple[tuple[float, float], ...] = Field(default=(), max_length=100_000)
     """The positions (x, y) themselves, instead of a file [um]."""
     _found: tuple[Path, np.ndarray] | None = PrivateAttr(None)

@@ -1,9 +1,9 @@
 """Trace every pixel until its error is small enough: rays are spent where they are needed.
 
 Two passes. A pilot tells from the spread of its replicates how many rays a pixel needs; a second pass with that many,
-and with other random numbers, gives the counts and their error. Nothing of the pilot is kept: whoever stops on the
-estimate that he reports stops too early where it happens to be small, and his mean and his error are both biased. So
-each pixel is what a run of its number of rays gives, to the bit, and its standard error is as honest as always.
+and with other random numbers, gives the counts and their error. Nothing of the pilot is kept: who stops on the very
+estimate that is reported stops too early where its error happens to look small, which biases mean and error. So each
+pixel is what a run of its number of rays gives, to the bit, and its standard error is as honest as always.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import Estimate
 from helio_jax.trace.transport import Experiment, trace_block
 
-SAFETY = 2.0
+SAFETY = 1.4
 """The pilot's variance is known to 50 % only (7 degrees of freedom): so many times the rays that it asks for."""
 _PILOT = 1 << 62  # added to the pixels' numbers, the key of their random numbers
 
@@ -27,7 +27,7 @@ def trace_to_target(
 ) -> Estimate:
     """Trace pixels until every detector's standard error is as small as wanted; or to the cap.
 
-    A pure function of its arguments, pixel by pixel. About nine pixels in ten reach the target, the others come close;
+    A pure function of its arguments, pixel by pixel. Nine pixels in ten reach the target, most others come close;
     those that the cap stops (dark ones, mostly) keep their larger, honest error.
 
     Args:

@@ -10,6 +10,7 @@ from helio_jax.errors import SceneError
 from helio_jax.pipeline import simulate
 from helio_jax.scene.shapes import TrenchSample
 from helio_jax.trace.converge import trace_to_target
+from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.transport import trace_block
@@ -41,21 +42,22 @@ def test_every_pixel_is_a_plain_run_of_its_rays(bshem):
 
 
 def test_stated_errors_are_honest(bshem):
-    """Against a long run, 10 places x 40 seeds: the mean of z is 0 and that of z^2 is 7/5, as Student's t of 7 says.
+    """Against a long run, 10 places x 25 seeds: the mean of z is 0 and that of z^2 is 7/5, as Student's t of 7 says.
 
-    400 values: a bias of 0.5 standard errors and errors stated 1.4 times too small are rejected. Catches an error that
-    is the pilot's, a pilot that is kept where it looks good, and an estimate that stops on itself.
+    250 values: a bias of 0.5 standard errors and errors stated 1.5 times too small are rejected. Catches an error that
+    is the target or the pilot's, and counts of another number of rays. (Stopping on the estimate itself is biased in
+    principle, in this slot by less than 0.5 %, which no test of this length would see.)
     """
     x, y = np.linspace(-250.0, 260.0, 10), np.linspace(-45.0, 40.0, 10)
-    body, z = slot(), []
-    long = SETTINGS.model_copy(update={"rays": 8192, "branches": 4})
+    body, z = Intersector(slot()), []
+    long = SETTINGS.model_copy(update={"rays": 4096, "branches": 4})
     truth, variance = trace_pixels(make_experiment(body, bshem, long), x, y).total()
-    for seed in range(2, 42):
+    for seed in range(2, 27):
         settings = SETTINGS.model_copy(update={"seed": seed, "max_rays": 256})
         found = trace_to_target(make_experiment(body, bshem, settings), settings, np.arange(10), x, y)
         z.append((found.total_mean[0] - truth[0]) / np.sqrt(found.total_variance[0] + variance[0]))
     z = np.array(z)
-    assert_mean(float(z.mean()), 0.0, np.sqrt(1.4 / z.size + 0.016 / 10), "mean of z")  # the long run is shared
+    assert_mean(float(z.mean()), 0.0, np.sqrt(1.4 / z.size + 0.032 / 10), "mean of z")  # the long run is shared
     assert_mean(float((z**2).mean()), 1.4, np.sqrt((9.8 - 1.4**2) / z.size), "mean of z^2")
 
 

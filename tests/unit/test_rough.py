@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.integrate import quad
 from scipy.special import gamma, j0, kv
 from stats import assert_mean
 
+from helio_jax.config import load_scene
 from helio_jax.scene.rough import RoughSample, rough_heights, spectrum
 from helio_jax.scene.sample import Sample, check_body
 
@@ -107,3 +109,11 @@ def test_impossible_surfaces_are_refused(change, message):
     """What cannot be built says so with limit and remedy. Catches a surface that is silently coarser than asked for."""
     with pytest.raises(ValidationError, match=message):
         RoughSample.model_validate(PLAIN | change)
+
+
+def test_validate_warns_of_a_truth_that_the_fit_could_represent():
+    """Fewer than 4 points of the surface per pixel are called few. Catches a warning always or never given."""
+    scenes = Path(__file__).resolve().parents[2] / "scenes"
+    assert load_scene(scenes / "rough.toml").warnings() == []
+    (warning,) = load_scene(scenes / "rough.toml", {"scan.pixel_size_um": 15.0}).warnings()
+    assert "a point every 4 um" in warning and "sample.resolution_um to at most 3.75 um" in warning
