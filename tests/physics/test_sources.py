@@ -6,6 +6,8 @@ cosine flat hands it on by K_1, so a hole of area A in the source's plane, R asi
 A / (2 pi) integral over q of q J_0(q R) K_n(q) K_1(q) (own derivation).
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -206,3 +208,19 @@ def test_footprint_widths(azimuth):
             assert abs(found["center_along_um"]) < 0.02 and abs(found["center_across_um"]) < 0.02
     round_spot = measure_spot(np.random.default_rng(1).normal(size=(200_000, 2)))
     assert round_spot["diameter_50_um"] == pytest.approx(2.0 * np.sqrt(2.0 * np.log(2.0)), rel=0.01)
+
+
+def test_draw_spot(tmp_path):
+    """The spot of scenes/nano.toml is 0.3 um wide (FWHM across) where its header says; a picture comes, and refusals.
+
+    Catches: a header that does not hold, heights from the plate downwards, no figure.
+    """
+    from helio_jax.spot import draw_spot
+
+    scene = load_scene(Path(__file__).parents[2] / "scenes" / "nano.toml")
+    low, high = draw_spot(scene, [0.0, 72.0], tmp_path / "spot.png")
+    assert high["gaussian_fwhm_across_um"] == pytest.approx(0.3, rel=0.01)
+    assert low["gaussian_fwhm_across_um"] > 1.1 * high["gaussian_fwhm_across_um"]
+    assert (tmp_path / "spot.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SceneError, match="472 um above the reference plane, got 472 um"):
+        draw_spot(scene, [472.0], None)
