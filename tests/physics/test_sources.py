@@ -53,6 +53,7 @@ def test_effusive_flat(exponent):
     here, settings = np.full(8, middle), TraceSettings(rays=64, branches=1, seed=3)
     body = FlatSample(size_um=4e5).build()
     both = make_experiment(body, instrument(**tilted).model_copy(update={"detector": (hole,)}), settings)
+    assert both.effusive is not None and both.effusive.sampling.seed != both.sampling.seed
     found = trace_pixels(both.effusive, here, 0.0 * here)
     mean, std = found.total_mean.mean(), np.sqrt(found.total_variance.sum()) / here.size
     assert_mean(mean, exact, max(std, 1e-3 * exact), f"effusive beam of cos^{exponent:g}")
