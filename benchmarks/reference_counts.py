@@ -33,6 +33,7 @@ from helio_jax.scene.scattering import (  # noqa: E402
 )
 from helio_jax.trace.laws import scatter_atoms  # noqa: E402
 from helio_jax.trace.lawtable import make_law_table  # noqa: E402
+from helio_jax.trace.run import N_REPLICATES  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
 from tests.stats import pooled_chi2  # noqa: E402
 
@@ -49,7 +50,7 @@ def order_p_values(count_set: CountSet, settings: TraceSettings, orders: list[li
     for k in range(mean.shape[1]):
         for j, group in enumerate(orders):
             columns = (a[:, k][:, group].sum(-1) for a in (count_set.counts, mean, variance))
-            out[k, j] = pooled_chi2(*columns)
+            out[k, j] = pooled_chi2(*columns, dof=N_REPLICATES - 1)
     return out
 
 

@@ -219,6 +219,20 @@ def import_files(
 
 
 @app.command()
+def export(
+    file: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mat (the reference's layout).")],
+    view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
+) -> None:
+    """Write micrographs in the layout of another program, by the suffix of the file."""
+    from helio_jax import read
+    from helio_jax.formats.export import export as write_foreign
+
+    write_foreign(read(file), output, view)
+    print(output)
+
+
+@app.command()
 def reconstruct(
     stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
     output: OutFile,
@@ -279,6 +293,32 @@ def report(
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, read(stack) if stack else None, rec, known, scores, title=height.stem)
     print(f"{output}\n{panel}")
+
+
+@app.command()
+def compare(
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5).")],
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("helio-out/comparison"),
+    explain: Annotated[bool, typer.Option(help="Add one effect at a time and tabulate what it does.")] = False,
+    rays: Rays = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
+    from helio_jax import read
+    from helio_jax.comparison import compare as compare_with_scene
+
+    found = compare_with_scene(
+        read(stack), scene, overrides=_given(**{"trace.rays": rays}), explain=explain, progress=_say
+    )
+    files = found.write(output)
+    if as_json:
+        print(json.dumps(found.as_dict() | {"files": list(map(str, files))}))
+        return
+    print(found.agreement.verdict())
+    _print_table(found.as_table())
+    for path in files:
+        print(path)
 
 
 @app.command()

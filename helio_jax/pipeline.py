@@ -239,13 +239,29 @@ def reconstruct(
     return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
 
 
+def unmasked_signal(scene: SceneFile, stack: MicrographStack) -> np.ndarray:
+    """Return the probability of single scattering if nothing hid the apertures, for cosine scattering [detector, y, x].
+
+    Parts of an aperture below a point's own horizon count as negative, so nowhere is it set below 0.
+    """
+    truth = _truth_on(scene, stack.x, stack.y)
+    assert truth.normals is not None  # of a scene
+    phi = SpotGeometry(scene.instrument).form_factor(truth.height)
+    return np.maximum(np.einsum("kiyx,yxi->kyx", phi, truth.normals), 0.0)
+
+
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
     """Return the true first hit of the beam axis for every pixel of a reconstruction's raster.
 
     Raises:
         SceneError: the beam misses the sample in some pixel.
     """
-    grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
+    return _truth_on(scene, rec.raster_x, rec.raster_y)
+
+
+def _truth_on(scene: SceneFile, x: np.ndarray, y: np.ndarray) -> Truth:
+    """Return the true first hits for the beam positions x [x] and y [y]."""
+    grid_x, grid_y = np.meshgrid(x, y)
     hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     n_missed = int(np.sum(hits.surface == MISS))
     if n_missed:

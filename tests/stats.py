@@ -11,25 +11,31 @@ N_CHECKS = 400
 P_MIN = FALSE_ALARM / N_CHECKS
 
 
-def pooled_chi2(observed: np.ndarray, expected: np.ndarray, variance: np.ndarray, smallest: float = 10.0) -> float:
+def pooled_chi2(
+    observed: np.ndarray, expected: np.ndarray, variance: np.ndarray, smallest: float = 10.0, dof: float = np.inf
+) -> float:
     """Return the p-value of Poisson counts against expectations that have a variance of their own.
 
     Cells are pooled with their neighbours in scan order (not by our noisy expectation) until a block expects `smallest`
-    on average; blocks that still expect less are pooled into one.
+    on average; blocks that still expect less are pooled into one. Where `variance` is itself an estimate, of `dof`
+    degrees of freedom, the deviations are Student's with the dof of Welch and Satterthwaite.
     """
     o, e, v = (np.asarray(a, float).ravel() for a in (observed, expected, variance))
     block = np.arange(o.size) // max(1, int(np.ceil(smallest / max(e.mean(), smallest / o.size))))
-    o, e, v = (np.bincount(block, a) for a in (o, e, v))
+    o, e, v, v2 = (np.bincount(block, a) for a in (o, e, v, v**2))
     is_small = e < smallest
     if is_small.any():
-        o, e, v = (np.append(a[~is_small], a[is_small].sum()) for a in (o, e, v))
+        o, e, v, v2 = (np.append(a[~is_small], a[is_small].sum()) for a in (o, e, v, v2))
     if e[-1] + v[-1] == 0.0:  # nothing expected here: any count at all is impossible
         if o[-1] > 0:
             return 0.0
-        o, e, v = o[:-1], e[:-1], v[:-1]
+        o, e, v, v2 = o[:-1], e[:-1], v[:-1], v2[:-1]
     if e.size == 0:
         return 1.0
-    return float(stats.chi2.sf(np.sum((o - e) ** 2 / (e + v)), o.size))
+    t = np.abs(o - e) / np.sqrt(e + v)
+    of_all = np.where(v2 > 0, dof * (e + v) ** 2 / np.maximum(v2, 1e-300), np.inf)
+    z = stats.norm.isf(np.maximum(stats.t.sf(t, np.minimum(of_all, 1e9)), 1e-300))
+    return float(stats.chi2.sf(np.sum(z**2), o.size))
 
 
 def smallest_tail(observed: np.ndarray, expected: np.ndarray) -> float:

@@ -141,12 +141,15 @@ def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) ->
     step_x = get_number(path, im, "raster_movement_x", low=0.0) * 1000 / math.cos(math.radians(full.beam.incidence_deg))
     step_y = get_number(path, im, "raster_movement_y", low=0.0) * 1000
     counts = by_order.sum(0)
+    center = get_array(path, im.get("helio_center_um", np.zeros(2)), "im.helio_center_um", 1)  # helio's own export
+    if center.shape != (2,):
+        raise InputFileError(f"{path}: im.helio_center_um must be x and y, got {center.size} numbers")
     fields = {
         "counts": counts,
         "by_order": by_order,
         "variance": np.maximum(_mean_of_neighbours(counts), 1.0),
-        "x": _centred(counts.shape[2], step_x),
-        "y": _centred(counts.shape[1], step_y),
+        "x": _centred(counts.shape[2], step_x) + center[0],
+        "y": _centred(counts.shape[1], step_y) + center[1],
         "n_rays": get_number(path, get_table(path, tree, "param"), "rays_per_pixel", low=0.0),
         "noise": "poisson",
         "instrument": full,

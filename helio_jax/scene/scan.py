@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from helio_jax.instrument import Beam
 from helio_jax.scene.files import read_positions
@@ -179,6 +179,7 @@ class PositionList(Scan):
     """Text file (.csv) relative to the scene file: x and y of one beam position on each line [um]."""
     points_um: tuple[tuple[float, float], ...] = Field(default=(), max_length=100_000)
     """The positions (x, y) themselves, instead of a file [um]."""
+    _found: tuple[Path, np.ndarray] | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _has_one_source(self) -> "PositionList":
@@ -187,12 +188,17 @@ class PositionList(Scan):
         return self
 
     def read(self, base_dir: Path) -> np.ndarray:
-        """Return the positions [n, 2], um.
+        """Return the positions [n, 2], um; a file is read once.
 
         Raises:
             InputFileError: the file is missing or holds anything else than positions.
         """
-        return np.array(self.points_um) if self.file is None else read_positions(base_dir / self.file)
+        if self.file is None:
+            return np.array(self.points_um)
+        path = (base_dir / self.file).resolve()
+        if self._found is None or self._found[0] != path:
+            self._found = path, read_positions(base_dir / self.file)
+        return self._found[1]
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers of the positions, from 0, and a single 0: the axes of images of one row."""

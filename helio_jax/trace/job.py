@@ -106,7 +106,9 @@ class Job:
 
     def units(self) -> list[Unit]:
         """Return the units of the scan, none across two views; they depend on the job alone, not on who runs them."""
-        size = min(max(1, self.settings.paths_per_unit // math.prod(paths_of(self.settings))), MAX_PIXELS)
+        n_rays, n_branches = paths_of(self.settings)
+        n_paths = (n_rays if self.settings.target_error is None else self.settings.max_rays) * n_branches
+        size = min(max(1, self.settings.paths_per_unit // n_paths), MAX_PIXELS)
         n = self.n_view_pixels
         runs = [
             (s, min(s + size, first + n)) for first in range(0, self.n_pixels, n) for s in range(first, first + n, size)

@@ -161,7 +161,7 @@ def trace_pixels(
         return lambda: trace_block(experiment, ids, x[part], y[part], first.take(part) if first else None).estimate()
 
     estimate = Estimate.join(list(in_order(workers or n_cpus(), map(task, range(0, len(x), size)))))
-    check_rays(estimate.fates.sum(1), estimate.n_unaccounted, estimate.n_launched * len(x), max_lost)
+    check_rays(estimate.fates.sum(1), estimate.n_unaccounted, int(np.sum(estimate.fates)), max_lost)
     return estimate
 
 

@@ -215,7 +215,7 @@ class Canvas:
         self.effuse_fates += patch.effuse_fates
         self.cpus.add(patch.cpu)
         self.missing.remove(unit.number)
-        check_rays(self.fates, 0, self.n_launched)
+        check_rays(self.fates, 0, max(self.n_launched, int(self.fates.sum())))
         check_rays(self.effuse_fates, 0, self.n_effused)
 
     def stack(self) -> Micrographs:
@@ -232,13 +232,15 @@ class Canvas:
             for f in (self.fates, self.effuse_fates)
         )
         note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        about = {
+        about: dict[str, Any] = {
             "rays": fates,
             **({"effusive_rays": effuse_fates} if self.job.scene.beam.effusive else {}),
             "job": self.job.key,
             "cpu": sorted(self.cpus),
             **(note if len(self.cpus) > 1 else {}),
         }
+        if self.job.settings.target_error is not None:
+            about["rays_per_pixel"] = sum(fates.values()) / self.job.settings.branches / self.job.n_pixels
         stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(n_views))
         if n_views == 1:
             return stacks[0].replace(provenance={**stacks[0].provenance, **about})
@@ -252,6 +254,8 @@ class Canvas:
         effusive = scene.beam.effusive
         effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
         n_negative = int(np.sum(self.total[:, pixels] < 0))
+        limit = (settings.target_error or 0.0) * self.total[:, pixels]
+        n_above = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
         images: dict[str, Any] = {}
         for name, array, factor in (
             ("by_order", self.by_order, scale),
@@ -281,6 +285,7 @@ class Canvas:
             provenance={
                 "trace": settings.model_dump(mode="json"),
                 "n_negative": n_negative,
+                **({} if settings.target_error is None else {"n_above_target": n_above}),
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
                 **({"view": view.about} if view.about else {}),
             },

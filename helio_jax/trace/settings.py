@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from helio_jax.settings import Settings
 
@@ -12,6 +12,11 @@ class TraceSettings(Settings):
 
     rays: int = Field(default=256, ge=8, le=10_000_000)
     """Beam rays per pixel; the counts do not depend on it (see scan.atoms_per_pixel), only their error does."""
+    target_error: float | None = Field(default=None, gt=0.0, lt=1.0)
+    """Wanted standard error of every detector in every pixel, as a share of its count: pixels that need more than
+    `rays` get more, up to `max_rays`; default: `rays` everywhere."""
+    max_rays: int = Field(default=16_384, ge=8, le=10_000_000)
+    """Most beam rays per pixel where there is a target error."""
     branches: int = Field(default=8, ge=1, le=1024)
     """`expected`: paths followed from the first hit of every beam ray, for the multiple scattering."""
     estimator: Literal["expected", "analog"] = "expected"
@@ -28,3 +33,14 @@ class TraceSettings(Settings):
     """Threads (or processes); default: one per CPU."""
     maps: bool = True
     """Also make the masking and shadowing maps."""
+
+    @model_validator(mode="after")
+    def _has_a_target_it_can_reach(self) -> "TraceSettings":
+        if self.target_error is not None and self.estimator == "analog":
+            raise ValueError(
+                "target_error needs estimator = 'expected': analog counts are those of `rays` atoms in every pixel; "
+                "remove one of both"
+            )
+        if self.target_error is not None and self.max_rays < self.rays:
+            raise ValueError(f"max_rays must be >= rays = {self.rays}, got {self.max_rays}: raise it")
+        return self

@@ -1,6 +1,6 @@
 """What the tracer counts: exact integer fates of all rays, analog hits, and sums of expected contributions."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -83,7 +83,8 @@ class Estimate:
         mean, variance: by order, the variance being that of the mean [order, detector, pixels].
         total_mean, total_variance: of all orders together [detector, pixels].
         plate_mean, plate_variance: of those of them that met the plate before [detector, pixels].
-        fates, hits, plate_hits, n_rays, n_branches: as in `Tally`.
+        fates, hits, plate_hits, n_branches: as in `Tally`.
+        n_rays: beam rays launched per pixel: one number, or one for every pixel [pixels].
     """
 
     mean: np.ndarray
@@ -95,24 +96,25 @@ class Estimate:
     fates: np.ndarray
     hits: np.ndarray
     plate_hits: np.ndarray
-    n_rays: int
+    n_rays: int | np.ndarray
     n_branches: int
 
     @classmethod
     def join(cls, parts: list["Estimate"]) -> "Estimate":
         """Put blocks of pixels side by side, in order."""
-        first = parts[0]
-        names = [f.name for f in fields(cls) if isinstance(getattr(first, f.name), np.ndarray)]
-        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in names}
-        return cls(**joined, n_rays=first.n_rays, n_branches=first.n_branches)
+        joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in parts[0]._arrays()}
+        return replace(parts[0], **joined)
 
-    def take(self, keep: slice) -> "Estimate":
-        """Return some of the pixels."""
-        kept = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Estimate(**{k: a[..., keep] if isinstance(a, np.ndarray) else a for k, a in kept.items()})
+    def take(self, pixels: np.ndarray | slice) -> "Estimate":
+        """Return some of the pixels, in the given order."""
+        return replace(self, **{name: getattr(self, name)[..., pixels] for name in self._arrays()})
+
+    def _arrays(self) -> list[str]:
+        """Return the names of what is kept per pixel."""
+        return [f.name for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)]
 
     @property
-    def n_launched(self) -> int:
+    def n_launched(self) -> int | np.ndarray:
         """Paths launched per pixel: beam rays times branches."""
         return self.n_rays * self.n_branches
 

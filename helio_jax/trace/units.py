@@ -16,6 +16,7 @@ import numpy as np
 
 from helio_jax.errors import ResumeError
 from helio_jax.scene.body import Body
+from helio_jax.trace.converge import trace_to_target
 from helio_jax.trace.intersect import MISS
 from helio_jax.trace.job import Job, Unit, differences, instruction_set
 from helio_jax.trace.masks import hidden_form_factor, is_shadowed
@@ -164,12 +165,14 @@ def _prepared(job: Job, number: int) -> Experiment:
 
 def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
     """Trace a block of pixels."""
+    if job.settings.target_error is not None:
+        return trace_to_target(experiment, job.settings, *job.pixels(start, stop))
     return trace_block(experiment, *job.pixels(start, stop)).estimate()
 
 
 def _trace_effusive(experiment: Experiment, job: Job, start: int, stop: int) -> _Effuse:
-    """Trace the effusive beam of a block of pixels."""
-    return _Effuse(_trace(experiment, job, start, stop))
+    """Trace the effusive beam of a block of pixels, whatever error is wanted of the beam's counts."""
+    return _Effuse(trace_block(experiment, *job.pixels(start, stop)).estimate())
 
 
 def _maps(experiment: Experiment, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

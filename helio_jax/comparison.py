@@ -1,0 +1,352 @@
+"""Simulation versus experiment: a scene simulated in the instrument that measured, and what lies between the two.
+
+Measured stack and scene file -> the scene's micrographs on the stack's raster, the sample moved to where the data show
+it, brought onto the data by gain, offset and slow drift (evaluate/agreement), residuals in standard errors, contrast by
+cause, a verdict. `explain` adds one effect at a time and tells what it does to chi-square, to the evidence and to the
+height that the near-field method recovers once the effect is taken away.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from helio_jax import pipeline
+from helio_jax.arrays import pitch
+from helio_jax.config import SceneFile, load_scene
+from helio_jax.errors import HelioError, SceneError
+from helio_jax.evaluate.agreement import REACH, Agreement, Terms, contrast_by_cause, find_shift, normalise
+from helio_jax.evaluate.agreement_figure import save_agreement, save_effects
+from helio_jax.formats.safe import atomic_path
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.scene.shapes import SpheresSample
+
+MAX_LAG = 5.0
+"""Longest response time of a detector that `explain` looks for [pixels]."""
+Progress = Callable[[str], Any]
+"""Called with what is done next."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """A simulated experiment, as detection probabilities per beam atom, with the variance of their sum.
+
+    All images [detector, y, x].
+    """
+
+    instrument: Instrument
+    single: np.ndarray
+    multiple: np.ndarray
+    unmasked: np.ndarray
+    variance: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """All that is detected."""
+        return self.single + self.multiple
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Something that a simulation may lack.
+
+    Attributes:
+        name: what it is.
+        changes: of the scene's settings, from the scene and a typical length of it; None: it does not apply.
+        terms: of the normalisation, instead of the usual ones.
+        total: which of the images' parts are added up.
+        is_geometry: whether heights are to be computed with the changed instrument, instead of taking away what the
+            effect does to the images.
+    """
+
+    name: str
+    changes: Callable[[SceneFile], Mapping[str, Any] | None] = lambda scene: {}
+    terms: Terms = field(default_factory=Terms)
+    total: Callable[[Images], np.ndarray] = lambda images: images.total
+    is_geometry: bool = False
+
+
+def _distance(factor: float) -> Callable[[SceneFile], Mapping[str, Any]]:
+    return lambda scene: {"plate.sample_distance_um": factor * scene.sample_distance}
+
+
+def _larger_instrument(scene: SceneFile) -> Mapping[str, Any]:
+    """All distances between plate and sample 4/3 as long, and the apertures as much larger: 4 mm instead of 3."""
+    f = 4.0 / 3.0
+    out: dict[str, Any] = {
+        "plate.working_distance_um": f * scene.working_distance,
+        "plate.sample_distance_um": scene.sample_distance + (f - 1.0) * scene.working_distance,
+    }
+    for k, d in enumerate(scene.detector):
+        if d.center_um is not None and d.axes_um is not None:
+            out |= {f"detector.{k}.center_um": [f * v for v in d.center_um]}
+            out |= {f"detector.{k}.axes_um": [f * v for v in d.axes_um]}
+    return out
+
+
+def _tilt(axis: int) -> Callable[[SceneFile], Mapping[str, Any]]:
+    def change(scene: SceneFile) -> Mapping[str, Any]:
+        angles = list(scene.sample.rotate_deg)
+        angles[axis] += 1.0
+        return {"sample.rotate_deg": angles}
+
+    return change
+
+
+def _moat(scene: SceneFile) -> Mapping[str, Any] | None:
+    if not isinstance(scene.sample, SpheresSample) or any(s.moat is not None for s in scene.sample.spheres):
+        return None
+    return {
+        f"sample.spheres.{i}.moat": {"width_um": 0.1 * s.radius_um, "depth_um": 0.1 * s.radius_um}
+        for i, s in enumerate(scene.sample.spheres)
+    }
+
+
+def _scattering_plate(scene: SceneFile) -> Mapping[str, Any] | None:
+    if scene.plate.kind != "transparent":
+        return None
+    return {"plate.kind": "scattering", "plate.radius_um": 3.0 * scene.working_distance}
+
+
+def _rough_law(scene: SceneFile) -> Mapping[str, Any] | None:
+    if scene.used_materials:
+        return None
+    law = {"material.rough": {"kind": "rough_diffuse", "roughness": 0.3}}
+    if isinstance(scene.sample, SpheresSample):
+        law |= {f"sample.spheres.{i}.material": "rough" for i in range(len(scene.sample.spheres))}
+    return law | {"sample.material": "rough"}
+
+
+def _wide_spot(scene: SceneFile) -> Mapping[str, Any]:
+    return {"beam.pinhole_radius_um": 0.5 * (scene.scan.spacing or 0.0)}
+
+
+LAG = "detector lag"
+BARE = Terms(offset=False, drift=0, along=False)
+EFFECTS = (
+    Effect("offset: a constant background", terms=replace(BARE, offset=True)),
+    Effect("slow drift of the background", terms=replace(BARE, offset=True, drift=3)),
+    Effect("slope along the fast axis", terms=Terms()),
+    Effect(LAG),
+    Effect("sample 10 % nearer to the plate", _distance(0.9), is_geometry=True),
+    Effect("sample 10 % farther from the plate", _distance(1.1), is_geometry=True),
+    Effect("instrument at 4/3 of its distance", _larger_instrument, is_geometry=True),
+    Effect("sample tilted by 1 deg about x", _tilt(0)),
+    Effect("sample tilted by 1 deg about y", _tilt(1)),
+    Effect("moat around the spheres, a tenth of a radius", _moat),
+    Effect("plate scatters", _scattering_plate),
+    Effect("rough-diffuse law, roughness 0.3", _rough_law),
+    Effect("spot as wide as a pixel", _wide_spot),
+    Effect("no multiple scattering", total=lambda images: images.single),
+    Effect("no masks", total=lambda images: images.unmasked + images.multiple),
+)
+"""What `explain` tries: the first three build up the usual normalisation, the others start from that."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one effect does.
+
+    Attributes:
+        name: of the effect.
+        chi2: per pixel, over all pixels.
+        d_chi2: change of the total chi-square against the usual model.
+        d_bic: change of the Bayesian information criterion; below -10: strong evidence for the effect.
+        height: recovered by `nearfield` once the effect is taken away from the data [um].
+        note: why there are no numbers.
+    """
+
+    name: str
+    chi2: float = np.nan
+    d_chi2: float = np.nan
+    d_bic: float = np.nan
+    height: float = np.nan
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A simulation against a measurement.
+
+    Attributes:
+        stack: what was measured.
+        images: the simulation, sample moved.
+        agreement: how far they agree.
+        contrast: by cause, as a share of the flat's signal [detector].
+        height: that `nearfield` recovers from the data, normalised by the simulation [um].
+        effects: one row each, if asked for.
+    """
+
+    stack: MicrographStack
+    images: Images
+    agreement: Agreement
+    contrast: Mapping[str, np.ndarray]
+    height: float
+    effects: tuple[Row, ...] = field(default=())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-compatible summary."""
+        known = [{k: v for k, v in vars(row).items() if v == v and v != ""} for row in self.effects]
+        contrast = {name: [float(v) for v in values] for name, values in self.contrast.items()}
+        summary = self.agreement.as_dict() | {"contrast": contrast, "nearfield_height_um": self.height}
+        return summary | ({"effects": known} if known else {})
+
+    def as_table(self) -> list[tuple[str, str, str]]:
+        """Return label, value and unit of what a reader asks for first."""
+        a, out = self.agreement, []
+        out += [("sample found at x, y", f"{a.shift[0]:.1f}, {a.shift[1]:.1f}", "um from where the scene has it")]
+        out += [("height by nearfield, data normalised so", f"{self.height:.1f}", "um")]
+        for k, name in enumerate(a.detectors):
+            text = f"{a.chi2[k]:.2f} ({a.chi2_unflagged[k]:.2f} unflagged)"
+            out.append((f"{name}: chi-square per pixel", text, f"gain {a.gain[k]:.4g}, offset {a.offset[k]:.5g}"))
+        for row in self.effects:
+            if row.note:
+                out.append((row.name, "-", row.note))
+                continue
+            text = f"chi2/pixel {row.chi2:.2f}, BIC {row.d_bic:+.0f}"
+            out.append((row.name, text, f"height {row.height:.1f} um ({row.height - self.height:+.1f})"))
+        return out
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write comparison.json and comparison.png, and effects.png if there are any; return their paths."""
+        folder.mkdir(parents=True, exist_ok=True)
+        out = [folder / "comparison.json", folder / "comparison.png"]
+        with atomic_path(out[0]) as part:
+            part.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
+        save_agreement(self.stack, self.agreement, self.contrast, out[1])
+        if self.effects:
+            out.append(folder / "effects.png")
+            save_effects([(row.name, row.d_bic, row.height) for row in self.effects], self.height, out[2])
+        return out
+
+
+def _raster(stack: MicrographStack, scene: SceneFile, shift: tuple[float, float]) -> dict[str, Any]:
+    """Return the settings that make the scene's raster the stack's, the sample moved by `shift` [um]."""
+    steps = pitch(stack.x), pitch(stack.y)
+    stretch = 1.0 / math.cos(math.radians(scene.beam.incidence_deg))
+    along = 0 if scene.beam.azimuth_deg % 180.0 == 0.0 else 1
+    across = steps[1 - along]
+    for how, factor in (("sample", 1.0), ("beam", stretch)):
+        if abs(steps[along] - factor * across) < 1e-6 * across:
+            middle = float(stack.x.mean()) - shift[0], float(stack.y.mean()) - shift[1]
+            values = {"nx": stack.x.size, "ny": stack.y.size, "pixel_size_um": across, "pitch": how}
+            return {f"scan.{key}": value for key, value in (values | {"center_um": list(middle)}).items()}
+    raise SceneError(
+        f"{stack.name}: its raster has steps of {steps[0]:g} um in x and {steps[1]:g} um in y; a scene's are equal on "
+        "the sample or across the beam: compare a scan with such a raster"
+    )
+
+
+def _images(path: Path, changes: Mapping[str, Any]) -> Images:
+    """Simulate a scene with some settings changed."""
+    scene = load_scene(path, dict(changes))
+    found = pipeline.simulate(scene, maps=False)
+    if isinstance(found, MicrographSet):
+        found = found.only(SceneError)
+    assert found.by_order is not None and found.variance is not None and found.n_rays is not None  # simulated
+    single, multiple = found.by_order[0] / found.n_rays, found.by_order[1:].sum(0) / found.n_rays
+    unmasked = pipeline.unmasked_signal(scene, found)
+    return Images(found.instrument, single, multiple, unmasked, found.variance / found.n_rays**2)
+
+
+def _height(stack: MicrographStack, fit: Agreement, images: Images, lacking: np.ndarray, scene: SceneFile) -> float:
+    """Return the height that `nearfield` finds in the data, normalised, without what an effect adds to them [um]."""
+    gain = fit.gain[:, None, None]
+    signal = (stack.counts - fit.model) / gain + images.total - lacking
+    variance = None if stack.variance is None else stack.variance / gain**2
+    clean = stack.replace(
+        counts=signal, variance=variance, background=None, n_rays=1.0, unit="detected per beam atom",
+        instrument=images.instrument,
+    )  # fmt: skip
+    rec = pipeline.reconstruct(clean, "nearfield", settings=scene.reconstruct)
+    level = float(np.median(rec.height))
+    return float(rec.height.ravel()[np.argmax(np.abs(rec.height - level))] - level)
+
+
+def compare(
+    stack: MicrographStack | MicrographSet,
+    scene_path: str | Path,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    explain: bool = False,
+    progress: Progress = lambda text: None,
+) -> Comparison:
+    """Simulate a scene in the instrument that measured, and say how far both agree.
+
+    Args:
+        stack: measured micrographs, one scan, with their variance.
+        scene_path: the sample (a shape, a CAD mesh, a reconstruction) in its instrument; the raster is the stack's.
+        overrides: settings that win over the scene, dotted keys.
+        explain: add one effect at a time, and tabulate what it does.
+        progress: called with what is done next.
+
+    Raises:
+        SceneError: another number of detectors, or a raster that a scene cannot have.
+        GuardError: a detector does not show the simulated contrast.
+    """
+    data, path = stack.only() if isinstance(stack, MicrographSet) else stack, Path(scene_path)
+    given = dict(overrides or {})
+    scene = load_scene(path, given)
+    if scene.detector_names != data.instrument.detector_names:
+        raise SceneError(
+            f"{path}: its detectors {list(scene.detector_names)} are not those of the measured stack, "
+            f"{list(data.instrument.detector_names)}: import the scan with this scene as its --instrument"
+        )
+    progress("simulating the scene, looking for the sample")
+    shift = (0.0, 0.0)
+    for reach in (REACH, 0.0):  # moved by interpolation first, then simulated there
+        images = _images(path, given | _raster(data, scene, shift))
+        found = find_shift(data, images.total, reach=reach)
+        shift = shift[0] + found[0], shift[1] + found[1]
+    here = given | _raster(data, scene, shift)
+    images = _images(path, here)
+    agreement = normalise(data, images.total, own_variance=images.variance, shift=shift)
+    contrast = contrast_by_cause(images.unmasked, images.single, images.multiple)
+    height = _height(data, agreement, images, 0.0 * images.total, scene)
+    out = Comparison(data, images, agreement, contrast, height)
+    return replace(out, effects=_explained(out, path, here, progress)) if explain else out
+
+
+def _explained(usual: Comparison, path: Path, here: Mapping[str, Any], progress: Progress) -> tuple[Row, ...]:
+    """Return a row for every effect, one at a time."""
+    scene, data = load_scene(path, dict(here)), usual.stack
+    rows = [_row("the usual model: offset, drift, slope", usual, usual.agreement, usual.height)]
+    for effect in EFFECTS:
+        progress(effect.name)
+        changes = effect.changes(scene)
+        if changes is None:
+            rows.append(Row(effect.name, note="does not apply to this scene"))
+            continue
+        try:
+            images = _images(path, {**here, **changes}) if changes else usual.images
+            total = effect.total(images)
+            terms = replace(effect.terms, lag=_best_lag(data, total)) if effect.name.startswith(LAG) else effect.terms
+            fit = normalise(data, total, terms, own_variance=images.variance)
+            lacking = 0.0 * total if effect.is_geometry else total - usual.images.total
+            height = _height(data, fit, replace(images, single=total, multiple=0.0 * total), lacking, scene)
+        except HelioError as e:
+            rows.append(Row(effect.name, note=str(e)))
+            continue
+        said = f"{effect.name}: {terms.lag:.2f} pixels" if terms.lag else effect.name
+        rows.append(_row(said, usual, fit, height))
+    return tuple(rows)
+
+
+def _row(name: str, usual: Comparison, fit: Agreement, height: float) -> Row:
+    total, before = (float(np.nansum(a.residuals**2)) for a in (fit, usual.agreement))
+    return Row(name, float(np.mean(fit.chi2)), total - before, fit.bic - usual.agreement.bic, height)
+
+
+def _best_lag(data: MicrographStack, probability: np.ndarray) -> float:
+    """Return the response time that explains the data best [pixels]."""
+
+    def misfit(lag: float) -> float:
+        return float(np.nansum(normalise(data, probability, Terms(lag=lag)).residuals ** 2))
+
+    return float(minimize_scalar(misfit, bounds=(0.0, MAX_LAG), method="bounded", options={"xatol": 0.02}).x)

@@ -1,0 +1,123 @@
+"""Write micrographs for users of other programs; the kind of file follows from its suffix.
+
+`.mat`: the reference simulator's layout (`im.single`, `im.multiple`, `param`, `beam_param`), which `helio import` reads
+back: counts to the bit, positions to rounding. Its frame is told in matlab_reference.py. Not written: rotations of
+apertures (the layout has no place for them) and `detector_vector` (what its users took for constant directions).
+"""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.errors import SceneError
+from helio_jax.formats.safe import atomic_path
+from helio_jax.micrograph import MicrographSet, MicrographStack
+
+_SOURCES = {"uniform": "Uniform", "gaussian": "Gaussian", "pencil": "Infinite"}
+
+
+def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> None:
+    """Write an object to a foreign file.
+
+    Args:
+        obj: what `read` gave.
+        path: its suffix says which kind.
+        view: which stack of a set, from 0; needed where there are several.
+
+    Raises:
+        SceneError: nothing of this kind can be written, or not from this object; the message says what can.
+    """
+    if isinstance(obj, MicrographSet):
+        n = len(obj.stacks)
+        if (view is None and n > 1) or not 0 <= (view or 0) < n:
+            raise SceneError(f"{path}: holds one scan, the set has {n}: choose --view 0 to {n - 1}, got {view}")
+        obj = obj.stacks[view or 0]
+    kind = Path(path).suffix.lower()
+    if kind != ".mat" or not isinstance(obj, MicrographStack):
+        raise SceneError(
+            f"{path}: a {type(obj).__name__} cannot be written as {kind or 'a file without suffix'!r}: there is .mat "
+            "for micrographs (the reference simulator's layout)"
+        )
+    tree = reference_tree(obj, str(path))
+    from scipy.io import savemat
+
+    with atomic_path(path) as part:
+        savemat(part, tree, do_compression=True)
+
+
+def reference_tree(stack: MicrographStack, path: str = "") -> dict[str, dict[str, Any]]:
+    """Return a stack as the variables of the reference simulator's file.
+
+    Args:
+        stack: simulated, with scattering orders that add up to the counts, on a raster.
+        path: for messages.
+
+    Raises:
+        SceneError: the layout cannot hold this stack.
+    """
+    _check(stack, path)
+    instrument, beam = stack.instrument, stack.instrument.beam
+    t = math.radians(beam.incidence_deg)
+    orders = {"single": stack.by_order[0], "multiple": stack.multiple}  # type: ignore[index]
+    im: dict[str, Any] = {name: _cells(_compact(image[:, :, ::-1])) for name, image in orders.items()}  # type: ignore[index]
+    im["raster_movement_x"] = pitch(stack.x) * math.cos(t) / 1000
+    im["raster_movement_y"] = pitch(stack.y) / 1000
+    im["helio_center_um"] = np.array([0.5 * (a[0] + a[-1]) for a in (stack.x, stack.y)])
+    apertures = instrument.apertures()
+    param = {
+        "detector_position": _cells([np.array([a.center[0], 0.0 - a.center[1]]) / 1000 for a in apertures]),
+        "detector_axes": _cells([2 * np.array(a.semi_axes) / 1000 for a in apertures]),
+        "z_sample_to_detector": instrument.sample_distance / 1000,
+        "rays_per_pixel": stack.n_rays,
+    }
+    beam_param = {
+        "init_angle": beam.incidence_deg,
+        "source_size": beam.source_size_mrad / 1000,
+        "source_model": _SOURCES[beam.source],
+        "pinhole_r": beam.pinhole_radius_um / 1000,
+        "pinhole_c": np.array([round(-instrument.working_distance * math.tan(t) / 1000, 8), 0.0, 0.0]),
+    }
+    return {"im": im, "param": param, "beam_param": beam_param}
+
+
+def _check(stack: MicrographStack, path: str) -> None:
+    """Check that the reference simulator's layout can hold a stack."""
+    n, ny, nx = stack.shape
+    if stack.by_order is None or len(stack.by_order) < 2 or stack.n_rays is None:
+        raise SceneError(
+            f"{path}: this layout holds single and multiple scattering apart, which {stack.name!r} does not"
+        )
+    if stack.noise != "expected" and not np.array_equal(stack.by_order.sum(0), stack.counts):
+        raise SceneError(
+            f"{path}: the scattering orders of {stack.name!r} are expectations, its counts have noise: export it "
+            "without noise, or trace with --estimator analog"
+        )
+    if stack.instrument.beam.azimuth_deg != 0.0:
+        raise SceneError(
+            f"{path}: in this layout the beam travels along x, here beam.azimuth_deg is "
+            f"{stack.instrument.beam.azimuth_deg:g}: turn the scene"
+        )
+    if stack.positions is not None or n < 2 or min(ny, nx) < 2:
+        raise SceneError(
+            f"{path}: this layout holds rasters of at least 2 x 2 pixels and 2 detectors, got {nx} x {ny} and {n}"
+        )
+
+
+def _compact(images: np.ndarray) -> list[np.ndarray]:
+    """Return images [detector, y, x] one by one: as small whole numbers where they are whole."""
+    if np.array_equal(images, np.round(images)) and images.min() >= 0 and images.max() < 2**32:
+        kind = next(k for k in (np.uint8, np.uint16, np.uint32) if images.max() <= np.iinfo(k).max)
+        return list(images.astype(kind))
+    return list(images)
+
+
+def _cells(items: list[np.ndarray]) -> np.ndarray:
+    """Return a MATLAB cell array (one row)."""
+    cells = np.empty((1, len(items)), dtype=object)
+    for i, item in enumerate(items):
+        cells[0, i] = item
+    return cells
