@@ -17,6 +17,7 @@ from stats import assert_mean
 from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.instrument import Beam, Detector, Effusive, Instrument, Plate
+from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.rays import read_rays
 from helio_jax.scene.shapes import FlatSample
 from helio_jax.trace.direct import form_factors
@@ -92,6 +93,13 @@ rays = 64
     return str(path)
 
 
+def stack_of(scene) -> MicrographStack:
+    """Trace a scene of one view."""
+    stack = trace_scene(scene, scene.trace)
+    assert isinstance(stack, MicrographStack)
+    return stack
+
+
 @pytest.mark.parametrize("estimator", ["expected", "analog"])
 def test_effuse_is_counted_apart(tmp_path, estimator):
     """`counts` and the book-keeping of the beam stay to the bit, `effuse` is added, in numbers of its own.
@@ -103,8 +111,9 @@ def test_effuse_is_counted_apart(tmp_path, estimator):
     beam = "effusive = {atoms_per_pixel = 50000.0, rays = 3000}"
     with_effusive = load_scene(scene_file(tmp_path, beam, plate), over)
     without = load_scene(scene_file(tmp_path, "", plate), over)
-    a, b = (trace_scene(s, s.trace) for s in (with_effusive, without))
-    assert np.array_equal(a.counts, b.counts) and np.array_equal(a.plate, b.plate) and b.effuse is None
+    a, b = stack_of(with_effusive), stack_of(without)
+    assert a.plate is not None and b.plate is not None and a.effuse is not None and b.effuse is None
+    assert np.array_equal(a.counts, b.counts) and np.array_equal(a.plate, b.plate)
     assert a.provenance["rays"] == b.provenance["rays"]
     rays = a.provenance["effusive_rays"]
     assert rays["launched"] == 6 * 3000 * (8 if estimator == "expected" else 1)
@@ -152,7 +161,7 @@ def test_scene_with_rays(tmp_path):
     stacks = []
     for name in ("rays.csv", "rays.npz"):
         scene = load_scene(scene_file(tmp_path, f'source = "rays"\nfile = "{name}"'), {"trace.maps": False})
-        stacks.append(trace_scene(scene, scene.trace))
+        stacks.append(stack_of(scene))
     np.testing.assert_allclose(stacks[0].counts, stacks[1].counts, rtol=1e-12)
     for beam, told in (('source = "rays"', "needs a file"), ('file = "rays.csv"', "only source = 'rays' reads it")):
         with pytest.raises(SceneError, match=told):
