@@ -67,8 +67,8 @@ def make_predictor(
     """
     if multiple == "radiosity" and stack.instrument.plate.is_scattering:
         raise SceneError(
-            "reconstruct.refine.multiple = 'radiosity': it does not know the atoms that the scattering plate sends "
-            "back: set it to 'traced'"
+            "reconstruct.refine.multiple = 'radiosity': it knows nothing of what a scattering plate sends back: "
+            "set it to 'traced'"
         )
     instrument = stack.instrument.with_cosine_plate()
     geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)

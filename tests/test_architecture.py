@@ -36,7 +36,7 @@ DOORS = {
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {"evaluate/figures.py", "evaluate/agreement_figure.py", "evaluate/sweep.py", "evaluate/spot.py"},
+    "matplotlib": {f"evaluate/{name}.py" for name in ("figures", "agreement_figure", "spot", "sweep")},
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},
     "lineax": {"reconstruct/refiner.py"},

@@ -24,7 +24,7 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
 from helio_jax.scene.views import View
-from helio_jax.trace.run import paths_of
+from helio_jax.trace.run import effusive_settings, paths_of
 from helio_jax.trace.settings import TraceSettings
 
 MAX_PIXELS = 65536
@@ -108,6 +108,8 @@ class Job:
         """Return the units of the scan, none across two views; they depend on the job alone, not on who runs them."""
         n_rays, n_branches = paths_of(self.settings)
         n_paths = (self.settings.max_rays if self.settings.has_target else n_rays) * n_branches
+        if effusive := self.scene.beam.effusive:
+            n_paths += math.prod(paths_of(effusive_settings(self.settings, effusive)))
         size = min(max(1, self.settings.paths_per_unit // n_paths), MAX_PIXELS)
         n = self.n_view_pixels
         runs = [

@@ -171,8 +171,8 @@ def _trace(experiment: Experiment, job: Job, start: int, stop: int) -> Estimate:
 
 
 def _trace_effusive(experiment: Experiment, job: Job, start: int, stop: int) -> _Effuse:
-    """Trace the effusive beam of a block of pixels."""
-    return _Effuse(_trace(experiment, job, start, stop))
+    """Trace the effusive beam of a block of pixels, whatever error is wanted of the beam's counts."""
+    return _Effuse(trace_block(experiment, *job.pixels(start, stop)).estimate())
 
 
 def _maps(experiment: Experiment, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

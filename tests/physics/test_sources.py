@@ -6,6 +6,8 @@ cosine flat hands it on by K_1, so a hole of area A in the source's plane, R asi
 A / (2 pi) integral over q of q J_0(q R) K_n(q) K_1(q) (own derivation).
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -15,6 +17,7 @@ from stats import assert_mean
 from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.instrument import Beam, Detector, Effusive, Instrument, Plate
+from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.rays import read_rays
 from helio_jax.scene.shapes import FlatSample
 from helio_jax.trace.direct import form_factors
@@ -51,6 +54,7 @@ def test_effusive_flat(exponent):
     here, settings = np.full(8, middle), TraceSettings(rays=64, branches=1, seed=3)
     body = FlatSample(size_um=4e5).build()
     both = make_experiment(body, instrument(**tilted).model_copy(update={"detector": (hole,)}), settings)
+    assert both.effusive is not None and both.effusive.sampling.seed != both.sampling.seed
     found = trace_pixels(both.effusive, here, 0.0 * here)
     mean, std = found.total_mean.mean(), np.sqrt(found.total_variance.sum()) / here.size
     assert_mean(mean, exact, max(std, 1e-3 * exact), f"effusive beam of cos^{exponent:g}")
@@ -89,6 +93,13 @@ rays = 64
     return str(path)
 
 
+def stack_of(scene) -> MicrographStack:
+    """Trace a scene of one view."""
+    stack = trace_scene(scene, scene.trace)
+    assert isinstance(stack, MicrographStack)
+    return stack
+
+
 @pytest.mark.parametrize("estimator", ["expected", "analog"])
 def test_effuse_is_counted_apart(tmp_path, estimator):
     """`counts` and the book-keeping of the beam stay to the bit, `effuse` is added, in numbers of its own.
@@ -100,8 +111,9 @@ def test_effuse_is_counted_apart(tmp_path, estimator):
     beam = "effusive = {atoms_per_pixel = 50000.0, rays = 3000}"
     with_effusive = load_scene(scene_file(tmp_path, beam, plate), over)
     without = load_scene(scene_file(tmp_path, "", plate), over)
-    a, b = (trace_scene(s, s.trace) for s in (with_effusive, without))
-    assert np.array_equal(a.counts, b.counts) and np.array_equal(a.plate, b.plate) and b.effuse is None
+    a, b = stack_of(with_effusive), stack_of(without)
+    assert a.plate is not None and b.plate is not None and a.effuse is not None and b.effuse is None
+    assert np.array_equal(a.counts, b.counts) and np.array_equal(a.plate, b.plate)
     assert a.provenance["rays"] == b.provenance["rays"]
     rays = a.provenance["effusive_rays"]
     assert rays["launched"] == 6 * 3000 * (8 if estimator == "expected" else 1)
@@ -149,7 +161,7 @@ def test_scene_with_rays(tmp_path):
     stacks = []
     for name in ("rays.csv", "rays.npz"):
         scene = load_scene(scene_file(tmp_path, f'source = "rays"\nfile = "{name}"'), {"trace.maps": False})
-        stacks.append(trace_scene(scene, scene.trace))
+        stacks.append(stack_of(scene))
     np.testing.assert_allclose(stacks[0].counts, stacks[1].counts, rtol=1e-12)
     for beam, told in (('source = "rays"', "needs a file"), ('file = "rays.csv"', "only source = 'rays' reads it")):
         with pytest.raises(SceneError, match=told):
@@ -206,3 +218,19 @@ def test_footprint_widths(azimuth):
             assert abs(found["center_along_um"]) < 0.02 and abs(found["center_across_um"]) < 0.02
     round_spot = measure_spot(np.random.default_rng(1).normal(size=(200_000, 2)))
     assert round_spot["diameter_50_um"] == pytest.approx(2.0 * np.sqrt(2.0 * np.log(2.0)), rel=0.01)
+
+
+def test_draw_spot(tmp_path):
+    """The spot of scenes/nano.toml is 0.3 um wide (FWHM across) where its header says; a picture comes, and refusals.
+
+    Catches: a header that does not hold, heights from the plate downwards, no figure.
+    """
+    from helio_jax.spot import draw_spot
+
+    scene = load_scene(Path(__file__).parents[2] / "scenes" / "nano.toml")
+    low, high = draw_spot(scene, [0.0, 72.0], tmp_path / "spot.png")
+    assert high["gaussian_fwhm_across_um"] == pytest.approx(0.3, rel=0.01)
+    assert low["gaussian_fwhm_across_um"] > 1.1 * high["gaussian_fwhm_across_um"]
+    assert (tmp_path / "spot.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(SceneError, match="472 um above the reference plane, got 472 um"):
+        draw_spot(scene, [472.0], None)
