@@ -27,6 +27,7 @@ from helio_jax.reconstruct.integrate import integrate_slopes  # noqa: E402
 from helio_jax.reconstruct.linear import signal_of, solve_linear  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
+from helio_jax.truth import load_truth, true_height  # noqa: E402
 
 
 def micrograph_rows(scene, stack, seed: int) -> list[Row]:
@@ -86,7 +87,7 @@ def _without_plane(rec, truth: Truth, radius_um: float = 1450.0):
 def linear_rows(scene, stack) -> list[Row]:
     """Row 8: the paper's linear method, with Phi at the flat, the file's own directions, and not in the beam frame."""
     base = pipeline.reconstruct(stack, "linear", integrator="dct_poisson")
-    truth = pipeline.true_height(scene, base)
+    truth = true_height(scene, base)
     signal, variance = signal_of(stack)
     own = stack.provenance["metadata"]["param"]["detector_vector"]
     vectors = np.array([[-v[0], -v[1], v[2]] for v in own])  # their x reversed; y as in DATA.md
@@ -136,7 +137,7 @@ def height_rows(scene, stack, numbers=("9", "10")) -> list[Row]:
         start = time.perf_counter()
         rec = pipeline.reconstruct(stack, method)
         seconds = time.perf_counter() - start
-        s = pipeline.evaluate(rec, pipeline.true_height(scene, rec))
+        s = pipeline.evaluate(rec, true_height(scene, rec))
         rms, height = float(s.rms_region or np.inf), float(s.recovered_height or 0.0)
         reached = rms <= limit and rms < last and (method == "refine" or 0.90 <= height <= 1.03)
         text = f"RMS {s.rms_region:.2%}, height {s.recovered_height:.4f}, {seconds:.0f} s"
@@ -165,7 +166,7 @@ def measured_rows(shared: Path) -> list[Row]:
     cases = (("linear", "dct_poisson"), ("linear", "weighted"), ("nearfield", "weighted"), ("refine", "weighted"))
     for method, integrator in cases:
         rec = pipeline.reconstruct(stack, method, settings=scene.reconstruct, integrator=integrator)
-        s = pipeline.evaluate(rec, pipeline.load_truth(path, rec, fit_center=True))
+        s = pipeline.evaluate(rec, load_truth(path, rec, fit_center=True))
         rms = float(s.rms_region or np.inf)
         constant = rms if constant is None else constant
         reached = None if method == "linear" else rms < constant

@@ -34,6 +34,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
 from helio_jax.reconstruct.model import Prediction  # noqa: E402
 from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
 from helio_jax.reconstruct.solve import reconstruct_stack  # noqa: E402
+from helio_jax.truth import true_height  # noqa: E402
 
 Case = dict[str, Any]
 SCENES = ROOT / "scenes"
@@ -73,7 +74,7 @@ class Record:
 
 def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case:
     """Return the numbers of row 1: errors over H (DATA.md), level taken on the flat."""
-    truth = pipeline.true_height(scene, rec)
+    truth = true_height(scene, rec)
     s = pipeline.evaluate(rec, truth)
     tx, ty = stack.instrument.beam_shift
     grid_x, grid_y = np.meshgrid(stack.x, stack.y)
@@ -223,7 +224,7 @@ def step_row(record: Record, seed: int) -> None:
     def step() -> Case:
         scene, stack = own("step", seed)
         rec = pipeline.reconstruct(stack, border="free", refine={"albedo_std": 0.05, "substrate_um": 6000.0})
-        true = pipeline.true_height(scene, rec).height
+        true = true_height(scene, rec).height
         up = true > 50.0
         value, std = rec.spread(lambda h: float(np.median(h[up]) - np.median(h[~up])))
         return {"step_um": value, "std_um": std, "true_um": 100.0, "flagged": float(np.mean(rec.reason == 5))}
@@ -250,7 +251,7 @@ def trench_row(record: Record, seed: int) -> None:
             overrides |= {"scan.nx": nx, "scan.ny": ny, "scan.center_um": [3.0, 4.0]}
             scene, stack = own("trench", seed, **overrides)
             rec, seconds = changed(scene, stack, change, substrate_um=6000.0)
-            true = pipeline.true_height(scene, rec).height
+            true = true_height(scene, rec).height
             floor, inside = true < -0.9 * depth, true < -0.05 * depth
             assert rec.height_std is not None
             wrong = rec.is_valid & (np.abs(rec.height - true) > 3.0 * rec.height_std + 0.05 * depth)

@@ -42,7 +42,7 @@ _HOME = {
     "load_instrument": "config",
     "simulate": "pipeline",
     "reconstruct": "pipeline",
-    "true_height": "pipeline",
+    "true_height": "truth",
     "evaluate": "pipeline",
     "run": "pipeline",
     "read": "formats.hdf5",

@@ -26,6 +26,7 @@ from helio_jax.evaluate.agreement_figure import save_agreement, save_effects
 from helio_jax.formats.safe import atomic_path
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.truth import true_surface
 
 TOP = 0.99
 """Quantile of the scene's heights from which on pixels are its top."""
@@ -139,7 +140,7 @@ def _images(path: Path, changes: Mapping[str, Any]) -> Images:
         found = found.only(SceneError)
     assert found.by_order is not None and found.variance is not None and found.n_rays is not None  # simulated
     single, multiple = found.by_order[0] / found.n_rays, found.by_order[1:].sum(0) / found.n_rays
-    truth = pipeline.true_surface(scene, found.x, found.y)
+    truth = true_surface(scene, found.x, found.y)
     assert truth.normals is not None  # of a scene
     phi = SpotGeometry(found.instrument).form_factor(truth.height)
     unmasked = np.maximum(np.einsum("kiyx,yxi->kyx", phi, truth.normals), 0.0)

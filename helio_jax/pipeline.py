@@ -1,9 +1,6 @@
 """The main job: the only module that joins the stages. Everything here is also public as `helio_jax.NAME`."""
 
 import json
-import math
-import os
-import platform
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -17,36 +14,28 @@ from helio_jax.checkpoint import Keeper, Shard
 from helio_jax.config import SceneFile, load_scene
 from helio_jax.errors import InputFileError, ResumeError, SceneError
 from helio_jax.evaluate.figures import panel, save_figure
-from helio_jax.evaluate.metrics import Region, Scores, Truth, evaluate_height
-from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
+from helio_jax.evaluate.metrics import Scores, Truth, evaluate_height
 from helio_jax.evaluate.report import write_report
-from helio_jax.formats.hdf5 import read, write
+from helio_jax.formats.hdf5 import write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.safe import atomic_path
-from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
-from helio_jax.provenance import package_version, with_provenance
+from helio_jax.provenance import with_provenance
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
-from helio_jax.scene.shapes import SpheresSample
-from helio_jax.scene.surfaces import first_hit_spheres, flat_body
-from helio_jax.trace.intersect import MISS, Intersector
-from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.scan import Crew, trace_scene
-from helio_jax.trace.settings import TraceSettings
+from helio_jax.truth import true_height
 
 DEFAULT_CREW = Crew()
 """Threads of this process, one per CPU."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
-SUBSTRATE_RATIO = 1.35
-"""Where a scene does not say: the substrate begins at this many radii of the scored region."""
 
 
 def _silent(label: str) -> Any:
@@ -239,77 +228,6 @@ def reconstruct(
     return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
 
 
-def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
-    """Return the true first hit of the beam axis for every pixel of a reconstruction's raster.
-
-    Raises:
-        SceneError: the beam misses the sample in some pixel.
-    """
-    return true_surface(scene, rec.raster_x, rec.raster_y)
-
-
-def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray) -> Truth:
-    """Return the same for the beam positions x [x] and y [y], um."""
-    grid_x, grid_y = np.meshgrid(x, y)
-    hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
-    n_missed = int(np.sum(hits.surface == MISS))
-    if n_missed:
-        raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or shrink the scan")
-    height = hits.point[:, 2].reshape(grid_x.shape)
-    return Truth(height, hits.normal.reshape(*grid_x.shape, 3), _region(scene, float(height.max())))
-
-
-def _region(scene: SceneFile, top: float) -> Region | None:
-    """Return the scored region of a scene's table [truth], or None where it names none."""
-    t = scene.truth
-    if t.region_radius_um is None:
-        return None
-    return Region(
-        center=t.region_center_um,
-        radius=t.region_radius_um,
-        substrate_radius=t.substrate_radius_um or SUBSTRATE_RATIO * t.region_radius_um,
-        height=t.height_um or top,
-    )
-
-
-def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = False) -> Truth:
-    """Return the truth of a scene file, or of another reconstruction on the same raster.
-
-    Args:
-        path: scene (.toml) or height map (.h5).
-        rec: what will be scored.
-        fit_center: for a scene of one sphere: fit its position first, as for measured data (DATA.md).
-
-    Raises:
-        SceneError: `fit_center` without a scene of one sphere and a scored region.
-    """
-    if Path(path).suffix == ".h5":
-        other = read(path)
-        if not isinstance(other, Reconstruction):
-            raise SceneError(f"{path}: the truth must be a scene or a height map, got {type(other).__name__}")
-        return Truth(other.height, other.normals)
-    scene = load_scene(path)
-    return _fitted_truth(path, scene, rec) if fit_center else true_height(scene, rec)
-
-
-def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
-    """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
-    sample, region = scene.sample, _region(scene, 0.0)
-    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or sample.is_placed or region is None:
-        raise SceneError(
-            f"{path}: fitting a centre needs a scene with one sphere, which sample.scale, rotate_deg and translate_um "
-            "leave where it is, and truth.region_radius_um"
-        )
-    grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
-    (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift
-
-    def sphere_at(x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-        return first_hit_spheres(grid_x, grid_y, np.array([[x, y, z, radius]]), shift)
-
-    found = fit_sphere_center(rec, lambda x, y: sphere_at(x, y)[0], region)
-    return Truth(*sphere_at(*found.center), found)
-
-
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
     """Score a reconstruction against the true heights of the same rays (DATA.md, "How we score spheres")."""
     return evaluate_height(rec, truth)
@@ -413,23 +331,3 @@ def run(
             title = f"{scene.name}: simulated, reconstructed, scored"
             files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)
-
-
-def diagnose() -> dict[str, Any]:
-    """Return versions and the outcome of a small trace, for `helio doctor`; `ok` says whether all is well."""
-    import jax
-
-    names = ("helio-jax", "numpy", "scipy", "numba", "embreex", "jax", "optimistix", "trimesh", "h5py", "plotly")
-    found: dict[str, Any] = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
-    found |= {name: package_version(name) for name in names}
-    found |= {"cpus": os.cpu_count(), "jax devices": ", ".join(str(d) for d in jax.devices())}
-    intersector = Intersector(flat_body(2000.0))
-    found["ray engine"] = "embree" if intersector.has_embree else "exhaustive (slow: embreex is not installed)"
-    detector = Detector(name="test", polar_deg=45.0, half_angle_deg=10.0)
-    instrument = Instrument(plate=Plate(working_distance_um=4000.0), detector=(detector,))
-    experiment = make_experiment(flat_body(2000.0), instrument, TraceSettings(rays=8, n_orders=1))
-    traced = float(trace_pixels(experiment, np.zeros(1), np.zeros(1)).total()[0][0, 0])
-    exact = math.sin(math.radians(10.0)) ** 2 * math.cos(math.radians(45.0))
-    found["small trace"] = f"P = {traced:.9f}, closed form {exact:.9f}"
-    found["ok"] = bool(abs(traced / exact - 1.0) < 1e-4)
-    return found

@@ -8,6 +8,7 @@ from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import GAIN, find_plateaus, joined, search_levels, unexplained
+from helio_jax.truth import true_height
 
 SHAPE = (40, 60)
 INSIDE = np.zeros(SHAPE, bool)
@@ -112,7 +113,7 @@ def test_a_trench_along_the_beam_has_its_depth():
     scene = load_scene("scenes/trench.toml", overrides)
     stack = pipeline.record(scene, pipeline.simulate(scene, seed=5))
     rec = pipeline.reconstruct(stack, "refine", refine={"rays": 200_000, "substrate_um": 6000.0, "max_rounds": 1})
-    true = pipeline.true_height(scene, rec).height
+    true = true_height(scene, rec).height
     floor = true < -230.0
     depth, std = rec.spread(lambda h: float(np.median(h[~floor]) - np.median(h[floor])))
     assert depth == pytest.approx(240.0, rel=0.07)

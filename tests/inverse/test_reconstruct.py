@@ -14,6 +14,7 @@ from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Prediction
+from helio_jax.truth import true_height
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 
@@ -124,7 +125,7 @@ def test_reference_sphere_by_rounds_of_physics(shared):
     score = {}
     for method, integrator in (("linear", "dct_poisson"), ("nearfield", "weighted"), ("refine", "weighted")):
         rec = pipeline.reconstruct(stack, method, integrator=integrator)
-        score[method] = pipeline.evaluate(rec, pipeline.true_height(scene, rec))
+        score[method] = pipeline.evaluate(rec, true_height(scene, rec))
     assert 0.82 <= score["linear"].recovered_height <= 0.88
     assert score["nearfield"].rms_region <= 0.06 and 0.90 <= score["nearfield"].recovered_height <= 1.03
     assert score["refine"].rms_region <= 0.025 and abs(score["refine"].recovered_height - 1) <= 0.025

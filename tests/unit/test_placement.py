@@ -7,9 +7,10 @@ from stats import assert_likely
 from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import write
-from helio_jax.pipeline import simulate, true_height
+from helio_jax.pipeline import simulate
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.surfaces import first_hit_spheres
+from helio_jax.truth import true_height
 
 SCENE = """
 [plate]

@@ -1,0 +1,91 @@
+"""Commands that tell: info, validate, schema, doctor, fetch-data, cite.
+
+Each parses, calls, prints; no logic of its own.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import AsJson, SceneArg, app
+
+
+@app.command()
+def info(file: Annotated[Path, typer.Argument(help="File written by helio (.h5).")], as_json: AsJson = False) -> None:
+    """Say what a file holds, where it came from and how it was made."""
+    from helio_jax.formats.hdf5 import describe
+
+    found = describe(file)
+    if as_json:
+        print(json.dumps(found))
+        return
+    print(f"{found['file']}: {found['kind']}, {found['bytes']:,} bytes, written {found['created']}")
+    for name, entry in found["entries"].items():
+        print(f"{name or 'entry'}:")
+        for place, field in entry["fields"].items():
+            shape = " x ".join(map(str, field.get("shape", ()))) or "scalar"
+            print(f"  {place:<24} {shape:<18} {field.get('unit', ''):<10} {field.get('long_name', '')}".rstrip())
+        for key in ("instrument", "provenance"):
+            print(f"  {key}: {json.dumps(entry.get(key))[:600]}")
+
+
+@app.command()
+def validate(scene: SceneArg) -> None:
+    """Check a scene file and its sample; list every error with place, value, limit and remedy."""
+    from helio_jax.config import load_scene
+    from helio_jax.scene.sample import check_body
+
+    loaded = load_scene(scene)
+    loaded.read_laws()
+    for key, value in check_body(loaded.build_body()).items():
+        print(f"  {key}: {value}")
+    for warning in loaded.warnings():
+        print(f"  warning: {warning}")
+    ny, nx = loaded.image_shape
+    views = f", {loaded.scan.n_views} views" if loaded.scan.n_views > 1 else ""
+    print(f"{scene}: ok ({nx} x {ny} pixels, {len(loaded.detector)} detectors{views})")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of scene files, for editors."""
+    from helio_jax.config import json_schema
+
+    print(json.dumps(json_schema(), indent=2))
+
+
+@app.command()
+def doctor(as_json: AsJson = False) -> None:
+    """Check this installation: versions, ray engine, JAX devices, and a small trace."""
+    from helio_jax.doctor import diagnose
+
+    found = diagnose()
+    if as_json:
+        print(json.dumps(found))
+    else:
+        for key, value in found.items():
+            print(f"  {key:<14} {value}")
+    if not found["ok"]:
+        raise typer.Exit(4)
+
+
+@app.command("fetch-data")
+def fetch_data(
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder (default: the user's cache).")] = None,
+) -> None:
+    """Download the paper's public micrographs (CC BY-SA), check their SHA-256 and say where they are."""
+    from helio_jax.formats.fetch import CITATION, fetch_pack
+
+    for path in fetch_pack(output):
+        print(path)
+    print(CITATION)
+
+
+@app.command()
+def cite() -> None:
+    """Print how to cite this program and the papers behind it."""
+    from helio_jax.evaluate.report import CITATION
+
+    print("\n".join(CITATION))

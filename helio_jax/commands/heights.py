@@ -1,0 +1,77 @@
+"""Commands about heights: reconstruct, evaluate, report.
+
+Each parses, calls, prints; no logic of its own.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import AsJson, Bar, Method, OutFile, app, given_options, print_table
+
+
+@app.command()
+def reconstruct(
+    stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
+    output: OutFile,
+    method: Method = None,
+    settings: Annotated[Path | None, typer.Option(help="Scene file whose table [reconstruct] is used.")] = None,
+    border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
+) -> None:
+    """Turn three or more micrographs into a height map."""
+    from helio_jax import pipeline, read, write
+    from helio_jax.config import load_scene
+
+    given = load_scene(settings).reconstruct if settings else None
+    with Bar("reconstructing") as bar:
+        result = pipeline.reconstruct(read(stack), method, settings=given, report=bar, **given_options(border=border))
+    write(result, output)
+    print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
+    for name, factor in result.provenance.get("sensitivity", {}).items():
+        print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+    if result.status.startswith("interrupted"):
+        raise KeyboardInterrupt
+
+
+@app.command()
+def evaluate(
+    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
+    truth: Annotated[Path, typer.Option(help="Scene file, or a height map (.h5) on the same raster.")],
+    fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Score a height map against the true heights of the same rays."""
+    from helio_jax import pipeline, read
+    from helio_jax.truth import load_truth
+
+    rec = read(height)
+    found = load_truth(truth, rec, fit_center=fit_center)
+    scores = pipeline.evaluate(rec, found)
+    if as_json:
+        center = list(found.region.center) if found.region else None
+        print(json.dumps(scores.as_dict() | {"center_um": center}))
+        return
+    if found.region and fit_center:
+        print(f"  centre fitted at x = {found.region.center[0]:.1f} um, y = {found.region.center[1]:.1f} um")
+    print_table(scores.as_table())
+
+
+@app.command()
+def report(
+    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
+    output: OutFile,
+    stack: Annotated[Path | None, typer.Option(help="Its micrographs (.h5).")] = None,
+    truth: Annotated[Path | None, typer.Option(help="Scene file or height map to compare with.")] = None,
+    fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+) -> None:
+    """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
+    from helio_jax import pipeline, read
+    from helio_jax.truth import load_truth
+
+    rec = read(height)
+    known = load_truth(truth, rec, fit_center=fit_center) if truth else None
+    scores = pipeline.evaluate(rec, known) if known else None
+    panel = pipeline.write_report_files(output, read(stack) if stack else None, rec, known, scores, title=height.stem)
+    print(f"{output}\n{panel}")

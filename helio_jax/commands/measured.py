@@ -1,0 +1,70 @@
+"""Commands for files of other programs and measured scans: import, export, compare.
+
+Each parses, calls, prints; no logic of its own.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import AsJson, OutFile, Rays, SceneArg, app, given_options, print_table, say
+
+
+@app.command("import")
+def import_files(
+    files: Annotated[list[Path], typer.Argument(help="Micrographs (.mat of B-SHeM, A-SHeM, the reference simulator).")],
+    output: OutFile,
+    instrument: Annotated[Path | None, typer.Option(help="Instrument or scene file: what the file lacks.")] = None,
+) -> None:
+    """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
+    from helio_jax import MicrographSet, import_micrographs, write
+    from helio_jax.config import load_instrument
+
+    given = load_instrument(instrument) if instrument else None
+    stacks = tuple(import_micrographs(path, given) for path in files)
+    write(stacks[0] if len(stacks) == 1 else MicrographSet(stacks), output)
+    for stack in stacks:
+        print(f"{stack.name}: {stack.shape[0]} micrographs of {stack.shape[2]} x {stack.shape[1]} pixels, {stack.unit}")
+    print(f"written to {output}")
+
+
+@app.command()
+def export(
+    file: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mat (the reference's layout).")],
+    view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
+) -> None:
+    """Write micrographs in the layout of another program, by the suffix of the file."""
+    from helio_jax import read
+    from helio_jax.formats.export import export as write_foreign
+
+    write_foreign(read(file), output, view)
+    print(output)
+
+
+@app.command()
+def compare(
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5).")],
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("helio-out/comparison"),
+    explain: Annotated[bool, typer.Option(help="Add one effect at a time and tabulate what it does.")] = False,
+    rays: Rays = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
+    from helio_jax import read
+    from helio_jax.comparison import compare as compare_with_scene
+
+    found = compare_with_scene(
+        read(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
+    )
+    files = found.write(output)
+    if as_json:
+        print(json.dumps(found.as_dict() | {"files": list(map(str, files))}))
+        return
+    print(found.agreement.verdict())
+    print_table(found.as_table())
+    for path in files:
+        print(path)

@@ -1,0 +1,173 @@
+"""Commands that trace: run, simulate, rays, resume, study, spot.
+
+Each parses, calls, prints; no logic of its own.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import (
+    AsJson,
+    Bar,
+    Method,
+    OutFile,
+    Processes,
+    Rays,
+    Restart,
+    SceneArg,
+    Scheduler,
+    Seed,
+    Workers,
+    app,
+    given_options,
+    print_table,
+    say,
+)
+
+
+@app.command()
+def run(
+    scene: SceneArg,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder (default: helio-out/NAME).")] = None,
+    rays: Rays = None,
+    seed: Seed = None,
+    method: Method = None,
+    workers: Workers = None,
+    processes: Processes = False,
+    scheduler: Scheduler = None,
+    restart: Restart = False,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
+    from helio_jax.pipeline import Crew
+    from helio_jax.pipeline import run as run_scene
+
+    overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
+    crew = Crew(workers, processes, scheduler)
+    result = run_scene(scene, output, overrides=overrides, stage=Bar, crew=crew, restart=restart, say=say)
+    if as_json:
+        print(json.dumps(result.as_dict()))
+        return
+    print(f"\n{result.name}: {result.method}, {result.status}")
+    print_table(result.scores.as_table())
+    print("\nfiles:")
+    for label, path in result.files.items():
+        print(f"  {label:<12} {path}")
+    if result.status.startswith("interrupted"):
+        raise KeyboardInterrupt
+
+
+@app.command()
+def simulate(
+    scene: SceneArg,
+    output: OutFile,
+    rays: Rays = None,
+    seed: Seed = None,
+    workers: Workers = None,
+    estimator: Annotated[str | None, typer.Option(help="expected or analog.")] = None,
+    noise: Annotated[bool, typer.Option(help="Add the scene's counting noise and background.")] = False,
+    processes: Processes = False,
+    shard: Annotated[str | None, typer.Option(help="i/N: trace the i-th of N shares; the last one writes.")] = None,
+    scheduler: Scheduler = None,
+    restart: Restart = False,
+) -> None:
+    """Trace the micrographs of a scene and write them to an HDF5 file; if interrupted, give it again to go on."""
+    from helio_jax.pipeline import Crew, SimulateOptions, simulate_file
+
+    overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
+    with Bar("tracing") as bar:
+        options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, say)
+        stack = simulate_file(scene, output, overrides=overrides, options=options)
+    if stack is not None:
+        for one in getattr(stack, "stacks", (stack,)):
+            n, ny, nx = one.shape
+            view = f"{one.name}: " if one is not stack else ""
+            print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
+            for name, share in one.shares().items():
+                print(f"  {name}: {share:.2%} of the counts")
+
+
+@app.command()
+def rays(
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz).")],
+    pixel: Annotated[tuple[int, int] | None, typer.Option(help="Row and column, from 0 (default: all).")] = None,
+    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, to write too.")] = None,
+    view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
+    n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
+    seed: Seed = None,
+) -> None:
+    """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
+    from helio_jax.config import load_scene
+    from helio_jax.formats.columns import write_columns
+    from helio_jax.trace.follow import follow_scene
+    from helio_jax.trace.tally import FATES
+
+    loaded = load_scene(scene, given_options(**{"trace.rays": n, "trace.seed": seed}))
+    atoms = follow_scene(loaded, loaded.trace, pixel, view)
+    write_columns(output, atoms.columns())
+    if directions:
+        write_columns(directions, atoms.directions())
+    fates = ", ".join(f"{int((atoms.fate == i).sum())} {name}" for i, name in enumerate(FATES))
+    print(f"{output}: {atoms.fate.size} atoms: {fates}; mean order {atoms.order.mean():.3f}")
+
+
+@app.command()
+def resume(
+    path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study.")],
+) -> None:
+    """Go on with what was interrupted or killed; no unit that was finished is traced again."""
+    from helio_jax.pipeline import resume as resume_run
+
+    if (path / "study.json").is_file():
+        from helio_jax.study import resume_study
+
+        print(resume_study(path, say=say))
+        return
+    for file in resume_run(path, stage=Bar, say=say):
+        print(file)
+
+
+@app.command()
+def study(
+    file: Annotated[Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the points and their index.")],
+    go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
+    workers: Workers = None,
+    processes: Processes = False,
+    shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, beginning with the i-th.")] = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
+    from helio_jax.pipeline import Crew, SimulateOptions
+    from helio_jax.study import run_study
+
+    options = SimulateOptions(crew=Crew(workers, processes, scheduler), shard=shard, say=say)
+    print(run_study(file, output, resume=go_on, options=options))
+
+
+@app.command()
+def spot(
+    scene: SceneArg,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg).")] = None,
+    heights: Annotated[str, typer.Option(help="Heights above the reference plane [um], commas between.")] = "0",
+    as_json: AsJson = False,
+) -> None:
+    """Measure the beam's spot at one or more heights above the reference plane, and draw it."""
+    from helio_jax.config import load_scene
+    from helio_jax.errors import SceneError
+    from helio_jax.spot import draw_spot
+
+    try:
+        at = [float(text) for text in heights.split(",")]
+    except ValueError:
+        raise SceneError(f"--heights must be numbers with commas between them, got {heights!r}") from None
+    found = draw_spot(load_scene(scene), at, output)
+    if as_json:
+        print(json.dumps(found))
+        return
+    for row in found:
+        print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
