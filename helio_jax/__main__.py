@@ -189,6 +189,72 @@ def import_files(
     print(f"written to {output}")
 
 
+def _read_set(path: Path) -> Any:
+    """Read a file of one or several scans as a set."""
+    from helio_jax import MicrographSet, MicrographStack, read
+    from helio_jax.errors import InputFileError
+
+    found = read(path)
+    if isinstance(found, MicrographStack):
+        return MicrographSet((found,))
+    if not isinstance(found, MicrographSet):
+        raise InputFileError(f"{path}: must hold micrographs, got a {type(found).__name__}")
+    return found
+
+
+@app.command()
+def align(
+    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
+    output: OutFile,
+    points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um).")] = None,
+    auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
+    settings: Annotated[list[str], typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")] = [],
+    figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
+    from helio_jax import pipeline, write
+    from helio_jax.errors import SceneError
+
+    if auto == (points is not None):
+        raise SceneError("align needs either --points FILE.csv or --auto")
+    chosen = dict(item.partition("=")[::2] for item in settings)
+    stack, places = pipeline.align(_read_set(scans), points, **chosen)
+    write(stack, output)
+    if figure:
+        from helio_jax.evaluate.figures import save_figure
+        from helio_jax.evaluate.overlay import overlay_panel
+
+        save_figure(overlay_panel(stack, places), figure)
+    record = stack.provenance["align"]
+    if as_json:
+        print(json.dumps(record))
+        return
+    for scan in record["scans"]:
+        x, y = scan["shift_um"]
+        print(f"  {scan['name']}: turned by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um,", end=" ")
+        print(f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown")
+    if "points" in record:
+        found = record["points"]
+        print(f"  points: residual {found['residual_rms_um']:.1f} um, leave-one-out {found['left_out_rms_um']:.1f} um (rms)")
+    n = stack.is_observed.sum(0)
+    print(f"{output}: {stack.shape[0]} images on {stack.shape[2]} x {stack.shape[1]} pixels; {(n >= 3).mean():.0%} in 3+")
+
+
+@app.command()
+def pick(
+    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Control points (CSV); goes on with what is there.")],
+) -> None:
+    """Open a window to click the same points in all scans; every click is saved."""
+    from helio_jax.evaluate.pick import pick_points
+    from helio_jax.formats.points import read_points, write_points
+
+    before = read_points(output) if output.exists() else {}
+    picks = pick_points(_read_set(scans), before, lambda found: write_points(output, found))
+    print(f"{output}: {sum(map(len, picks.values()))} picks in {len(picks)} scans")
+
+
 @app.command()
 def reconstruct(
     stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],

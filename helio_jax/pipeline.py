@@ -22,12 +22,15 @@ from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
 from helio_jax.evaluate.report import write_report
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.formats.parts import Parts
+from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
+from helio_jax.prepare.align import AlignSettings, align_scans
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
+from helio_jax.prepare.points import fit_points
 from helio_jax.provenance import package_version, with_provenance
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
@@ -185,6 +188,20 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None)
     """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`)."""
     flat = SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
     return calibrate_on_border(stack, flat, settings or CalibrateSettings())
+
+
+def align(
+    scans: MicrographSet, points: str | Path | None = None, **changes: Any
+) -> tuple[MicrographStack, dict[str, tuple[float, float]]]:
+    """Align turned scans, by control points (a CSV file) or automatically; see `prepare.align`.
+
+    Returns:
+        One stack, and where the control points are in its frame [um] (empty without them).
+    """
+    picks = read_points(points) if points is not None else None
+    stack = align_scans(scans, picks, _changed(AlignSettings(), changes), str(points or ""))
+    places = {} if picks is None else fit_points(picks, tuple(s.name for s in scans.stacks)).places
+    return stack, places
 
 
 def reconstruct(
