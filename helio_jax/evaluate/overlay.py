@@ -1,4 +1,4 @@
-"""Pictures of an alignment: every scan in the common frame under the edges of all others, and how many saw each pixel.
+"""Pictures of an alignment and of facets: every scan in the common frame under the edges of all others, and where they are.
 
 Where a scan is in place, its own edges run along the lines. Uses `matplotlib.figure.Figure` only: no display.
 """
@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from helio_jax.arrays import pitch
 from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,4 +70,29 @@ def overlay_panel(stack: MicrographStack, places: Mapping[str, tuple[float, floa
     ax.set_xlabel("x (µm)", fontsize=8)
     ax.set_ylabel("y (µm)", fontsize=8)
     ax.tick_params(labelsize=7)
+    return figure
+
+
+def facet_map(rec: Reconstruction, labels: np.ndarray) -> "Figure":
+    """Draw the heights and, beside them, the facets with their numbers (labels [y, x], 0: none)."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2 * _INCH, _INCH), facecolor="white", layout="constrained")
+    half_x, half_y = 0.5 * pitch(rec.raster_x), 0.5 * pitch(rec.raster_y)
+    x, y = rec.raster_x, rec.raster_y
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    left, right = figure.subplots(1, 2)
+    known = np.ma.masked_array(rec.height, ~rec.is_valid)
+    shown = left.imshow(known, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
+    figure.colorbar(shown, ax=left, shrink=0.8, label="height (µm)")
+    colors = colormaps["tab20"].with_extremes(bad="#f2f2f2")
+    right.imshow(np.ma.masked_equal(labels % 20, 0), origin="lower", extent=extent, cmap=colors, vmin=0, vmax=19)
+    for number in range(1, int(labels.max()) + 1):
+        row, column = np.argwhere(labels == number).mean(0)
+        right.text(x[round(column)], y[round(row)], str(number), ha="center", va="center", fontsize=9)
+    for ax, title in ((left, "height"), (right, "facets")):
+        ax.set_title(title, fontsize=9, loc="left")
+        ax.set_xlabel("x (µm)", fontsize=8)
+        ax.tick_params(labelsize=7)
     return figure

@@ -5,7 +5,8 @@ model: while nothing is masked, a micrograph is a linear combination of three ot
 constant (I = rho n . Phi + background, three unknowns per pixel). Its coefficients are fitted, robustly, so that neither
 gains, backgrounds nor apertures need be known. Gauss-Newton on rotation and shift, coarse to fine, ends below a pixel.
 Error bars are sandwich estimates over blocks of the picture plus a jackknife over the predicting views, so they feel
-masks and other errors of the model.
+masks and other errors of the model; and what changes when slower shades are let in is added. On smooth round objects the
+latter matters: shifts of all views along their detectors look like a change of albedo there.
 
 Source: linear combination: Shashua, Int. J. Comput. Vis. 21 (1997) 99; sandwich: White, Econometrica 48 (1980) 817;
 jackknife: Efron & Stein, Ann. Statist. 9 (1981) 586.
@@ -28,6 +29,9 @@ _STEADY_PX = 0.01
 _RIVAL_PX = 5.0
 _BLOCK_PX = 10
 _LEAST_COMMON = 0.3
+_LEAST_PIXELS = 100
+_RANK = 3
+_BANDS = (2.0, 4.0)
 _RIDGE = 1e-3
 _ROBUST = 2.5
 
@@ -63,6 +67,8 @@ class Aligner:
         """
         self.views = views
         self._kept: dict[int, tuple] = {}
+        self.band = _BANDS[0]
+        self.doubt_um = np.zeros(len(views))
         first = views[0]
         self.frame = Frame.around_view(first, reach_um)
         self.reach = max(1, math.ceil(reach_um / self.frame.step))
@@ -82,6 +88,11 @@ class Aligner:
                 self._search(k, self.turns[len(self.turns) // 2 :: len(self.turns)] if search else self.turns)
             for level in _LEVELS_PX:
                 self._refine(level)
+        found, places = list(self.motions), self.frame.points[self.frame.inside]
+        self.band = _BANDS[1]
+        self._refine(_LEVELS_PX[-1])
+        self.doubt_um = np.array([separation(a, b, places) for a, b in zip(found, self.motions, strict=True)])
+        self.band, self.motions = _BANDS[0], found
 
     def _shifted(self, motion: Rigid, shift_px: tuple[int, int]) -> Rigid:
         """Return a motion read further on by (rows, columns) of the common raster."""
@@ -115,9 +126,9 @@ class Aligner:
 
     def _read(self, k: int, sigma_um: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the pictures of view k at its present motion, read anew only where that changed."""
-        key = self.motions[k], sigma_um
+        key = self.motions[k], sigma_um, self.band
         if k not in self._kept or self._kept[k][0] != key:
-            self._kept[k] = key, read(self.views[k].readable(sigma_um), self.motions[k], self.frame)
+            self._kept[k] = key, read(self.views[k].readable(sigma_um, self.band), self.motions[k], self.frame)
         return self._kept[k][1]
 
     def predict(
@@ -133,11 +144,11 @@ class Aligner:
         for image, seen in zip(own, is_own, strict=True):
             chosen = _companions(seen, pictures)
             common = np.all([s for _, s in chosen], axis=0)
-            columns = np.stack([p for p, _ in chosen] + [np.ones_like(image)])
             use = common & seen
-            if use.sum() < 4 * len(columns):
+            if use.sum() < _LEAST_PIXELS:
                 yield image, seen, np.zeros_like(image), np.zeros_like(seen)
                 continue
+            columns = np.concatenate([_components(np.stack([p for p, _ in chosen]), use), np.ones((1, *image.shape))])
             yield image, seen, np.tensordot(_combine(columns[:, use], image[use]), columns, 1), common
 
     def _search(self, k: int, turns: np.ndarray) -> None:
@@ -147,7 +158,7 @@ class Aligner:
         found = []
         for angle in turns:
             motion = self._turned(self.motions[k], float(angle))
-            images, seen = read(self.views[k].readable(sigma), motion, self.frame)
+            images, seen = read(self.views[k].readable(sigma, self.band), motion, self.frame)
             maps = [
                 correlate_masked(p, s, image, known, min(self.reach, 15))
                 for (p, s), image, known in zip(guesses, images, seen, strict=True)
@@ -233,7 +244,8 @@ class Aligner:
         for j in others:  # jackknife over the views that predict: they feel what the linear model leaves out
             away = self._step(k, _LEVELS_PX[-1], without=j)[0] - step
             covariance = covariance + (len(others) - 1) / len(others) * np.outer(away, away)
-        return Match(peaks.height, margin, math.hypot(*peaks.shift), self._field_rms(covariance) / math.sqrt(2))
+        std = math.hypot(self._field_rms(covariance), self.doubt_um[k]) / math.sqrt(2)
+        return Match(peaks.height, margin, math.hypot(*peaks.shift), std)
 
 
 def _companions(
@@ -244,6 +256,17 @@ def _companions(
     while len(chosen) > 2 and np.sum(np.all([s for _, s in chosen], axis=0) & seen) < _LEAST_COMMON * seen.sum():
         chosen = chosen[:-1]
     return chosen
+
+
+def _components(pictures: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Return the three strongest components of pictures [picture, y, x], their weights taken from the pixels in `use`.
+
+    More would be no photometry: shifts of view k by A c_k make terms quadratic in c_k, which five free pictures
+    can imitate, so that such shifts of all views would go unseen.
+    """
+    data = pictures[:, use]
+    _, vectors = np.linalg.eigh(data @ data.T)
+    return np.tensordot(vectors[:, : -_RANK - 1 : -1].T, pictures, 1)
 
 
 def _combine(columns: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from helio_jax.prepare.rigid import Rigid
 
 _EDGE_SIGMA = 1.5
 _SPIKE = 5.0
-_BAND = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,7 @@ class View:
     known: np.ndarray
     x: np.ndarray
     y: np.ndarray
-    _kept: dict[float, list[Readable]] = field(default_factory=dict)
+    _kept: dict[tuple[float, float], list[Readable]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stack: MicrographStack) -> "View":
@@ -80,18 +79,18 @@ class View:
         """Middle of the field [2], um."""
         return np.array([self.x.mean(), self.y.mean()])
 
-    def readable(self, sigma_um: float) -> list[Readable]:
-        """Return the pictures smoothed by a Gaussian of `sigma_um` less one twice as wide.
+    def readable(self, sigma_um: float, band: float) -> list[Readable]:
+        """Return the pictures smoothed by a Gaussian of `sigma_um` less one `band` times as wide.
 
         So slow shades, drift and the soft ends of cast shadows are no landmarks.
         """
-        if sigma_um not in self._kept:
+        if (sigma_um, band) not in self._kept:
             sigma = sigma_um / min(pitch(self.x), pitch(self.y))
-            self._kept[sigma_um] = [
-                Readable.of(smooth(p, k, sigma) - smooth(p, k, _BAND * sigma), k, self.x, self.y)
+            self._kept[sigma_um, band] = [
+                Readable.of(smooth(p, k, sigma) - smooth(p, k, band * sigma), k, self.x, self.y)
                 for p, k in zip(self.pictures, self.known, strict=True)
             ]
-        return self._kept[sigma_um]
+        return self._kept[sigma_um, band]
 
     def edges(self) -> Readable:
         """Return the strength of the edges of all detectors."""
