@@ -59,7 +59,9 @@ def spheres(rng: np.random.Generator) -> Surface:
     at, radius = rng.uniform(-900, 900, (6, 2)), rng.uniform(150, 450, 6)
 
     def height(x, y):
-        caps = [np.sqrt(np.maximum(r * r - (x - a) ** 2 - (y - b) ** 2, 0)) for (a, b), r in zip(at, radius, strict=True)]
+        caps = [
+            np.sqrt(np.maximum(r * r - (x - a) ** 2 - (y - b) ** 2, 0)) for (a, b), r in zip(at, radius, strict=True)
+        ]
         return np.maximum.reduce(caps)
 
     return height
@@ -72,7 +74,10 @@ def rough(rng: np.random.Generator) -> Surface:
     size = 0.35 * math.sqrt(2 / 60) / wave
 
     def height(x, y):
-        waves = [s * np.sin(k * (x * np.cos(a) + y * np.sin(a)) + p) for s, k, a, p in zip(size, wave, angle, phase)]
+        waves = [
+            s * np.sin(k * (x * np.cos(a) + y * np.sin(a)) + p)
+            for s, k, a, p in zip(size, wave, angle, phase, strict=True)
+        ]
         return np.sum(waves, axis=0)
 
     return height
@@ -84,7 +89,8 @@ def bumps(rng: np.random.Generator) -> Surface:
 
     def height(x, y):
         return sum(
-            h * w * np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w)) for (a, b), w, h in zip(at, width, size, strict=True)
+            h * w * np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w))
+            for (a, b), w, h in zip(at, width, size, strict=True)
         )
 
     return height
@@ -158,7 +164,11 @@ def synthetic_rows(n_cases: int, n: int = 101) -> list[Row]:
         stds = [s / PITCH_UM for s in found.std_um[1:]]
         text = f"worst view {max(errors):.3f} px (stated {max(stds):.3f}){', refused' if flagged[-1] else ''}"
         more = {"errors_px": errors, "std_px": stds, "problems": list(found.problems)}
-        rows.append(row("10", f"case {number}: {KINDS[number % len(KINDS)].__name__}", text, "< 1 px", max(errors) < 1.0, **more))
+        rows.append(
+            row(
+                "10", f"case {number}: {KINDS[number % len(KINDS)].__name__}", text, "< 1 px", max(errors) < 1.0, **more
+            )
+        )
     good = np.array([w < 1.0 and not f for w, f in zip(worst, flagged, strict=True)])
     unseen = sum(w >= 1.0 and not f for w, f in zip(worst, flagged, strict=True))
     text = f"{good.sum()} of {n_cases} below 1 px, median {np.median(worst):.3f} px; {unseen} failures not flagged"
@@ -181,11 +191,15 @@ def alum_rows(shared: Path) -> list[Row]:
     for k, name in enumerate(SCANS[1:], 1):
         apart = separation(auto.motions[k], by_hand.motions[k], places) / step
         turned = math.degrees(
-            math.remainder(auto.motions[k].rotation - scans.stacks[k].sample_rotation + scans.stacks[0].sample_rotation, math.tau)
+            math.remainder(
+                auto.motions[k].rotation - scans.stacks[k].sample_rotation + scans.stacks[0].sample_rotation, math.tau
+            )
         )
         beyond = math.sqrt(max(apart**2 - 2 * (by_hand.std_um[k] / step) ** 2, 0.0))
         text = f"{apart:.2f} px, beyond their error {beyond:.2f}; stage {turned:+.2f} deg"
-        rows.append(row("4", f"{name}: automatic against points", text, "<= 1 px beyond it", beyond <= 1.0, apart_px=apart))
+        rows.append(
+            row("4", f"{name}: automatic against points", text, "<= 1 px beyond it", beyond <= 1.0, apart_px=apart)
+        )
     rows.append(row("4", "automatic: refused?", "; ".join(auto.problems) or "no", "no", not auto.problems))
     return rows
 

@@ -208,37 +208,31 @@ def align(
     output: OutFile,
     points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um).")] = None,
     auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
-    settings: Annotated[list[str], typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")] = [],
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")
+    ] = None,
     figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
     from helio_jax import pipeline, write
     from helio_jax.errors import SceneError
+    from helio_jax.prepare.align import describe
 
     if auto == (points is not None):
         raise SceneError("align needs either --points FILE.csv or --auto")
-    chosen = dict(item.partition("=")[::2] for item in settings)
+    chosen = dict(item.partition("=")[::2] for item in settings or ())
     stack, places = pipeline.align(_read_set(scans), points, **chosen)
     write(stack, output)
     if figure:
-        from helio_jax.evaluate.figures import save_figure
-        from helio_jax.evaluate.overlay import overlay_panel
+        from helio_jax.evaluate.overlay import save_overlay
 
-        save_figure(overlay_panel(stack, places), figure)
-    record = stack.provenance["align"]
+        save_overlay(stack, places, figure)
     if as_json:
-        print(json.dumps(record))
+        print(json.dumps(stack.provenance["align"]))
         return
-    for scan in record["scans"]:
-        x, y = scan["shift_um"]
-        print(f"  {scan['name']}: turned by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um,", end=" ")
-        print(f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown")
-    if "points" in record:
-        found = record["points"]
-        print(f"  points: residual {found['residual_rms_um']:.1f} um, leave-one-out {found['left_out_rms_um']:.1f} um (rms)")
-    n = stack.is_observed.sum(0)
-    print(f"{output}: {stack.shape[0]} images on {stack.shape[2]} x {stack.shape[1]} pixels; {(n >= 3).mean():.0%} in 3+")
+    print("\n".join(describe(stack)))
+    print(f"written to {output}")
 
 
 @app.command()
@@ -326,7 +320,9 @@ def _read_height(path: Path) -> Any:
 
     found = read(path)
     if not isinstance(found, Reconstruction):
-        raise InputFileError(f"{path}: must hold a height map, got a {type(found).__name__}: helio reconstruct makes one")
+        raise InputFileError(
+            f"{path}: must hold a height map, got a {type(found).__name__}: helio reconstruct makes one"
+        )
     return found
 
 

@@ -31,6 +31,8 @@ from helio_jax.prepare.align import AlignSettings, align_scans
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
 from helio_jax.prepare.points import fit_points
+from helio_jax.prepare.selfcalibrate import apply as apply_calibration
+from helio_jax.prepare.selfcalibrate import effective_instrument, self_calibrate
 from helio_jax.provenance import package_version, with_provenance
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
@@ -190,6 +192,14 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None)
     return calibrate_on_border(stack, flat, settings or CalibrateSettings())
 
 
+def calibrate_turned(stack: MicrographStack) -> MicrographStack:
+    """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`)."""
+    found = self_calibrate(stack)
+    instrument = effective_instrument(stack.instrument, found.polar_deg)
+    flat = SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return apply_calibration(stack, found, flat, instrument)
+
+
 def align(
     scans: MicrographSet, points: str | Path | None = None, **changes: Any
 ) -> tuple[MicrographStack, dict[str, tuple[float, float]]]:
@@ -227,7 +237,7 @@ def reconstruct(
     """
     one = stack.only() if isinstance(stack, MicrographSet) else stack
     if one.noise == "measured" and one.n_rays is None:
-        one = calibrate(one)
+        one = calibrate_turned(one) if "align" in one.provenance else calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
     refine = chosen.refine

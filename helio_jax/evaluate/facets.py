@@ -50,7 +50,7 @@ class Facet:
         tilt_deg, azimuth_deg: of its outward normal.
         area_um2, area_std_um2: in its own plane.
         projected_um2: seen along the plate normal.
-        long_um, short_um, long_std_um, short_std_um: sides, in its plane, of the rectangle with the same second moments.
+        long_um, short_um (and _std): sides, in its plane, of the rectangle with the same second moments.
         projected_long_um, projected_short_um: the same seen along the plate normal.
         rms_um: of the heights about the plane.
         n_pixels: its size.
@@ -107,7 +107,9 @@ class Facets:
         """Return a JSON-compatible record; unknown numbers are None."""
         rows = {"facets": [vars(f) for f in self.facets], "edges": [vars(e) for e in self.edges]}
         return {
-            key: [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in items]
+            key: [
+                {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in items
+            ]
             for key, items in rows.items()
         }
 
@@ -127,7 +129,7 @@ def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) 
     numbers = sorted((n for n in range(1, labels.max() + 1)), key=lambda n: -int(np.sum(labels == n)))
     if not numbers:
         raise GuardError(
-            f"no planar region of {settings.min_pixels} or more pixels was found: lower min_pixels or raise max_turn_deg"
+            f"no planar region of {settings.min_pixels} or more pixels found: lower min_pixels or raise max_turn_deg"
         )
     order = np.zeros(labels.max() + 1, int)
     order[numbers] = np.arange(1, len(numbers) + 1)
@@ -218,7 +220,9 @@ def _shared_out(rec, labels, planes, use, s: FacetSettings) -> np.ndarray:
     return out
 
 
-def _fit_plane(rec: Reconstruction, region: np.ndarray, height: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _fit_plane(
+    rec: Reconstruction, region: np.ndarray, height: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit z = a x + b y + c robustly (Tukey's biweight); return (a, b, c) and the misfit of the region's pixels."""
     z = (rec.height if height is None else height)[region]
     design = np.stack([rec.x[region], rec.y[region], np.ones(z.size)], -1)

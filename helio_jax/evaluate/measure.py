@@ -52,7 +52,9 @@ def measure_height_map(
         found["profile"] = {
             "distance_um": line.distance.tolist(),
             "height_um": [None if math.isnan(h) else h for h in line.height],
-            "height_std_um": None if line.height_std is None else [None if math.isnan(h) else h for h in line.height_std],
+            "height_std_um": None
+            if line.height_std is None
+            else [None if math.isnan(h) else h for h in line.height_std],
         }
         if wanted.step:
             step = measure_step(line)
@@ -84,14 +86,16 @@ def _facet_lines(facets: Facets) -> list[str]:
     lines = ["facet  tilt  azimuth  area (mm2)         long (um)   short (um)  projected  rms (um)"]
     for f in facets.facets:
         lines.append(
-            f"{f.number:>5} {f.tilt_deg:5.1f} {f.azimuth_deg:8.1f}  {f.area_um2 / 1e6:.4f} +- {f.area_std_um2 / 1e6:.4f}  "
+            f"{f.number:>5} {f.tilt_deg:5.1f} {f.azimuth_deg:8.1f}  "
+            f"{f.area_um2 / 1e6:.4f} +- {f.area_std_um2 / 1e6:.4f}  "
             f"{f.long_um:6.0f} +- {f.long_std_um:<3.0f} {f.short_um:5.0f} +- {f.short_std_um:<3.0f} "
-            f"{f.projected_long_um:.0f} x {f.projected_short_um:.0f}  {f.rms_um:.1f}{'  cut by the border' if f.is_cut else ''}"
+            f"{f.projected_long_um:.0f} x {f.projected_short_um:.0f}  {f.rms_um:.1f}"
+            f"{'  cut by the border' if f.is_cut else ''}"
         )
     lines.append("edge    angle of planes (deg)  of profiles (deg)  length (um)")
     for e in facets.edges:
         lines.append(
-            f"{e.facets[0]}-{e.facets[1]:<5} {e.angle_deg:7.2f} +- {e.angle_std_deg:<8.2f} {e.profile_angle_deg:7.2f} +- "
-            f"{e.profile_std_deg:.2f} ({e.n_profiles})  {e.length_um:.0f}"
+            f"{e.facets[0]}-{e.facets[1]:<5} {e.angle_deg:7.2f} +- {e.angle_std_deg:<8.2f} "
+            f"{e.profile_angle_deg:7.2f} +- {e.profile_std_deg:.2f} ({e.n_profiles})  {e.length_um:.0f}"
         )
     return lines

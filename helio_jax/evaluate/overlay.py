@@ -1,15 +1,17 @@
-"""Pictures of an alignment and of facets: every scan in the common frame under the edges of all others, and where they are.
+"""Pictures of an alignment (every scan in the common frame under the edges of all others) and of facets.
 
 Where a scan is in place, its own edges run along the lines. Uses `matplotlib.figure.Figure` only: no display.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
 
 from helio_jax.arrays import pitch
+from helio_jax.evaluate.figures import save_figure
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -71,6 +73,11 @@ def overlay_panel(stack: MicrographStack, places: Mapping[str, tuple[float, floa
     ax.set_ylabel("y (µm)", fontsize=8)
     ax.tick_params(labelsize=7)
     return figure
+
+
+def save_overlay(stack: MicrographStack, places: Mapping[str, tuple[float, float]], path: str | Path) -> None:
+    """Draw `overlay_panel` into a file."""
+    save_figure(overlay_panel(stack, places), path)
 
 
 def facet_map(rec: Reconstruction, labels: np.ndarray) -> "Figure":

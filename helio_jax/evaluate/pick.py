@@ -55,8 +55,8 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
 
     if matplotlib.get_backend().lower() in ("agg", "pdf", "svg", "ps", "cairo", "template"):
         raise MissingDependencyError(
-            f"picking points needs a window, but matplotlib has only the backend {matplotlib.get_backend()!r} here: run it "
-            "on a machine with a display and a GUI toolkit (pip install PyQt6), or write the CSV by hand: "
+            f"picking points needs a window, but matplotlib has only the backend {matplotlib.get_backend()!r} here: "
+            "run it on a machine with a display and a GUI toolkit (pip install PyQt6), or write the CSV by hand: "
             "view,point,x_um,y_um"
         )
     picker = Picker([s.name for s in scans.stacks], picks)

@@ -1,4 +1,4 @@
-"""Control points as CSV: the header `view,point,x_um,y_um`, then one pick per line (beam positions of that view, um)."""
+"""Control points as CSV: the header `view,point,x_um,y_um`, then one pick per line (beam positions, um)."""
 
 import csv
 import io
@@ -40,7 +40,9 @@ def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, flo
         except ValueError:
             x = y = math.nan
         if not (math.isfinite(x) and math.isfinite(y)):
-            raise InputFileError(f"{path}, line {number}: x_um and y_um must be finite numbers, got {row[2]!r}, {row[3]!r}")
+            raise InputFileError(
+                f"{path}, line {number}: x_um and y_um must be finite numbers, got {row[2]!r}, {row[3]!r}"
+            )
         if point in picks.setdefault(view, {}):
             raise InputFileError(f"{path}, line {number}: point {point!r} of view {view!r} is given twice: remove one")
         picks[view][point] = (x, y)

@@ -84,7 +84,9 @@ class Alignment:
             for scan, match in zip(out["scans"], self.matches, strict=True):
                 scan["match"] = {k: v if math.isfinite(v) else None for k, v in asdict(match).items()}
         if self.points is not None:
-            finite = {v: {p: None if math.isnan(e) else e for p, e in n.items()} for v, n in self.points.left_out.items()}
+            finite = {
+                v: {p: None if math.isnan(e) else e for p, e in n.items()} for v, n in self.points.left_out.items()
+            }
             std = self.points.std_um
             out["points"] = {
                 "std_um": std if math.isfinite(std) else None,
@@ -153,8 +155,8 @@ def _check(scans: MicrographSet, is_auto: bool) -> None:
     for stack in scans.stacks:
         if stack.instrument.beam.incidence_deg:
             raise GuardError(
-                f"scan {stack.name!r} has an incidence of {stack.instrument.beam.incidence_deg:g} deg: turned scans can "
-                "be aligned rigidly only at 0 deg, for elsewhere every height moves its pixel by another amount"
+                f"scan {stack.name!r} has an incidence of {stack.instrument.beam.incidence_deg:g} deg: turned scans "
+                "can be aligned rigidly only at 0 deg, for elsewhere every height moves its pixel by another amount"
             )
         if stack.instrument.sample_distance != first.instrument.sample_distance:
             raise InputFileError(
@@ -188,7 +190,9 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
              f"{turned:.2f} deg", f"<= {settings.max_rotation_deg:g} deg"),
             (moved > reach, "shift of its centre", f"{moved:.0f} um", f"<= {reach:g} um"),
         )  # fmt: skip
-        problems += [f"scan {stack.name!r}: {what} must be {limit}, got {got}" for bad, what, got, limit in checks if bad]
+        problems += [
+            f"scan {stack.name!r}: {what} must be {limit}, got {got}" for bad, what, got, limit in checks if bad
+        ]
     stds = (0.0, *(m.std_um for m in matches[1:]))
     names = tuple(s.name for s in scans.stacks)
     return Alignment(names, tuple(aligner.motions), stds, matches=matches, problems=tuple(problems))
@@ -207,8 +211,8 @@ def _from_points(scans: MicrographSet, picks: Picks, settings: AlignSettings, so
             default=(math.nan, "?", "?"),
         )
         problems.append(
-            f"{source}: the leave-one-out error must be <= {settings.max_left_out_px:g} px, got {left_out:.2f} px (worst: "
-            f"point {worst[2]!r} in {worst[1]!r}, {worst[0] / step:.1f} px)"
+            f"{source}: the leave-one-out error must be <= {settings.max_left_out_px:g} px, got {left_out:.2f} px "
+            f"(worst: point {worst[2]!r} in {worst[1]!r}, {worst[0] / step:.1f} px)"
         )
     # a rigid motion has 3 unknowns for 2 n coordinates: mean square displacement per axis over the points
     stds = tuple(
@@ -228,3 +232,21 @@ def _check_in_field(scans: MicrographSet, picks: Mapping, source: str) -> None:
                         f"{source}: point {point!r} of {stack.name!r} has {axis} = {value:g} um, outside the scan "
                         f"({own[0]:g} to {own[-1]:g} um): give beam positions in um"
                     )
+
+
+def describe(stack: MicrographStack) -> list[str]:
+    """Return lines that tell the motions of an aligned stack."""
+    record, lines = stack.provenance["align"], []
+    for scan in record["scans"]:
+        x, y = scan["shift_um"]
+        error = f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown"
+        lines.append(
+            f"  {scan['name']}: turned by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um, {error}"
+        )
+    if "points" in record:
+        found = record["points"]
+        rest, left_out = found["residual_rms_um"], found["left_out_rms_um"]
+        lines.append(f"  points: residual {rest:.1f} um, leave-one-out {left_out:.1f} um (rms)")
+    share = float(np.mean(stack.is_observed.sum(0) >= 3))
+    n, ny, nx = stack.shape
+    return [*lines, f"{n} images on {nx} x {ny} pixels; {share:.0%} of them in 3 or more"]

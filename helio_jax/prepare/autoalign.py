@@ -2,11 +2,11 @@
 
 Start: the stage's rotations, and shifts from the correlation of edge strengths, view after view. Then the photometric
 model: while nothing is masked, a micrograph is a linear combination of three others taken under the same beam, plus a
-constant (I = rho n . Phi + background, three unknowns per pixel). Its coefficients are fitted, robustly, so that neither
+constant (I = rho n . Phi + background, three unknowns per pixel). Its coefficients are fitted, robustly, so neither
 gains, backgrounds nor apertures need be known. Gauss-Newton on rotation and shift, coarse to fine, ends below a pixel.
 Error bars are sandwich estimates over blocks of the picture plus a jackknife over the predicting views, so they feel
-masks and other errors of the model; and what changes when slower shades are let in is added. On smooth round objects the
-latter matters: shifts of all views along their detectors look like a change of albedo there.
+masks and other errors of the model; and what changes when slower shades are let in is added. On smooth round objects
+the latter matters: shifts of all views along their detectors look like a change of albedo there.
 
 Source: linear combination: Shashua, Int. J. Comput. Vis. 21 (1997) 99; sandwich: White, Econometrica 48 (1980) 817;
 jackknife: Efron & Stein, Ann. Statist. 9 (1981) 586.
@@ -32,6 +32,8 @@ _LEAST_COMMON = 0.3
 _LEAST_PIXELS = 100
 _RANK = 3
 _BANDS = (2.0, 4.0)
+_DOUBT = 2.0
+"""How much farther off a fit is than its two bands disagree (benchmarks/alignment.py, errors over stated ones)."""
 _RIDGE = 1e-3
 _ROBUST = 2.5
 
@@ -244,13 +246,11 @@ class Aligner:
         for j in others:  # jackknife over the views that predict: they feel what the linear model leaves out
             away = self._step(k, _LEVELS_PX[-1], without=j)[0] - step
             covariance = covariance + (len(others) - 1) / len(others) * np.outer(away, away)
-        std = math.hypot(self._field_rms(covariance), self.doubt_um[k]) / math.sqrt(2)
+        std = math.hypot(self._field_rms(covariance), _DOUBT * self.doubt_um[k]) / math.sqrt(2)
         return Match(peaks.height, margin, math.hypot(*peaks.shift), std)
 
 
-def _companions(
-    seen: np.ndarray, pictures: list[tuple[np.ndarray, np.ndarray]]
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _companions(seen: np.ndarray, pictures: list[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the pictures that share a field with one, dropping those that overlap least while that field is small."""
     chosen = sorted(pictures, key=lambda p: -int(np.sum(p[1] & seen)))
     while len(chosen) > 2 and np.sum(np.all([s for _, s in chosen], axis=0) & seen) < _LEAST_COMMON * seen.sum():
@@ -270,7 +270,7 @@ def _components(pictures: np.ndarray, use: np.ndarray) -> np.ndarray:
 
 
 def _combine(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the coefficients [n] of the robust linear combination of columns [n, pixel] nearest to a target [pixel]."""
+    """Return the coefficients [n] of the robust combination of columns [n, pixel] nearest to a target [pixel]."""
     weight = np.ones(target.size)
     ridge = _RIDGE * target.size * np.diag([*np.ones(len(columns) - 1), 0.0])
     for _ in range(3):

@@ -63,9 +63,7 @@ def fit_points(picks: Picks, views: tuple[str, ...], source: str = "the control 
     freedom = 2 * n_picks - 2 * len(places) - 3 * (len(views) - 1)
     total = sum(r * r for named in residuals.values() for r in named.values())
     std = math.sqrt(total / freedom) if freedom > 0 else math.nan
-    return PointFit(
-        motions, {p: (float(r[0]), float(r[1])) for p, r in places.items()}, residuals, left_out, std
-    )
+    return PointFit(motions, {p: (float(r[0]), float(r[1])) for p, r in places.items()}, residuals, left_out, std)
 
 
 def rms(errors: Mapping[str, Mapping[str, float]]) -> float:
@@ -82,9 +80,7 @@ def _shared(picks: Picks, views: tuple[str, ...], source: str) -> dict[str, dict
     for named in picks.values():
         for point in named:
             count[point] = count.get(point, 0) + 1
-    shared = {
-        v: {p: np.asarray(at, float) for p, at in picks.get(v, {}).items() if count[p] > 1} for v in views
-    }
+    shared = {v: {p: np.asarray(at, float) for p, at in picks.get(v, {}).items() if count[p] > 1} for v in views}
     for view, named in shared.items():
         if len(named) < MIN_POINTS:
             raise InputFileError(

@@ -1,4 +1,4 @@
-"""Measurements on height maps against closed forms: facets of a truncated octahedron, steps, sinusoids, tilted planes."""
+"""Measurements on height maps against closed forms: a truncated octahedron, steps, sinusoids, planes."""
 
 import json
 import math
@@ -21,7 +21,9 @@ TILT = math.degrees(math.acos(1 / math.sqrt(3)))
 def make_rec(height, n=(101, 101), incidence=0.0, noise=0.0, is_valid=None) -> Reconstruction:
     """Return a height map of a formula of the surface's own x, y, solved along the beam."""
     detector = Detector(name="d", polar_deg=45.0, half_angle_deg=10.0)
-    instrument = Instrument(beam=Beam(incidence_deg=incidence), plate=Plate(working_distance_um=3000.0), detector=(detector,))
+    instrument = Instrument(
+        beam=Beam(incidence_deg=incidence), plate=Plate(working_distance_um=3000.0), detector=(detector,)
+    )
     x, y = ((np.arange(k) - (k - 1) / 2) * PITCH for k in reversed(n))
     grid_x, grid_y = np.meshgrid(x, y)
     tx, _ = instrument.beam_shift
@@ -71,7 +73,7 @@ def test_angles_of_a_truncated_octahedron(noise, limit):
 
 
 def test_sides_and_area_of_the_top_face():
-    """440 x 260 um, 0.1144 mm2, within a pixel and two stated deviations. Catches full for half axes, projected for true."""
+    """440 x 260 um, 0.1144 mm2, within a pixel or two stated deviations. Catches half for full sides."""
     top = max(find_facets(make_rec(octahedron)).facets, key=lambda f: f.level if f.tilt_deg < 5 else -1e9)
     assert abs(top.long_um - 440) < 0.8 * PITCH and abs(top.short_um - 260) < 0.8 * PITCH
     assert abs(top.area_um2 - 440 * 260) < 2 * top.area_std_um2 + 1e-9 and top.area_std_um2 < 0.1 * 440 * 260
@@ -97,7 +99,7 @@ def test_area_of_a_tilted_plane(incidence):
 
 
 def test_roughness_of_a_sinusoid():
-    """z = a sin(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 with the cell's own transfer function.
+    """z = a sin(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 times the cell's transfer.
 
     Catches peak-to-valley for amplitude, excess kurtosis, and slopes of half the step.
     """
@@ -122,7 +124,7 @@ def test_roughness_is_levelled_by_a_plane():
 
 
 def test_step_on_a_slope():
-    """A step of 30 um on a slope of 0.1: the height between parallel lines. Catches the mean difference of the sides."""
+    """A step of 30 um on a slope of 0.1: between parallel lines. Catches the difference of the sides' means."""
     line = measure_profile(make_rec(lambda x, y: 0.1 * x + 30.0 * (x > 5.0)), (-900.0, 40.0), (900.0, 40.0))
     step = measure_step(line)
     assert step.height == pytest.approx(30.0, abs=1e-6) and step.slope == pytest.approx(0.1, abs=1e-9)
