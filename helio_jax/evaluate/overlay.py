@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from helio_jax.arrays import pitch
-from helio_jax.evaluate.figures import save_figure
+from helio_jax.evaluate.figures import robust_range, save_figure
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -91,7 +91,9 @@ def facet_map(rec: Reconstruction, labels: np.ndarray) -> "Figure":
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     left, right = figure.subplots(1, 2)
     known = np.ma.masked_array(rec.height, ~rec.is_valid)
-    shown = left.imshow(known, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
+    low, high = robust_range(rec.height[rec.is_valid], 1.0)
+    style = {"cmap": "viridis", "interpolation": "nearest", "vmin": low, "vmax": high}
+    shown = left.imshow(known, origin="lower", extent=extent, **style)
     figure.colorbar(shown, ax=left, shrink=0.8, label="height (µm)")
     colors = colormaps["tab20"].with_extremes(bad="#f2f2f2")
     right.imshow(np.ma.masked_equal(labels % 20, 0), origin="lower", extent=extent, cmap=colors, vmin=0, vmax=19)
