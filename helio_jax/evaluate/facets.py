@@ -178,7 +178,7 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
         direction = normal[seed]
         for _ in range(4):
             alike = known & (labels == 0) & (normal @ direction >= near)
-            piece, _ = ndimage.label(alike)
+            piece, _ = _pieces(alike)
             if not piece[seed]:
                 break
             region = piece == piece[seed]
@@ -193,6 +193,12 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
                 planes[number] = _fit_plane(rec, _core(region, s.rim_pixels))[0]
         tried[seed] = True
     return _shared_out(rec, labels, planes, use, s)
+
+
+def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the connected pieces of a mask, numbered from 1 [y, x], and how many there are."""
+    numbers = np.zeros(mask.shape, np.int32)
+    return numbers, int(ndimage.label(mask, output=numbers))  # type: ignore[arg-type]
 
 
 def _core(region: np.ndarray, rim: int) -> np.ndarray:
@@ -213,7 +219,7 @@ def _shared_out(rec, labels, planes, use, s: FacetSettings) -> np.ndarray:
         is_nearer = reach & (away < best)
         out, best = np.where(is_nearer, number, out), np.where(is_nearer, away, best)
     for number in planes:
-        piece, n = ndimage.label(out == number)
+        piece, n = _pieces(out == number)
         if n > 1:
             sizes = np.bincount(piece.ravel())[1:]
             out[(piece > 0) & (piece != 1 + int(np.argmax(sizes)))] = 0
@@ -250,7 +256,7 @@ def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit:
         return drawn.T @ drawn / len(drawn)
     signs = np.zeros(core.shape, int)
     signs[core] = np.where(misfit > 0, 1, 2)
-    n_pieces = max(ndimage.label(signs == 1)[1] + ndimage.label(signs == 2)[1], 1)
+    n_pieces = max(_pieces(signs == 1)[1] + _pieces(signs == 2)[1], 1)
     together = max(misfit.size / n_pieces, 1.0)
     x, y = rec.x[core] - rec.x[core].mean(), rec.y[core] - rec.y[core].mean()
     moments = np.array([[np.sum(x * x), np.sum(x * y)], [np.sum(x * y), np.sum(y * y)]])
@@ -272,7 +278,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
     along = np.array([plane[0], plane[1]]) / (np.hypot(plane[0], plane[1]) or 1.0)
     lift = np.outer(along, along) * (1.0 / normal[2] - 1.0)  # lengths up the slope grow by 1 / cos(tilt)
     sides, true_sides = (_sides(p, projected, step) for p in (flat, flat + flat @ lift))
-    rim = region & ~ndimage.binary_erosion(region)
+    rim = region & ~np.asarray(ndimage.binary_erosion(region))
     edge_std = step * _roughness_of_rim(region)
     lower = ndimage.binary_dilation(region) & ~use
     border = np.zeros_like(region)
@@ -313,13 +319,13 @@ def _roughness_of_rim(region: np.ndarray) -> float:
     """Return how far a region's rim is from smooth [pixels]: rms of what closing and opening change, at least 0.3."""
     smooth = ndimage.gaussian_filter(region.astype(float), 3.0) > 0.5
     changed = np.sum(smooth != region)
-    rim = max(int(np.sum(region & ~ndimage.binary_erosion(region))), 1)
+    rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region)))), 1)
     return max(float(changed) / rim, 0.3)
 
 
 def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetSettings) -> Edge | None:
     """Measure the edge of two facets; None where they do not touch over five or more pixels."""
-    touching = ndimage.binary_dilation(labels == a.number, iterations=2) & ndimage.binary_dilation(
+    touching = np.asarray(ndimage.binary_dilation(labels == a.number, iterations=2)) & ndimage.binary_dilation(
         labels == b.number, iterations=2
     )
     if touching.sum() < 15:

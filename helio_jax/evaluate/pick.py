@@ -107,7 +107,7 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
             draw()
 
     for name, handler in (("button_press", on_click), ("key_press", on_key), ("scroll", on_wheel)):
-        figure.canvas.mpl_connect(f"{name}_event", handler)
+        figure.canvas.mpl_connect(f"{name}_event", handler)  # type: ignore[call-overload,arg-type]
     draw()
     pyplot.show()
     return picker.picks

@@ -38,10 +38,10 @@ def correlate_masked(
     Returns:
         Correlations [2 reach + 1, 2 reach + 1], index (reach, reach) being no shift; -1 where not considered.
     """
-    shape = [fft.next_fast_len(n + reach, real=True) for n in fixed.shape]
+    shape = [int(fft.next_fast_len(n + reach, real=True) or n + reach) for n in fixed.shape]
     a, b = np.where(is_fixed, fixed, 0.0), np.where(is_moving, moving, 0.0)
     a, b = a - a.sum() / max(is_fixed.sum(), 1) * is_fixed, b - b.sum() / max(is_moving.sum(), 1) * is_moving
-    first = [np.conj(fft.rfft2(v, shape)) for v in (is_fixed.astype(float), a, a * a)]
+    first = [np.conj(np.asarray(fft.rfft2(v, shape))) for v in (is_fixed.astype(float), a, a * a)]
     second = [fft.rfft2(v, shape) for v in (is_moving.astype(float), b, b * b)]
 
     def lagged(i: int, j: int) -> np.ndarray:

@@ -85,7 +85,7 @@ def self_calibrate(
         for image, known in zip(stack.counts, stack.is_observed, strict=True)
     ]
     chosen = np.random.default_rng(settings.seed).choice(int(inside.sum()), settings.n_pixels, replace=False)
-    data = np.stack([image[inside][chosen] for image in smoothed])
+    data = np.stack([np.asarray(image)[inside][chosen] for image in smoothed])
     scale = np.median(data, axis=1)
     azimuth, prior = np.arctan2(centers[:, 1], centers[:, 0]), math.degrees(polar.mean())
 
