@@ -88,10 +88,11 @@ def bumps(rng: np.random.Generator) -> Surface:
     at, width, size = rng.uniform(-1000, 1000, (12, 2)), rng.uniform(60, 200, 12), rng.uniform(-1, 1, 12)
 
     def height(x, y):
-        return sum(
+        hills = [
             h * w * np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * w * w))
             for (a, b), w, h in zip(at, width, size, strict=True)
-        )
+        ]
+        return np.sum(hills, axis=0)
 
     return height
 

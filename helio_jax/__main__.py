@@ -221,7 +221,7 @@ def align(
 
     if auto == (points is not None):
         raise SceneError("align needs either --points FILE.csv or --auto")
-    chosen = dict(item.partition("=")[::2] for item in settings or ())
+    chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
     stack, places = pipeline.align(_read_set(scans), points, **chosen)
     write(stack, output)
     if figure:

@@ -278,7 +278,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
     along = np.array([plane[0], plane[1]]) / (np.hypot(plane[0], plane[1]) or 1.0)
     lift = np.outer(along, along) * (1.0 / normal[2] - 1.0)  # lengths up the slope grow by 1 / cos(tilt)
     sides, true_sides = (_sides(p, projected, step) for p in (flat, flat + flat @ lift))
-    rim = region & ~np.asarray(ndimage.binary_erosion(region))
+    rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
     edge_std = step * _roughness_of_rim(region)
     lower = ndimage.binary_dilation(region) & ~use
     border = np.zeros_like(region)
@@ -319,15 +319,16 @@ def _roughness_of_rim(region: np.ndarray) -> float:
     """Return how far a region's rim is from smooth [pixels]: rms of what closing and opening change, at least 0.3."""
     smooth = ndimage.gaussian_filter(region.astype(float), 3.0) > 0.5
     changed = np.sum(smooth != region)
-    rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region)))), 1)
+    rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region), bool))), 1)
     return max(float(changed) / rim, 0.3)
 
 
 def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetSettings) -> Edge | None:
     """Measure the edge of two facets; None where they do not touch over five or more pixels."""
-    touching = np.asarray(ndimage.binary_dilation(labels == a.number, iterations=2)) & ndimage.binary_dilation(
-        labels == b.number, iterations=2
+    near_a, near_b = (
+        np.asarray(ndimage.binary_dilation(labels == n, iterations=2), bool) for n in (a.number, b.number)
     )
+    touching = near_a & near_b
     if touching.sum() < 15:
         return None
     points = np.stack([rec.x[touching], rec.y[touching]], -1)
@@ -338,7 +339,7 @@ def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetS
     step = pitch(rec.raster_x)
     if length < 5 * step:
         return None
-    nearby = ndimage.binary_dilation(touching, iterations=4)  # a facet may surround the other
+    nearby = np.asarray(ndimage.binary_dilation(touching, iterations=4), bool)  # a facet may surround the other
     side_a, side_b = (
         np.stack([rec.x[c], rec.y[c]], -1).mean(0) for c in (nearby & (labels == n) for n in (a.number, b.number))
     )

@@ -75,7 +75,7 @@ def self_calibrate(
             f"self-calibration needs 4 or more images by one turned aperture, got {len(polar)} at polar angles of "
             f"{np.degrees(polar.min()):.1f} to {np.degrees(polar.max()):.1f} deg: calibrate on a flat border instead"
         )
-    inside = np.asarray(ndimage.binary_erosion(stack.is_observed.all(0), iterations=3))
+    inside = np.asarray(ndimage.binary_erosion(stack.is_observed.all(0), iterations=3), bool)
     if inside.sum() < settings.n_pixels:
         raise GuardError(f"self-calibration needs {settings.n_pixels} pixels in all images, got {int(inside.sum())}")
     smoothed = [
@@ -84,7 +84,8 @@ def self_calibrate(
         )
         for image, known in zip(stack.counts, stack.is_observed, strict=True)
     ]
-    chosen = np.random.default_rng(settings.seed).choice(int(inside.sum()), settings.n_pixels, replace=False)
+    draw = np.random.default_rng(settings.seed)
+    chosen = np.asarray(draw.permutation(int(inside.sum()))[: settings.n_pixels], np.int64)
     data = np.stack([np.asarray(image)[inside][chosen] for image in smoothed])
     scale = np.median(data, axis=1)
     azimuth, prior = np.arctan2(centers[:, 1], centers[:, 0]), math.degrees(polar.mean())
