@@ -18,11 +18,16 @@ from helio_jax.evaluate.metrics import Scores, Truth, evaluate_height
 from helio_jax.evaluate.report import write_report
 from helio_jax.formats.hdf5 import write
 from helio_jax.formats.parts import Parts
+from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
+from helio_jax.prepare.align import AlignSettings, align_scans
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
+from helio_jax.prepare.points import fit_points
+from helio_jax.prepare.selfcalibrate import apply as apply_calibration
+from helio_jax.prepare.selfcalibrate import effective_instrument, self_calibrate
 from helio_jax.provenance import with_provenance
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
@@ -186,6 +191,28 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None)
     return calibrate_on_border(stack, flat, settings or CalibrateSettings())
 
 
+def calibrate_turned(stack: MicrographStack) -> MicrographStack:
+    """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`)."""
+    found = self_calibrate(stack)
+    instrument = effective_instrument(stack.instrument, found.polar_deg)
+    flat = SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return apply_calibration(stack, found, flat, instrument)
+
+
+def align(
+    scans: MicrographSet, points: str | Path | None = None, **changes: Any
+) -> tuple[MicrographStack, dict[str, tuple[float, float]]]:
+    """Align turned scans, by control points (a CSV file) or automatically; see `prepare.align`.
+
+    Returns:
+        One stack, and where the control points are in its frame [um] (empty without them).
+    """
+    picks = read_points(points) if points is not None else None
+    stack = align_scans(scans, picks, _changed(AlignSettings(), changes), str(points or ""))
+    places = {} if picks is None else fit_points(picks, tuple(s.name for s in scans.stacks)).places
+    return stack, places
+
+
 def reconstruct(
     stack: MicrographStack | MicrographSet,
     method: str | None = None,
@@ -213,7 +240,7 @@ def reconstruct(
             f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
         )
     if one.noise == "measured" and one.n_rays is None:
-        one = calibrate(one)
+        one = calibrate_turned(one) if "align" in one.provenance else calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     chosen = _changed(settings or ReconstructSettings(), wanted)
     refine = chosen.refine

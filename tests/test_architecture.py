@@ -37,7 +37,9 @@ DOORS = {
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {f"evaluate/{name}.py" for name in ("figures", "agreement_figure", "spot", "sweep")},
+    "matplotlib": {
+        f"evaluate/{name}.py" for name in ("figures", "agreement_figure", "overlay", "pick", "spot", "sweep")
+    },
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},
     "lineax": {"reconstruct/refiner.py"},

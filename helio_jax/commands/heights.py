@@ -1,11 +1,11 @@
-"""Commands about heights: reconstruct, evaluate, report.
+"""Commands about heights: reconstruct, evaluate, measure, report.
 
 Each parses, calls, prints; no logic of its own.
 """
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -75,3 +75,35 @@ def report(
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, read(stack) if stack else None, rec, known, scores, title=height.stem)
     print(f"{output}\n{panel}")
+
+
+@app.command()
+def measure(
+    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
+    facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
+    profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
+    step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
+    roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
+    min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
+    figure: Annotated[Path | None, typer.Option(help="Facets as a picture (.png, .pdf, .svg).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure on a height map: facets, a profile between two beam positions, a step, roughness."""
+    from helio_jax.evaluate.measure import Wanted, measure_height_map
+
+    wanted = Wanted(facets, profile, step, roughness, min_pixels)
+    found, lines = measure_height_map(_read_height(height), wanted, figure)
+    print(json.dumps(found) if as_json else "\n".join(lines))
+
+
+def _read_height(path: Path) -> Any:
+    """Read a file that must hold a height map."""
+    from helio_jax import Reconstruction, read
+    from helio_jax.errors import InputFileError
+
+    found = read(path)
+    if not isinstance(found, Reconstruction):
+        raise InputFileError(
+            f"{path}: must hold a height map, got a {type(found).__name__}: helio reconstruct makes one"
+        )
+    return found

@@ -1,11 +1,11 @@
-"""Commands for files of other programs and measured scans: import, export, compare.
+"""Commands for files of other programs and measured scans: import, export, align, pick, compare.
 
 Each parses, calls, prints; no logic of its own.
 """
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -68,3 +68,63 @@ def compare(
     print_table(found.as_table())
     for path in files:
         print(path)
+
+
+def _read_set(path: Path) -> Any:
+    """Read a file of one or several scans as a set."""
+    from helio_jax import MicrographSet, MicrographStack, read
+    from helio_jax.errors import InputFileError
+
+    found = read(path)
+    if isinstance(found, MicrographStack):
+        return MicrographSet((found,))
+    if not isinstance(found, MicrographSet):
+        raise InputFileError(f"{path}: must hold micrographs, got a {type(found).__name__}")
+    return found
+
+
+@app.command()
+def align(
+    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
+    output: OutFile,
+    points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um).")] = None,
+    auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")
+    ] = None,
+    figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
+    from helio_jax import pipeline, write
+    from helio_jax.errors import SceneError
+    from helio_jax.prepare.align import describe
+
+    if auto == (points is not None):
+        raise SceneError("align needs either --points FILE.csv or --auto")
+    chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
+    stack, places = pipeline.align(_read_set(scans), points, **chosen)
+    write(stack, output)
+    if figure:
+        from helio_jax.evaluate.overlay import save_overlay
+
+        save_overlay(stack, places, figure)
+    if as_json:
+        print(json.dumps(stack.provenance["align"]))
+        return
+    print("\n".join(describe(stack)))
+    print(f"written to {output}")
+
+
+@app.command()
+def pick(
+    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Control points (CSV); goes on with what is there.")],
+) -> None:
+    """Open a window to click the same points in all scans; every click is saved."""
+    from helio_jax.evaluate.pick import pick_points
+    from helio_jax.formats.points import read_points, write_points
+
+    before = read_points(output) if output.exists() else {}
+    picks = pick_points(_read_set(scans), before, lambda found: write_points(output, found))
+    print(f"{output}: {sum(map(len, picks.values()))} picks in {len(picks)} scans")

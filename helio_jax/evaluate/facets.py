@@ -1,0 +1,395 @@
+"""Planar facets of a height map: where they are, the angles between them, their sides and areas.
+
+Pixels are joined while a plane explains them; every facet's plane is then fitted robustly. The angle between two facets
+that touch is the interior one of the solid (180 deg: no edge), once from the two planes and once as in the paper, by
+straight lines fitted to profiles across the edge. Heights only; normals of the file are not used. Positions are the
+surface points' own, so tilt and oblique incidence are in. Source of the method: arXiv 2501.14833, sec. 4.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+from scipy import ndimage
+
+from helio_jax.arrays import pitch
+from helio_jax.errors import GuardError
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.settings import Settings
+
+_TUKEY = 4.685
+_ROUNDS = 30
+_LEAST_CORE = 0.25
+"""A strip of which less is left without its rim is the rounding of an edge."""
+
+
+class FacetSettings(Settings):
+    """How facets are found."""
+
+    window: int = Field(default=5, ge=3, le=101)
+    """Side of the square in which the local plane is fitted [pixels]; odd."""
+    max_turn_deg: float = Field(default=12.0, gt=0.0, le=60.0)
+    """Largest angle between a pixel's local plane and its facet's [deg]."""
+    min_pixels: int = Field(default=60, ge=9)
+    """Smaller facets are left out."""
+    rim_pixels: int = Field(default=2, ge=0, le=50)
+    """Pixels along a facet's border that its plane is not fitted to, for edges are rounded."""
+
+
+@dataclass(frozen=True)
+class Facet:
+    """A planar piece of the surface.
+
+    Attributes:
+        number: label in the map of facets, from 1.
+        slope: dz/dx, dz/dy of its plane.
+        level: height of the plane at x = y = 0 [um].
+        slope_std: standard deviation of the slopes, from the heights' samples or else from the misfit.
+        tilt_deg, azimuth_deg: of its outward normal.
+        area_um2, area_std_um2: in its own plane.
+        projected_um2: seen along the plate normal.
+        long_um, short_um (and _std): sides, in its plane, of the rectangle with the same second moments.
+        projected_long_um, projected_short_um: the same seen along the plate normal.
+        rms_um: of the heights about the plane.
+        n_pixels: its size.
+        is_cut: it touches the border of the reconstructed field, so sides and areas are lower bounds.
+    """
+
+    number: int
+    slope: tuple[float, float]
+    level: float
+    slope_std: tuple[float, float]
+    tilt_deg: float
+    azimuth_deg: float
+    area_um2: float
+    area_std_um2: float
+    projected_um2: float
+    long_um: float
+    short_um: float
+    long_std_um: float
+    short_std_um: float
+    projected_long_um: float
+    projected_short_um: float
+    rms_um: float
+    n_pixels: int
+    is_cut: bool
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal, up [3]."""
+        return _normal(np.array(self.slope))
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Where two facets meet: interior angle of the solid [deg] (convex < 180 < concave), from planes and profiles."""
+
+    facets: tuple[int, int]
+    angle_deg: float
+    angle_std_deg: float
+    profile_angle_deg: float
+    profile_std_deg: float
+    n_profiles: int
+    length_um: float
+
+
+@dataclass(frozen=True)
+class Facets:
+    """All facets, largest first; their labels [y, x] (0: none); and the edges between them."""
+
+    labels: np.ndarray
+    facets: tuple[Facet, ...]
+    edges: tuple[Edge, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-compatible record; unknown numbers are None."""
+        rows = {"facets": [vars(f) for f in self.facets], "edges": [vars(e) for e in self.edges]}
+        return {
+            key: [
+                {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in items
+            ]
+            for key, items in rows.items()
+        }
+
+
+def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) -> Facets:
+    """Find the facets of a reconstruction and measure them.
+
+    Args:
+        rec: heights; invalid pixels take no part.
+        settings: sizes and limits.
+
+    Raises:
+        GuardError: no planar region of `min_pixels` pixels.
+    """
+    use = rec.is_valid & np.isfinite(rec.height)
+    labels = _segment(rec, use, settings)
+    numbers = sorted((n for n in range(1, labels.max() + 1)), key=lambda n: -int(np.sum(labels == n)))
+    if not numbers:
+        raise GuardError(
+            f"no planar region of {settings.min_pixels} or more pixels found: lower min_pixels or raise max_turn_deg"
+        )
+    order = np.zeros(labels.max() + 1, int)
+    order[numbers] = np.arange(1, len(numbers) + 1)
+    labels = order[labels]
+    facets = tuple(_measure(rec, labels, n, use, settings) for n in range(1, len(numbers) + 1))
+    edges = [_edge(rec, labels, a, b, settings) for i, a in enumerate(facets) for b in facets[i + 1 :]]
+    return Facets(labels, facets, tuple(e for e in edges if e is not None))
+
+
+def _normal(slope: np.ndarray) -> np.ndarray:
+    """Return unit normals, up, of slopes [..., 2]."""
+    n = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], -1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+
+def _local_slopes(rec: Reconstruction, use: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return slopes of the plane fitted in a window about each pixel [y, x, 2], and their misfit; NaN where too few."""
+    w = use.astype(float)
+    mean = lambda v: ndimage.uniform_filter(np.where(use, v, 0.0), window, mode="constant")  # noqa: E731
+    n = np.maximum(mean(w), 1e-12)
+    x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), np.where(use, rec.height, 0.0)
+    mx, my, mz = mean(x) / n, mean(y) / n, mean(z) / n
+    xx, yy, xy = mean(x * x) / n - mx * mx, mean(y * y) / n - my * my, mean(x * y) / n - mx * my
+    xz, yz, zz = mean(x * z) / n - mx * mz, mean(y * z) / n - my * mz, mean(z * z) / n - mz * mz
+    det = xx * yy - xy * xy
+    ok = use & (n > 0.6) & (det > 1e-6 * (xx + yy) ** 2)
+    det = np.where(ok, det, 1.0)
+    slope = np.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det], -1)
+    misfit = np.sqrt(np.maximum(zz - slope[..., 0] * xz - slope[..., 1] * yz, 0.0))
+    return np.where(ok[..., None], slope, np.nan), np.where(ok, misfit, np.nan)
+
+
+def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarray:
+    """Grow facets from the most planar pixels, then give each pixel near two of them to the nearer plane [y, x]."""
+    slope, misfit = _local_slopes(rec, use, s.window | 1)
+    normal, known = _normal(slope), np.isfinite(misfit)
+    labels = np.zeros(use.shape, int)
+    planes: dict[int, np.ndarray] = {}
+    order = np.argsort(np.where(known, misfit, np.inf), axis=None)[: int(known.sum())]
+    near = math.cos(math.radians(s.max_turn_deg))
+    tried = np.zeros(use.shape, bool)
+    for start in order:
+        seed = np.unravel_index(start, use.shape)
+        if labels[seed] or tried[seed]:
+            continue
+        direction = normal[seed]
+        for _ in range(4):
+            alike = known & (labels == 0) & (normal @ direction >= near)
+            piece, _ = _pieces(alike)
+            if not piece[seed]:
+                break
+            region = piece == piece[seed]
+            direction = np.mean(normal[region], axis=0)
+            direction /= np.linalg.norm(direction)
+        else:
+            tried |= region
+            inner = ndimage.binary_erosion(region, iterations=max(s.rim_pixels, 1))
+            if region.sum() >= s.min_pixels and inner.sum() >= _LEAST_CORE * region.sum():
+                number = len(planes) + 1
+                labels[region] = number
+                planes[number] = _fit_plane(rec, _core(region, s.rim_pixels))[0]
+        tried[seed] = True
+    return _shared_out(rec, labels, planes, use, s)
+
+
+def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the connected pieces of a mask, numbered from 1 [y, x], and how many there are."""
+    numbers = np.zeros(mask.shape, np.int32)
+    return numbers, int(ndimage.label(mask, output=numbers))  # type: ignore[arg-type]
+
+
+def _core(region: np.ndarray, rim: int) -> np.ndarray:
+    """Return a region without its rim; less of it is taken off where little would be left."""
+    for n in range(rim, 0, -1):
+        inner = ndimage.binary_erosion(region, iterations=n)
+        if inner.sum() >= 0.3 * region.sum():
+            return np.asarray(inner)
+    return region
+
+
+def _shared_out(rec, labels, planes, use, s: FacetSettings) -> np.ndarray:
+    """Give pixels within a window of facets to the facet whose plane is nearest in height; one piece each."""
+    out, best = labels.copy(), np.full(labels.shape, np.inf)
+    for number, (a, b, c) in planes.items():
+        away = np.abs(rec.height - (a * rec.x + b * rec.y + c))
+        reach = ndimage.binary_dilation(labels == number, iterations=(s.window | 1)) & use
+        is_nearer = reach & (away < best)
+        out, best = np.where(is_nearer, number, out), np.where(is_nearer, away, best)
+    for number in planes:
+        piece, n = _pieces(out == number)
+        if n > 1:
+            sizes = np.bincount(piece.ravel())[1:]
+            out[(piece > 0) & (piece != 1 + int(np.argmax(sizes)))] = 0
+    return out
+
+
+def _fit_plane(
+    rec: Reconstruction, region: np.ndarray, height: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit z = a x + b y + c robustly (Tukey's biweight); return (a, b, c) and the misfit of the region's pixels."""
+    z = (rec.height if height is None else height)[region]
+    design = np.stack([rec.x[region], rec.y[region], np.ones(z.size)], -1)
+    weight = np.ones(z.size)
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        plane = np.linalg.lstsq(design * root, z * root[:, 0], rcond=None)[0]
+        misfit = z - design @ plane
+        scale = _TUKEY * 1.4826 * np.median(np.abs(misfit)) + 1e-9 * (np.ptp(z) + 1.0)
+        new = np.where(np.abs(misfit) < scale, (1 - np.minimum(np.abs(misfit) / scale, 1.0) ** 2) ** 2, 0.0)
+        if np.allclose(new, weight, atol=1e-6):
+            break
+        weight = new
+    return plane, misfit
+
+
+def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """Return the covariance of a plane's slopes [2, 2]: from the posterior's samples, or else from the misfit.
+
+    Misfits of neighbouring pixels go together, for heights are integrals: their correlation length is taken as the
+    square root of the area over which the misfit keeps its sign.
+    """
+    if rec.height_samples is not None:
+        drawn = np.stack([_fit_plane(rec, core, rec.height + d)[0][:2] - plane[:2] for d in rec.height_samples])
+        return drawn.T @ drawn / len(drawn)
+    signs = np.zeros(core.shape, int)
+    signs[core] = np.where(misfit > 0, 1, 2)
+    n_pieces = max(_pieces(signs == 1)[1] + _pieces(signs == 2)[1], 1)
+    together = max(misfit.size / n_pieces, 1.0)
+    x, y = rec.x[core] - rec.x[core].mean(), rec.y[core] - rec.y[core].mean()
+    moments = np.array([[np.sum(x * x), np.sum(x * y)], [np.sum(x * y), np.sum(y * y)]])
+    return np.linalg.inv(moments) * np.mean(misfit**2) * together
+
+
+def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarray, s: FacetSettings) -> Facet:
+    """Measure one facet."""
+    region = labels == number
+    core = _core(region, s.rim_pixels)
+    plane, misfit = _fit_plane(rec, core)
+    covariance = _slope_std(rec, core, plane, misfit)
+    normal = _normal(plane[:2])
+    cell, step = pitch(rec.raster_x) * pitch(rec.raster_y), math.sqrt(pitch(rec.raster_x) * pitch(rec.raster_y))
+    tx, ty = rec.instrument.beam_shift
+    stretch = abs(1.0 + plane[0] * tx + plane[1] * ty)  # raster cells to x, y: the beam may be oblique
+    projected = region.sum() * cell / stretch
+    flat = np.stack([rec.x[region], rec.y[region]], -1)
+    along = np.array([plane[0], plane[1]]) / (np.hypot(plane[0], plane[1]) or 1.0)
+    lift = np.outer(along, along) * (1.0 / normal[2] - 1.0)  # lengths up the slope grow by 1 / cos(tilt)
+    sides, true_sides = (_sides(p, projected, step) for p in (flat, flat + flat @ lift))
+    rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
+    edge_std = step * _roughness_of_rim(region)
+    lower = ndimage.binary_dilation(region) & ~use
+    border = np.zeros_like(region)
+    border[[0, -1]], border[:, [0, -1]] = True, True
+    return Facet(
+        number=number,
+        slope=(float(plane[0]), float(plane[1])),
+        level=float(plane[2]),
+        slope_std=(math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])),
+        tilt_deg=math.degrees(math.acos(min(float(normal[2]), 1.0))),
+        azimuth_deg=math.degrees(math.atan2(normal[1], normal[0])),
+        area_um2=float(projected / normal[2]),
+        area_std_um2=float(edge_std * step * math.sqrt(rim.sum()) / normal[2] * 2.0),
+        projected_um2=float(projected),
+        long_um=true_sides[0],
+        short_um=true_sides[1],
+        long_std_um=math.sqrt(2.0) * edge_std,
+        short_std_um=math.sqrt(2.0) * edge_std,
+        projected_long_um=sides[0],
+        projected_short_um=sides[1],
+        rms_um=float(np.sqrt(np.mean(misfit**2))),
+        n_pixels=int(region.sum()),
+        is_cut=bool(np.any(region & border) or lower.sum() > 0.1 * rim.sum()),
+    )
+
+
+def _sides(points: np.ndarray, projected: float, step: float) -> tuple[float, float]:
+    """Return the long and short side [um] of the rectangle with the second moments of points on a square grid.
+
+    A rectangle a x b has the moments a^2/12, b^2/12; points at the middles of cells miss step^2/12 of it.
+    """
+    values = np.linalg.eigvalsh(np.cov(points.T, bias=True))
+    short, long = np.sqrt(12.0 * np.maximum(values, 0.0) + step**2)
+    return float(long), float(short)
+
+
+def _roughness_of_rim(region: np.ndarray) -> float:
+    """Return how far a region's rim is from smooth [pixels]: rms of what closing and opening change, at least 0.3."""
+    smooth = ndimage.gaussian_filter(region.astype(float), 3.0) > 0.5
+    changed = np.sum(smooth != region)
+    rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region), bool))), 1)
+    return max(float(changed) / rim, 0.3)
+
+
+def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetSettings) -> Edge | None:
+    """Measure the edge of two facets; None where they do not touch over five or more pixels."""
+    near_a, near_b = (
+        np.asarray(ndimage.binary_dilation(labels == n, iterations=2), bool) for n in (a.number, b.number)
+    )
+    touching = near_a & near_b
+    if touching.sum() < 15:
+        return None
+    points = np.stack([rec.x[touching], rec.y[touching]], -1)
+    middle = points.mean(0)
+    values, vectors = np.linalg.eigh(np.cov(points.T))
+    along = vectors[:, 1]
+    length = math.sqrt(12.0 * max(float(values[1]), 0.0))
+    step = pitch(rec.raster_x)
+    if length < 5 * step:
+        return None
+    nearby = np.asarray(ndimage.binary_dilation(touching, iterations=4), bool)  # a facet may surround the other
+    side_a, side_b = (
+        np.stack([rec.x[c], rec.y[c]], -1).mean(0) for c in (nearby & (labels == n) for n in (a.number, b.number))
+    )
+    across = np.array([-along[1], along[0]])
+    across = across if (side_b - side_a) @ across > 0 else -across
+    angle = _interior(np.array(a.slope), np.array(b.slope), across)
+    std = _angle_std(a, b, across, angle)
+    ridge = 0.5 * (np.array(a.slope) + np.array(b.slope)) @ along
+    profiles = _profile_angles(rec, labels, a.number, b.number, middle, along, across, length, float(ridge), s)
+    n = len(profiles)
+    mean = float(np.mean(profiles)) if n else math.nan
+    spread = float(np.std(profiles, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
+    return Edge((a.number, b.number), angle, std, mean, spread, n, length)
+
+
+def _interior(slope_a: np.ndarray, slope_b: np.ndarray, across: np.ndarray) -> float:
+    """Return the interior angle [deg] of planes a and b, b lying on the side to which `across` points."""
+    turn = math.degrees(math.acos(float(np.clip(_normal(slope_a) @ _normal(slope_b), -1.0, 1.0))))
+    return 180.0 - turn if (slope_b - slope_a) @ across < 0 else 180.0 + turn
+
+
+def _angle_std(a: Facet, b: Facet, across: np.ndarray, angle: float) -> float:
+    """Return the angle's standard deviation [deg], by differences; the two planes count as independent."""
+    total, slopes = 0.0, [np.array(a.slope), np.array(b.slope)]
+    for i, facet in enumerate((a, b)):
+        for axis in (0, 1):
+            moved = [s.copy() for s in slopes]
+            moved[i][axis] += facet.slope_std[axis]
+            total += (_interior(moved[0], moved[1], across) - angle) ** 2
+    return math.sqrt(total)
+
+
+def _profile_angles(rec, labels, a, b, middle, along, across, length, ridge, s: FacetSettings) -> list[float]:
+    """Return the angle from each profile across an edge: straight lines fitted to its two sides, as in the paper.
+
+    A profile runs at right angles to the edge seen from above; where the edge climbs, its slope `ridge` is that of
+    both planes along it, and the angle is taken between the planes so fixed.
+    """
+    step = pitch(rec.raster_x)
+    offset = np.stack([rec.x, rec.y], -1) - middle
+    t, u = offset @ along, offset @ across
+    out = []
+    for low in np.arange(-0.4 * length, 0.4 * length, step):
+        line = (t >= low) & (t < low + step)
+        fits = []
+        for number, sign in ((a, -1.0), (b, 1.0)):
+            side = line & (labels == number) & (sign * u > s.rim_pixels * step)
+            if side.sum() < 5 or np.ptp(u[side]) < 4 * step:
+                break
+            fits.append(np.polyfit(u[side], rec.height[side], 1)[0])
+        if len(fits) == 2:
+            out.append(_interior(fits[0] * across + ridge * along, fits[1] * across + ridge * along, across))
+    return out

@@ -1,0 +1,58 @@
+"""Control points as CSV: the header `view,point,x_um,y_um`, then one pick per line (beam positions, um)."""
+
+import csv
+import io
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from helio_jax.errors import InputFileError
+from helio_jax.formats.safe import MIB, atomic_path, check_size
+
+HEADER = ["view", "point", "x_um", "y_um"]
+MAX_FILE_BYTES = 4 * MIB
+
+
+def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, float]]]:
+    """Read control points: {view: {point: (x, y) [um]}}. Lines that begin with # are left out.
+
+    Raises:
+        InputFileError: missing, too large, not UTF-8, another header, a bad number, or a point given twice; the message
+            names file and line.
+    """
+    check_size(path, MAX_FILE_BYTES)
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise InputFileError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}): save it as UTF-8") from None
+    lines = [(n, row) for n, row in enumerate(csv.reader(io.StringIO(text)), 1) if row and not row[0].startswith("#")]
+    if not lines or [name.strip() for name in lines[0][1]] != HEADER:
+        found = ",".join(lines[0][1]) if lines else "an empty file"
+        raise InputFileError(f"{path}: the first line must be {','.join(HEADER)}, got {found[:200]}")
+    picks: dict[str, dict[str, tuple[float, float]]] = {}
+    for number, row in lines[1:]:
+        if len(row) != len(HEADER):
+            raise InputFileError(f"{path}, line {number}: must have {len(HEADER)} columns, got {len(row)}")
+        view, point = row[0].strip(), row[1].strip()
+        try:
+            x, y = float(row[2]), float(row[3])
+        except ValueError:
+            x = y = math.nan
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise InputFileError(
+                f"{path}, line {number}: x_um and y_um must be finite numbers, got {row[2]!r}, {row[3]!r}"
+            )
+        if point in picks.setdefault(view, {}):
+            raise InputFileError(f"{path}, line {number}: point {point!r} of view {view!r} is given twice: remove one")
+        picks[view][point] = (x, y)
+    return picks
+
+
+def write_points(path: str | os.PathLike, picks: Mapping[str, Mapping[str, tuple[float, float]]]) -> None:
+    """Write control points; replaces the file at once or not at all."""
+    with atomic_path(Path(path)) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(HEADER)
+        for view, named in picks.items():
+            writer.writerows([view, point, f"{x:.3f}", f"{y:.3f}"] for point, (x, y) in named.items())

@@ -1,0 +1,154 @@
+"""Measurements on height maps against closed forms: a truncated octahedron, steps, sinusoids, planes."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from helio_jax.errors import GuardError, SceneError
+from helio_jax.evaluate.facets import find_facets
+from helio_jax.evaluate.measure import Wanted, measure_height_map
+from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
+from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.reconstruction import Reconstruction
+
+PITCH = 20.0
+TILT = math.degrees(math.acos(1 / math.sqrt(3)))
+"""Angle between the faces {100} and {111} of a cube's lattice: 54.7356 deg."""
+
+
+def make_rec(height, n=(101, 101), incidence=0.0, noise=0.0, is_valid=None) -> Reconstruction:
+    """Return a height map of a formula of the surface's own x, y, solved along the beam."""
+    detector = Detector(name="d", polar_deg=45.0, half_angle_deg=10.0)
+    instrument = Instrument(
+        beam=Beam(incidence_deg=incidence), plate=Plate(working_distance_um=3000.0), detector=(detector,)
+    )
+    x, y = ((np.arange(k) - (k - 1) / 2) * PITCH for k in reversed(n))
+    grid_x, grid_y = np.meshgrid(x, y)
+    tx, _ = instrument.beam_shift
+    z = np.zeros(n)
+    for _ in range(200):  # a fixed point: the height seen at (X, Y) is that at x = X - z tan t
+        z = 0.5 * z + 0.5 * height(grid_x - z * tx, grid_y)
+    z = z + noise * np.random.default_rng(5).standard_normal(n)
+    valid = np.ones(n, bool) if is_valid is None else is_valid
+    up = np.zeros((*n, 3)) + [0.0, 0.0, 1.0]
+    return Reconstruction(z, x, y, instrument, "linear", up, np.ones(n), valid, np.where(valid, 0, 1))
+
+
+def octahedron(x, y):
+    """Top 440 x 260 um at z = 600 um, four {111} sides, lowest at 0; turned by 20 deg."""
+    c, s = math.cos(0.35), math.sin(0.35)
+    u, v, steep = c * x + s * y, c * y - s * x, math.tan(math.radians(TILT))
+    return np.maximum(600.0 - steep * np.maximum(np.maximum(np.abs(u) - 220.0, np.abs(v) - 130.0), 0.0), 0.0)
+
+
+@pytest.mark.parametrize(("noise", "limit"), [(0.0, 0.5), (4.0, 1.5)])
+def test_angles_of_a_truncated_octahedron(noise, limit):
+    """Top to side 125.26 deg, side to side 109.47 deg, side to floor 234.74 deg, from planes and from profiles.
+
+    Catches the angle of the normals given for the interior one, convex taken for concave, a profile across a climbing
+    edge whose slope is forgotten (side to side would be 98.5 deg), and facets that swallow their neighbours.
+    """
+    found = find_facets(make_rec(octahedron, noise=noise))
+    tilts = {f.number: f.tilt_deg for f in found.facets}
+    flat = [n for n, t in tilts.items() if t < 5]
+    sides = [n for n, t in tilts.items() if abs(t - TILT) < 1.5]
+    assert len(sides) == 4 and len(flat) == 2
+    top = max(flat, key=lambda n: found.facets[n - 1].level)
+    kinds = {"top": 0, "side": 0, "foot": 0}
+    for edge in found.edges:
+        pair = set(edge.facets)
+        if pair <= set(sides):
+            kind, exact = "side", 2 * math.degrees(math.asin(math.sqrt(2 / 3)))
+        elif top in pair:
+            kind, exact = "top", 180 - TILT
+        else:
+            kind, exact = "foot", 180 + TILT
+        kinds[kind] += 1
+        assert abs(edge.angle_deg - exact) < limit, (edge, exact)
+        if edge.n_profiles >= 5:
+            assert abs(edge.profile_angle_deg - exact) < 2 * limit, (edge, exact)
+    assert kinds == {"top": 4, "side": 4, "foot": 4}
+
+
+def test_sides_and_area_of_the_top_face():
+    """440 x 260 um, 0.1144 mm2, within a pixel or two stated deviations. Catches half for full sides."""
+    top = max(find_facets(make_rec(octahedron)).facets, key=lambda f: f.level if f.tilt_deg < 5 else -1e9)
+    assert abs(top.long_um - 440) < 0.8 * PITCH and abs(top.short_um - 260) < 0.8 * PITCH
+    assert abs(top.area_um2 - 440 * 260) < 2 * top.area_std_um2 + 1e-9 and top.area_std_um2 < 0.1 * 440 * 260
+    assert not top.is_cut
+
+
+@pytest.mark.parametrize("incidence", [0.0, 30.0])
+def test_area_of_a_tilted_plane(incidence):
+    """A plane that climbs along x by 30 deg: area in the plane is 1 / cos 30 deg times the projected one.
+
+    At oblique incidence the raster is not the surface's x, y; catches cells taken as such (15 % here).
+    """
+    slope = math.tan(math.radians(30.0))
+    rec = make_rec(lambda x, y: slope * x, incidence=incidence)
+    (facet,) = find_facets(rec).facets
+    tx, _ = rec.instrument.beam_shift
+    projected = rec.height.size * PITCH**2 / (1 + slope * tx)
+    assert facet.tilt_deg == pytest.approx(30.0, abs=1e-6) and facet.is_cut
+    assert facet.projected_um2 == pytest.approx(projected, rel=1e-9)
+    assert facet.area_um2 == pytest.approx(projected / math.cos(math.radians(30.0)), rel=1e-9)
+    wide, deep = 101 * PITCH / (1 + slope * tx) / math.cos(math.radians(30.0)), 101 * PITCH
+    assert sorted((facet.long_um, facet.short_um)) == pytest.approx(sorted((wide, deep)), rel=2e-3)
+
+
+def test_roughness_of_a_sinusoid():
+    """z = a sin(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 times the cell's transfer.
+
+    Catches peak-to-valley for amplitude, excess kurtosis, and slopes of half the step.
+    """
+    a, k = 7.0, 2 * math.pi / 404.0  # 101 pixels hold five whole periods
+    rough = measure_roughness(make_rec(lambda x, y: a * np.sin(k * x)), level="mean")
+    assert rough.Sa == pytest.approx(2 * a / math.pi, rel=2e-3)
+    assert rough.Sq == pytest.approx(a / math.sqrt(2), rel=1e-9)
+    assert abs(rough.Ssk) < 1e-9 and rough.Sku == pytest.approx(1.5, rel=1e-9)
+    assert rough.Sz == pytest.approx(2 * a, rel=1e-2)
+    between = math.sin(k * PITCH / 2) / (k * PITCH / 2)  # a slope is a mean over one pitch
+    assert rough.Sdq == pytest.approx(a * k / math.sqrt(2) * between, rel=6e-3)
+    assert rough.Sdr == pytest.approx(100 * rough.Sdq**2 / 2, rel=1e-2)
+
+
+def test_roughness_is_levelled_by_a_plane():
+    """A tilted plane has Sq = 0 but Sdr = 0, too, once levelled; unlevelled Sdr is 1/cos - 1."""
+    rec = make_rec(lambda x, y: 0.5 * x)
+    assert measure_roughness(rec).Sq < 1e-9 and measure_roughness(rec).Sdr < 1e-9
+    assert measure_roughness(rec, level="mean").Sdr == pytest.approx(100 * (math.sqrt(1.25) - 1), rel=1e-9)
+    with pytest.raises(GuardError, match="16 or more valid pixels, got 0"):
+        measure_roughness(rec, np.zeros(rec.height.shape, bool))
+
+
+def test_step_on_a_slope():
+    """A step of 30 um on a slope of 0.1: between parallel lines. Catches the difference of the sides' means."""
+    line = measure_profile(make_rec(lambda x, y: 0.1 * x + 30.0 * (x > 5.0)), (-900.0, 40.0), (900.0, 40.0))
+    step = measure_step(line)
+    assert step.height == pytest.approx(30.0, abs=1e-6) and step.slope == pytest.approx(0.1, abs=1e-9)
+    assert abs(step.position - 905.0) < PITCH
+
+
+def test_profile_leaves_gaps_and_refuses_what_is_outside():
+    """Invalid pixels are NaN, not bridged; a point off the raster is named."""
+    valid = np.ones((101, 101), bool)
+    valid[:, 40:60] = False
+    rec = make_rec(lambda x, y: x, is_valid=valid)
+    line = measure_profile(rec, (-1000.0, 0.0), (1000.0, 0.0))
+    np.testing.assert_allclose(line.height[np.isfinite(line.height)], line.distance[np.isfinite(line.height)] - 1000.0)
+    assert 18 <= np.isnan(line.height).sum() <= 22
+    with pytest.raises(SceneError, match=r"profile end \(2000, 0\)"):
+        measure_profile(rec, (0.0, 0.0), (2000.0, 0.0))
+
+
+def test_measure_answers_in_json(tmp_path):
+    """All parts at once are JSON, and the picture is drawn; nothing wanted is an error."""
+    wanted = Wanted(True, (-900.0, 0.0, 900.0, 0.0), False, True)
+    found, lines = measure_height_map(make_rec(octahedron), wanted, tmp_path / "f.png")
+    assert set(json.loads(json.dumps(found))) == {"reconstructed", "facets", "profile", "roughness"}
+    assert len(found["facets"]["edges"]) == 12 and any("125." in line for line in lines)
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    with pytest.raises(SceneError, match="--facets"):
+        measure_height_map(make_rec(octahedron), Wanted())
