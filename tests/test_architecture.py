@@ -47,7 +47,7 @@ DOORS = {
     "rich": {"commands/app.py"},
 }
 FOLDERS = {
-    "jax": {"reconstruct", "pipeline.py"},
+    "jax": {"reconstruct", "doctor.py"},
     "equinox": {"reconstruct"},
     "numba": {"trace", "reconstruct/horizon.py"},
     "llvmlite": {"trace"},
