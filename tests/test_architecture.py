@@ -36,7 +36,7 @@ DOORS = {
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {"evaluate/figures.py", "evaluate/sweep.py"},
+    "matplotlib": {"evaluate/figures.py", "evaluate/sweep.py", "evaluate/before_after.py"},
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},
     "lineax": {"reconstruct/refiner.py"},

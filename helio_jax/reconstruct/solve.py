@@ -171,13 +171,19 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
+def _known(fit: "Fit") -> dict[str, np.ndarray]:
+    """Return what a fit knows of the instrument that does not depend on the surface."""
+    return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
+
+
 def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "Fit":
     """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit."""
     from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
-    fit = fit_heights(*problem, start, settings, predict, report)
+    slow_axis = 0 if stack.fast_axis == "x" else 1
+    fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     roughly = make_predict(max(settings.refine.rays // SEARCH_THRIFT, 1000))
     for is_last in (False, True):
@@ -191,13 +197,13 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
                 fit.surface,
                 (pitch(stack.y), pitch(stack.x)),
                 MAX_WIDTH * stack.instrument.sample_distance,
-                lambda surface: misfit_on(*problem, surface, settings, roughly),
+                lambda surface, fit=fit: misfit_on(*problem, surface, settings, roughly, slow_axis, _known(fit)),
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
             if numbers:
                 is_moved = np.isin(left, numbers)
                 levelled[is_moved] = levelled.max() + left[is_moved]
-                fit = fit_heights(*problem, moved, settings, predict, report, levelled)
+                fit = fit_heights(*problem, moved, settings, predict, report, levelled, slow_axis)
             elif np.unique(left).size == np.unique(single).size:
                 break
         except KeyboardInterrupt:
@@ -233,7 +239,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         height=fit.surface.height,
         raster_x=stack.x,
         raster_y=stack.y,
-        instrument=stack.instrument,
+        instrument=fit.instrument,
         method="refine",
         normals=fit.normals,
         albedo=fit.albedo,

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helio_jax.instrument import Uncertainty
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Prediction, Surface
+from helio_jax.reconstruct.model import INSTRUMENT, Prediction, Surface
 from helio_jax.reconstruct.refiner import Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
 from helio_jax.reconstruct.uncertainty import linearise
@@ -17,27 +18,32 @@ SHAPE, PITCH = (9, 11), 30.0
 
 @pytest.fixture(scope="module")
 def problem(bshem):
-    """A rough surface with a kink, a jump, two plateaus, hidden parts, multiple scattering and free albedo."""
+    """A rough surface with a kink, a jump, two plateaus, hidden parts, multiple scattering; all of the instrument free.
+
+    The residuals are taken away from the geometry at which masks were predicted.
+    """
     rng = np.random.default_rng(3)
-    geometry = SpotGeometry(bshem)
+    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
+    geometry = SpotGeometry(bshem.model_copy(update={"uncertainty": sure}))
     height = rng.normal(scale=8.0, size=SHAPE)
     height[:, 6:] += 150.0
     slopes = rng.normal(scale=0.3, size=(2, *SHAPE))
     slopes[0, 4:] += 1.5
     signal = geometry.form_factor(height)[:, 2] * rng.uniform(0.7, 1.1, (3, *SHAPE))
     signal[1, 2, 3] = np.nan
-    settings = ReconstructSettings(refine=RefineSettings(albedo_std=0.05, albedo_modes=3))
+    settings = ReconstructSettings(refine=RefineSettings(albedo_std=0.05, albedo_modes=3, drift_std=0.2, line_std=0.02))
     surface = Surface(height, *slopes)
     variance = (0.03 * np.nan_to_num(signal, nan=1.0)) ** 2
     region = np.zeros(SHAPE, int)
     region[2:5, 2:5], region[6:8, 5:9] = 1, 3
-    refiner = Refiner(signal, variance, geometry, PITCH, PITCH, surface, settings, region)
+    refiner = Refiner(signal, variance, geometry, PITCH, PITCH, surface, settings, region, 1)
     with jax.enable_x64(True):
         hidden = rng.uniform(0, 0.1, (3, 3, *SHAPE)) * geometry.form_factor(height)
         response = rng.normal(scale=1e-4, size=hidden.shape)
         multiple, unseen = 0.2 * np.nan_to_num(signal), 0.05 * np.nan_to_num(signal)
         prediction = Prediction(multiple, hidden, lambda change: response * (1.0 + change.mean()), unseen)
-        refiner.predict(lambda height, normals: prediction)
+        refiner.predict(lambda height, normals, instrument: prediction)
+        refiner.values |= {name: 0.5 * rng.normal(size=v.shape) for name, v in refiner.values.items()}
         yield refiner.model, *refiner.lag(8.0, 3.0)
 
 
@@ -89,18 +95,19 @@ def test_sparse_jacobian_is_the_automatic_one(problem):
     model, unknowns, lagged = problem
     with jax.enable_x64(True):
         linear = linearise(model, unknowns, lagged)
-        direction = random_direction(unknowns, 4)
+        direction = random_direction(unknowns, 4)._replace(lines=jnp.zeros_like(unknowns.lines))
         value, slope = jax.jvp(lambda u: model.residuals(u, lagged), (unknowns,), (direction,))
         change = jax.jvp(lambda u: model.surface(u, lagged), (unknowns,), (direction,))[1]
     surface = np.stack([np.asarray(part).ravel() for part in change], 1).ravel()
-    instrument = np.concatenate([np.asarray(getattr(direction, n)).ravel() for n in model.instrument_fields])
+    names = model.instrument_fields(unknowns)
+    instrument = np.concatenate([np.asarray(getattr(direction, n)).ravel() for n in names])
     levels = linear.plateau.T @ surface
     assert (
         linear.far.shape[1] == 2 and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
     )
     ours = linear.surface @ surface + linear.far @ levels + linear.instrument @ instrument
-    order = ["data", "edge_x", "edge_y", "border", "slope_x", "slope_y"]
-    order += ["gain", "offset", "multiple", "unseen", "albedo"]
+    order = ["data", "edge_x", "edge_y", "border", "slope_x", "slope_y", *names]
+    assert set(names) == set(INSTRUMENT) - {"lines"}
     theirs = np.concatenate([np.asarray(slope[name]).ravel() for name in order])
-    assert set(order) == set(value)
+    assert set(order) == set(value) - {"lines"}
     assert np.allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
