@@ -48,10 +48,12 @@ class CalibrateSettings(Settings):
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
     """Return the drift of an image whose rows are scanned one after another, mean zero [y, x].
 
-    A polynomial in the row (time) and a slope along the row, fitted robustly to the frame's pixels.
+    A polynomial in the row (time), and along the row a parabola and a slope that changes with the row, fitted robustly
+    to the frame's pixels.
     """
     time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in image.shape), indexing="ij")
-    basis = np.concatenate([np.polynomial.legendre.legvander(time, degree), along[..., None]], -1)
+    lines = np.stack([along, along**2, along * time], -1)
+    basis = np.concatenate([np.polynomial.legendre.legvander(time, degree), lines], -1)
     keep = frame & np.isfinite(image)
     for _ in range(4):
         coefficients = np.linalg.lstsq(basis[keep], image[keep], rcond=None)[0]

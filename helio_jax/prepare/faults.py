@@ -65,12 +65,13 @@ def _noise_line(image: np.ndarray) -> tuple[float, float]:
     x = np.array([level[g].mean() for g in groups])
     y = np.array([(_MAD * np.median(np.abs(second[g]))) ** 2 / 6.0 for g in groups])
     weight = 1.0 / np.maximum(y, 1e-9 * y.max() + 1e-300)
+    lines = []
     for columns in ([0, 1], [1], [0]):
-        basis = np.stack([np.ones_like(x), x], 1)[:, columns] * weight[:, None]
-        line = np.zeros(2)
-        line[columns] = np.linalg.lstsq(basis, y * weight, rcond=None)[0]
+        basis, line = np.stack([np.ones_like(x), x], 1), np.zeros(2)
+        line[columns] = np.linalg.lstsq(basis[:, columns] * weight[:, None], y * weight, rcond=None)[0]
         if np.all(line >= 0):
-            break
+            lines.append((float(np.sum(((y - basis @ line) * weight) ** 2)), line))
+    line = min(lines, key=lambda entry: entry[0])[1]
     return float(line[0]), float(line[1])
 
 
@@ -85,8 +86,8 @@ def find_spikes(stack: MicrographStack, variance: np.ndarray, limit: float) -> n
         limit: in standard deviations of the difference of two pixels.
     """
     counts = np.where(stack.is_observed, stack.counts, np.nan)
-    high = maximum_filter(np.nan_to_num(counts, nan=-np.inf), footprint=_RING[None], mode="nearest")
-    low = minimum_filter(np.nan_to_num(counts, nan=np.inf), footprint=_RING[None], mode="nearest")
+    high = maximum_filter(np.nan_to_num(counts, nan=-np.inf), footprint=_RING[None], mode="mirror")
+    low = minimum_filter(np.nan_to_num(counts, nan=np.inf), footprint=_RING[None], mode="mirror")
     beyond = limit * np.sqrt(2.0 * variance)
     with np.errstate(invalid="ignore"):
         return (counts > high + beyond) | (counts < low - beyond)

@@ -67,6 +67,12 @@ class Fit:
     status: str
     is_interrupted: bool = False
 
+    @property
+    def chi_square(self) -> list[float]:
+        """Mean square residual of the data of every detector, each counted by its robust weight, squared."""
+        total = np.sum((self.weight * self.residuals) ** 2, axis=(1, 2))
+        return (total / np.maximum(np.sum(self.weight**2, axis=(1, 2)), 1e-300)).tolist()
+
 
 def _thinning(shape: tuple[int, int]) -> int:
     """Return the power of two by which rows and columns are thinned for the posterior."""
@@ -185,6 +191,8 @@ def fit_heights(
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
+                if number == s.fixed_rounds:
+                    refiner.tear()
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
                     found = refiner.step(limit, cut, number >= s.fixed_rounds)
@@ -193,6 +201,7 @@ def fit_heights(
                     raise
                 refiner.surface, is_interrupted = before, True
                 break
+            refiner.torn = None
             changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
             cost = float(sum(found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"

@@ -25,6 +25,7 @@ from helio_jax.reconstruct.background import drift_modes
 from helio_jax.reconstruct.edges import Edges, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.shadows import shadow_edges
 from helio_jax.reconstruct.settings import ReconstructSettings
 
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
@@ -196,6 +197,7 @@ class Refiner:
         nothing = np.zeros(signal.shape)
         self.adopt(Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface)
         self.level_response = np.zeros((len(self.plateau), len(signal), 3, *shape))
+        self.torn: tuple[np.ndarray, np.ndarray] | None = None
         self.residuals = np.zeros(signal.shape)
         self.weight = np.ones(signal.shape)
 
@@ -271,10 +273,21 @@ class Refiner:
     def edges(self, cut: float) -> tuple[Edges, Edges]:
         """Return the edges of the current surface along x and along y."""
         (height, slope_x, slope_y), m = self.surface, self.model
-        return (
+        found = (
             find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut),
             find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut),
         )
+        if self.torn is None:
+            return found
+        edges_x, edges_y = (Edges(e.doubt, np.where(t, 0.0, e.intact)) for e, t in zip(found, self.torn, strict=True))
+        return edges_x, edges_y
+
+    def tear(self) -> None:
+        """Cut all edges that may lie behind a rim, until `torn` is None again; only where the instrument is unknown."""
+        if self.moves is None and not len(self.drift):
+            return
+        about = self.signal, self.variance, self.surface, self.shift
+        self.torn = shadow_edges(*about, 1), shadow_edges(*about, 0)
 
     def lag(self, limit: float, cut: float) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""

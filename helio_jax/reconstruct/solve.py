@@ -223,6 +223,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
     fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+    from helio_jax.reconstruct.findings import describe_instrument
+
     posterior = fit.posterior
     is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:
@@ -257,5 +259,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
             "height_changes_um": list(fit.changes),
             "contraction": fit.contraction,
             "sensitivity": sensitivity(fit, settings),
+            "instrument": describe_instrument(fit, settings.refine),
+            "chi_square": fit.chi_square,
         },
     )

@@ -97,6 +97,11 @@ class Posterior:
     stride: int = 1
 
     @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the unknowns that the instrument parameters are entries of, in their order."""
+        return tuple(dict.fromkeys(name.partition("[")[0] for name in self.names))
+
+    @property
     def height_std(self) -> np.ndarray:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
