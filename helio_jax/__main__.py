@@ -209,7 +209,8 @@ def calibrate(
     if as_json:
         print(json.dumps(record | {"detectors": found.instrument.detector_names}))
         return
-    print(f"  {'detector':<12}{'background':>11}{'flat':>9}{'noise':>8}{'SNR':>7}{'lines':>8}{'a + b counts':>17}{'spikes':>8}")
+    heads = ("background", 11), ("flat", 9), ("noise", 8), ("SNR", 7), ("lines", 8), ("a + b counts", 17), ("spikes", 8)
+    print(f"  {'detector':<12}" + "".join(f"{head:>{width}}" for head, width in heads))
     for k, name in enumerate(found.instrument.detector_names):
         flat, background, noise, snr, lines_, a, b, spikes = (
             record[key][k]
@@ -245,8 +246,19 @@ def reconstruct(
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
     for name, factor in result.provenance.get("sensitivity", {}).items():
         print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+    _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
+
+
+def _print_instrument(found: dict[str, Any]) -> None:
+    """Print what a fit found out about the geometry, and what the data leave open of the instrument."""
+    for name, (value, std, prior, unit) in found.get("values", {}).items():
+        if unit in ("um", "deg"):
+            print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
+    for weak in found.get("weak", [])[:3]:
+        terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())
+        print(f"  weakly determined, {weak['left']:.0%} of the prior is left: {terms}")
 
 
 @app.command()

@@ -31,7 +31,9 @@ def save_before_after(before: MicrographStack, after: MicrographStack, path: Pat
         titles = f"{name}: as read (counts)", "taken off (counts)", "left (flat's signal = 1)"
         for ax, image, title in zip(row, (read[k], taken, left[k] * record["gain"][k] / flat), titles, strict=False):
             low, high = robust_range(image)
-            shown = ax.imshow(np.ma.masked_invalid(image), origin="lower", extent=extent, vmin=low, vmax=high, cmap="gray")
+            shown = ax.imshow(
+                np.ma.masked_invalid(image), origin="lower", extent=extent, vmin=low, vmax=high, cmap="gray"
+            )
             fig.colorbar(shown, ax=ax, shrink=0.8)
             ax.set_title(title, fontsize=10, loc="left")
         width = max(1, round(record["settings"]["border_fraction"] * read.shape[3 - slow]))
@@ -39,7 +41,7 @@ def save_before_after(before: MicrographStack, after: MicrographStack, path: Pat
             lines = image if slow == 1 else image.T
             ends = np.concatenate([lines[:, :width], lines[:, -width:]], axis=1)
             row[3].plot(np.nanmean(ends, axis=1) / flat, label=label)
-        row[3].set_title("ends of every scan line, mean / flat's signal", fontsize=10, loc="left")
+        row[3].set_title("ends of the scan lines / flat", fontsize=10, loc="left")
         row[3].set_xlabel("scan line (slow axis)")
         row[3].legend()
         row[3].grid(alpha=0.3)

@@ -103,6 +103,7 @@ def calibrate_on_border(
     """
     frame = border_mask(stack.shape[1:], settings.border_fraction)
     stack, record = _without_faults(stack, settings)
+    assert stack.variance is not None  # estimated, if it was not known
     steady = _steady(stack, frame, settings)
     flat = np.nanmedian(steady[:, frame], axis=1)
     darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)

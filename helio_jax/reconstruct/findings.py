@@ -16,6 +16,8 @@ WEAK = 0.5
 _LISTED = 6
 _TERMS = 4
 """Weak combinations that are listed at most, and parameters that are named in each."""
+_UNTOLD = 1.0 - 1e-6
+"""A parameter that keeps all of its prior deviation touches no datum, and so no height."""
 
 
 def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[float, str]]:
@@ -74,12 +76,13 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         if prior > 0:
             numbers = (float(prior * value), float(prior * std), float(prior))
             values[_plain(name, detectors)] = [*numbers, unit]
-    size, vector = np.linalg.eigh(posterior.instrument_covariance)
+    told = np.flatnonzero(deviation < _UNTOLD)
+    size, vector = np.linalg.eigh(posterior.instrument_covariance[np.ix_(told, told)])
     weak = []
     for i in np.argsort(size)[::-1][:_LISTED]:
         if size[i] <= WEAK**2:
             break
         terms = np.argsort(-np.abs(vector[:, i]))[:_TERMS]
-        of = {_plain(posterior.names[t], detectors): round(float(vector[t, i]), 3) for t in terms}
+        of = {_plain(posterior.names[told[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
         weak.append({"left": float(np.sqrt(size[i])), "of": of})
     return {"values": values, "weak": weak}

@@ -105,7 +105,8 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     data = np.where(is_known, signal, 0.0)
     spread = np.where(is_known, variance, _UNKNOWN * variance[is_known].max())
     strength = [
-        _crests(np.maximum(*(wall_strength(data, spread, axis, half) for half in _HALF_LENGTHS)), axis) for axis in (0, 1)
+        _crests(np.maximum(*(wall_strength(data, spread, axis, half) for half in _HALF_LENGTHS)), axis)
+        for axis in (0, 1)
     ]
     is_calm = np.ones(shape, bool)
     for axis, change in enumerate(strength):

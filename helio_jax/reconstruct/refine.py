@@ -232,9 +232,7 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
     return Fit(
         surface=surface,
         normals=surface.normals(refiner.shift),
-        albedo=np.asarray(
-            smooth_albedo(jnp.asarray(refiner.values["albedo"]), surface.height.shape, s.albedo_std)
-        ),
+        albedo=np.asarray(smooth_albedo(jnp.asarray(refiner.values["albedo"]), surface.height.shape, s.albedo_std)),
         gain=np.exp(s.gain_std * refiner.values["log_gain"]),
         offset=s.offset_std * refiner.mean_signal * refiner.values["offset"],
         background=background,

@@ -23,10 +23,10 @@ from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.aiming import aimed_slopes
 from helio_jax.reconstruct.background import drift_modes
 from helio_jax.reconstruct.edges import Edges, find_edges, geman_mcclure, one_sided, to_pixels
-from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.shadows import shadow_edges
+from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruct.shadows import shadow_edges
 
 _FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
 """Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
@@ -172,7 +172,16 @@ class Refiner:
     """State of one fit: the data, the current surface and instrument, and the lagged quantities."""
 
     def __init__(
-        self, signal, variance, geometry, dx, dy, start: Surface, settings: ReconstructSettings, region=None, slow_axis=0
+        self,
+        signal,
+        variance,
+        geometry,
+        dx,
+        dy,
+        start: Surface,
+        settings: ReconstructSettings,
+        region=None,
+        slow_axis=0,
     ) -> None:
         s = settings.refine
         self.signal, self.variance, self.settings = signal, variance, s
@@ -282,9 +291,20 @@ class Refiner:
         edges_x, edges_y = (Edges(e.doubt, np.where(t, 0.0, e.intact)) for e, t in zip(found, self.torn, strict=True))
         return edges_x, edges_y
 
+    @property
+    def is_unknown(self) -> bool:
+        """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""
+        return self.moves is not None or len(self.drift) > 0
+
+    def _mixing(self, model: Model, start: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return the instruments that are fitted: as they are where hardly anything is unknown of it."""
+        if self.is_unknown:
+            return _mixing(model, start, lagged)
+        return jnp.eye(sum(getattr(start, name).size for name in model.instrument_fields(start)))
+
     def tear(self) -> None:
         """Cut all edges that may lie behind a rim, until `torn` is None again; only where the instrument is unknown."""
-        if self.moves is None and not len(self.drift):
+        if not self.is_unknown:
             return
         about = self.signal, self.variance, self.surface, self.shift
         self.torn = shadow_edges(*about, 1), shadow_edges(*about, 0)
@@ -354,7 +374,7 @@ class Refiner:
         """Solve one weighted least-squares problem from the current surface."""
         s = self.settings
         problem = self.model, *self.lag(limit, cut)
-        mixing = _mixing(*problem) if is_instrument_free else None
+        mixing = self._mixing(*problem) if is_instrument_free else None
         found = _solve(*problem, s.lm_steps, s.cg_steps, mixing)
         self.surface = Surface(*map(np.asarray, found.surface))
         self.values = {name: np.asarray(getattr(found.unknowns, name)) for name in INSTRUMENT}

@@ -15,8 +15,14 @@ def problem(geometry):
     """Heights, aims and a direction in both."""
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
-        at = {"height": jnp.asarray(rng.normal(scale=200.0, size=(4, 5))), "aim": jnp.asarray(rng.normal(scale=0.05, size=(2, 2)))}
-        way = {"height": jnp.asarray(rng.normal(scale=100.0, size=(4, 5))), "aim": jnp.asarray(rng.normal(scale=0.1, size=(2, 2)))}
+        at = {
+            "height": jnp.asarray(rng.normal(scale=200.0, size=(4, 5))),
+            "aim": jnp.asarray(rng.normal(scale=0.05, size=(2, 2))),
+        }
+        way = {
+            "height": jnp.asarray(rng.normal(scale=100.0, size=(4, 5))),
+            "aim": jnp.asarray(rng.normal(scale=0.1, size=(2, 2))),
+        }
         yield jax.jit(lambda v: {"phi": aimed_form_factor(geometry, v["height"], v["aim"])}), at, way
 
 
@@ -31,9 +37,13 @@ def test_the_same_as_a_moved_instrument(geometry):
     with jax.enable_x64(True):
         ours = np.asarray(aimed_form_factor(geometry, jnp.asarray(height - distance), jnp.asarray(aim)))
     assert ours == pytest.approx(moved, rel=1e-9, abs=1e-12)
-    polar = [np.arctan2(np.hypot(*a.center), geometry.instrument.working_distance) for a in geometry.instrument.apertures()]
+    polar = [
+        np.arctan2(np.hypot(*a.center), geometry.instrument.working_distance) for a in geometry.instrument.apertures()
+    ]
     new = geometry.instrument.moved(aim, 0.0)
-    assert [np.arctan2(np.hypot(*a.center), new.working_distance) for a in new.apertures()] == pytest.approx(polar + aim[:, 0])
+    assert [np.arctan2(np.hypot(*a.center), new.working_distance) for a in new.apertures()] == pytest.approx(
+        polar + aim[:, 0]
+    )
 
 
 def test_derivatives(problem):
