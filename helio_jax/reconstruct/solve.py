@@ -29,6 +29,12 @@ MAX_WIDTH = 0.125
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 
+GEOMETRY_DOUBT = (
+    "the geometry was fitted, too: heights behind a shadowed rim may come out low by more than their stated "
+    "deviations (benchmarks/calibration.py); compare with nearfield"
+)
+"""What the status says of a fit whose aims or distance are unknown."""
+
 if TYPE_CHECKING:
     from helio_jax.reconstruct.refine import Fit, Report
     from helio_jax.reconstruct.refiner import Predict
@@ -235,6 +241,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         depth_jumps(height, slope_x, fit.intact_x, pitch(stack.x), 1),
         depth_jumps(height, slope_y, fit.intact_y, pitch(stack.y), 0),
     )
+    is_moved = bool(fit.values["aim"].size or fit.values["distance"].size)
     n_telling = telling(fit.model_share, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack), worst, n_telling, *jumps, is_floating)
     return Reconstruction(
@@ -252,7 +259,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         residuals=fit.residuals,
         gain=fit.gain,
         offset=fit.offset,
-        status=fit.status,
+        status=f"{fit.status}; {GEOMETRY_DOUBT}" if is_moved else fit.status,
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),
