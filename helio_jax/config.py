@@ -80,7 +80,7 @@ def load_instrument(path: str | os.PathLike) -> Instrument:
     """Read the instrument of an instrument file, or of any scene file.
 
     Raises:
-        SceneError: as `load_scene`; only the tables beam, plate and detector are checked.
+        SceneError: as `load_scene`; only the tables beam, plate, uncertainty and detector are checked.
     """
     data = _read_extended(Path(path))
     known = set(SceneFile.model_fields) - set(Instrument.model_fields)

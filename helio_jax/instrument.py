@@ -149,6 +149,19 @@ class Detector(Settings):
         return self
 
 
+class Uncertainty(Settings):
+    """How well the geometry is known: standard deviations, which the fit takes for priors; 0: known exactly."""
+
+    sample_distance_um: float = Field(default=0.0, ge=0.0, le=1e5)
+    """Of the distance from the plate to the sample's reference plane [um]."""
+    tilt_deg: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Of the reference plane's tilt against the plate, about each of x and y [deg]."""
+    polar_deg: float = Field(default=0.0, ge=0.0, le=30.0)
+    """Of the angle between each aperture's centre and the plate normal, seen from the nominal spot [deg]."""
+    azimuth_deg: float = Field(default=0.0, ge=0.0, le=30.0)
+    """Of each aperture's azimuth about the nominal spot [deg]."""
+
+
 @dataclass(frozen=True)
 class Aperture:
     """A detector aperture resolved to its ellipse on the plate (lab frame, um, radians, SEMI-axes)."""
@@ -199,6 +212,7 @@ class Instrument(Settings):
 
     beam: Beam = Beam()
     plate: Plate
+    uncertainty: Uncertainty = Uncertainty()
     detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")
@@ -260,6 +274,29 @@ class Instrument(Settings):
                 polar, azimuth, half = map(math.radians, (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg))
                 out.append(cone_ellipse(polar, azimuth, half, self.working_distance))
         return tuple(out)
+
+    def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
+        """Return the instrument with its apertures aimed elsewhere and the sample farther away.
+
+        Each aperture is shifted along its azimuth until its centre is seen from the nominal spot under a polar angle
+        larger by `aim[:, 0]`, and turned about the plate normal through that spot by `aim[:, 1]`.
+
+        Args:
+            aim: changes of polar angle and azimuth [detector, 2], rad.
+            distance: change of the sample's distance, um.
+        """
+        detectors = []
+        for d, a, (polar, azimuth) in zip(self.detector, self.apertures(), aim, strict=True):
+            radius, turn = math.hypot(*a.center), math.atan2(a.center[1], a.center[0]) + azimuth
+            radius = self.working_distance * math.tan(math.atan2(radius, self.working_distance) + polar)
+            ellipse = {
+                "center_um": (radius * math.cos(turn), radius * math.sin(turn)),
+                "axes_um": (2.0 * a.semi_axes[0], 2.0 * a.semi_axes[1]),
+                "rotation_deg": math.degrees(math.remainder(a.rotation + azimuth, 2.0 * math.pi)),
+            }
+            detectors.append(Detector(name=d.name, channel=d.channel, **ellipse))
+        plate = self.plate.model_copy(update={"sample_distance_um": self.sample_distance + distance})
+        return Instrument(beam=self.beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
 
     def spot_position(self, height: Any) -> tuple[Any, Any, Any]:
         """Return the lab position (x, y, z) [um] of the point at `height` above the reference plane.

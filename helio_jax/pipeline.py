@@ -13,10 +13,11 @@ from pydantic import ValidationError
 from helio_jax.checkpoint import Keeper, Shard
 from helio_jax.config import SceneFile, load_scene
 from helio_jax.errors import InputFileError, ResumeError, SceneError
+from helio_jax.evaluate.before_after import save_before_after
 from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Scores, Truth, evaluate_height
 from helio_jax.evaluate.report import write_report
-from helio_jax.formats.hdf5 import write
+from helio_jax.formats.hdf5 import read, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
@@ -185,10 +186,47 @@ def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
     return add_noise(stack, scene.noise) if scene.noise.enabled and stack.noise == "expected" else stack
 
 
-def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None) -> MicrographStack:
-    """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`)."""
+def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
+    """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`).
+
+    Args:
+        stack: measured counts.
+        settings: table [calibrate]; default: its defaults.
+        changes: settings that replace those, e.g. drift=False.
+
+    Raises:
+        SceneError: the stack is calibrated already, or its beam is known (simulated).
+        GuardError: a detector has no signal.
+    """
+    if stack.n_rays is not None:
+        raise SceneError(
+            f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
+            "calibrated already; calibrate the imported file itself"
+        )
     flat = SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
-    return calibrate_on_border(stack, flat, settings or CalibrateSettings())
+    return calibrate_on_border(stack, flat, _changed(settings or CalibrateSettings(), changes))
+
+
+def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
+    """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
+    found = read(path)
+    if isinstance(found, Reconstruction):
+        raise SceneError(f"{path} holds a height map: give the file of its micrographs")
+    before = found.only() if isinstance(found, MicrographSet) else found
+    after = calibrate(before, **changes)
+    write(after, output)
+    save_before_after(before, after, Path(output).with_suffix(".png"))
+    return after
+
+
+def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
+    """Return changes of the settings, those added that the stack's calibration asks for and nobody has given."""
+    given = dict(changes.get("refine", {}))
+    priors = stack.provenance.get("calibrate", {}).get("priors", {})
+    asked = {key: value for key, value in priors.items() if key not in settings.refine.model_fields_set}
+    if not asked and not given:
+        return changes
+    return changes | {"refine": settings.refine.model_dump() | asked | given}
 
 
 def calibrate_turned(stack: MicrographStack) -> MicrographStack:
@@ -242,7 +280,8 @@ def reconstruct(
     if one.noise == "measured" and one.n_rays is None:
         one = calibrate_turned(one) if "align" in one.provenance else calibrate(one)
     wanted = changes | ({"method": method} if method else {})
-    chosen = _changed(settings or ReconstructSettings(), wanted)
+    settings = settings or ReconstructSettings()
+    chosen = _changed(settings, _with_priors(settings, one, wanted))
     refine = chosen.refine
 
     def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:

@@ -9,6 +9,7 @@ the beam does not see may stand anywhere between that sheet and below the rim: b
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -51,8 +52,8 @@ def make_predictor(
     seed: int = 7,
     workers: int | None = None,
     multiple: Literal["traced", "radiosity"] = "traced",
-) -> Callable[[np.ndarray, np.ndarray], Prediction]:
-    """Return a function that predicts masks and multiple scattering of a surface.
+) -> Callable[..., Prediction]:
+    """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
@@ -70,14 +71,19 @@ def make_predictor(
             "reconstruct.refine.multiple = 'radiosity': it knows nothing of what a scattering plate sends back: "
             "set it to 'traced'"
         )
-    instrument = stack.instrument.with_cosine_plate()
-    geometry, dx, dy = SpotGeometry(instrument), pitch(stack.x), pitch(stack.y)
+    dx, dy = pitch(stack.x), pitch(stack.y)
     border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
-    reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
-    raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach)
-    radiosity = Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
 
-    def predict(height: np.ndarray, normals: np.ndarray) -> Prediction:
+    @lru_cache(maxsize=1)
+    def about_instrument(given: str) -> tuple[SpotGeometry, _Raster, Radiosity | None]:
+        instrument = Instrument.model_validate_json(given).with_cosine_plate()
+        reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
+        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach)
+        geometry = SpotGeometry(instrument)
+        return geometry, raster, Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
+
+    def predict(height: np.ndarray, normals: np.ndarray, instrument: Instrument = stack.instrument) -> Prediction:
+        geometry, raster, radiosity = about_instrument(instrument.model_dump_json())
         a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
         about = (geometry, dx, dy)
         hidden = np.asarray(hidden_form_factor(height, a, b, *about))

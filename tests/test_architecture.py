@@ -38,7 +38,8 @@ DOORS = {
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
     "matplotlib": {
-        f"evaluate/{name}.py" for name in ("figures", "agreement_figure", "overlay", "pick", "spot", "sweep")
+        f"evaluate/{name}.py"
+        for name in ("figures", "agreement_figure", "before_after", "overlay", "pick", "spot", "sweep")
     },
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/refiner.py"},

@@ -31,6 +31,7 @@ def reconstruct(
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
     for name, factor in result.provenance.get("sensitivity", {}).items():
         print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+    _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
 
@@ -107,3 +108,13 @@ def _read_height(path: Path) -> Any:
             f"{path}: must hold a height map, got a {type(found).__name__}: helio reconstruct makes one"
         )
     return found
+
+
+def _print_instrument(found: dict[str, Any]) -> None:
+    """Print what a fit found out about the geometry, and what the data leave open of the instrument."""
+    for name, (value, std, prior, unit) in found.get("values", {}).items():
+        if unit in ("um", "deg"):
+            print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
+    for weak in found.get("weak", [])[:3]:
+        terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())
+        print(f"  weakly determined, {weak['left']:.0%} of the prior is left: {terms}")

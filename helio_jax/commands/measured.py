@@ -1,4 +1,4 @@
-"""Commands for files of other programs and measured scans: import, export, align, pick, compare.
+"""Commands for files of other programs and measured scans: import, export, calibrate, align, pick, compare.
 
 Each parses, calls, prints; no logic of its own.
 """
@@ -128,3 +128,41 @@ def pick(
     before = read_points(output) if output.exists() else {}
     picks = pick_points(_read_set(scans), before, lambda found: write_points(output, found))
     print(f"{output}: {sum(map(len, picks.values()))} picks in {len(picks)} scans")
+
+
+@app.command()
+def calibrate(
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5), from helio import.")],
+    output: OutFile,
+    drift: Annotated[bool, typer.Option(help="Take slow drift off, and leave it to the fit.")] = True,
+    lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
+    noise_model: Annotated[bool, typer.Option(help="Let the variance follow the counts.")] = True,
+    spike_limit: Annotated[float | None, typer.Option(help="Standard deviations of a spike; 0: none.")] = None,
+    masked_share: Annotated[float | None, typer.Option(help="Multiple scattering in the darkest spot / flat.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate background, gain, drift and noise of a measured scan; the fit goes on from these estimates."""
+    from helio_jax.pipeline import calibrate_file
+
+    given = given_options(spike_limit=spike_limit, masked_share=masked_share)
+    found = calibrate_file(stack, output, drift=drift, lines=lines, noise_model=noise_model, **given)
+    record = found.provenance["calibrate"]
+    if as_json:
+        print(json.dumps(record | {"detectors": found.instrument.detector_names}))
+        return
+    heads = ("background", 11), ("flat", 9), ("noise", 8), ("SNR", 7), ("lines", 8), ("a + b counts", 17), ("spikes", 8)
+    print(f"  {'detector':<12}" + "".join(f"{head:>{width}}" for head, width in heads))
+    for k, name in enumerate(found.instrument.detector_names):
+        flat, background, noise, snr, lines_, a, b, spikes = (
+            record[key][k]
+            for key in (
+                "flat", "background", "pixel_std", "snr", "line_noise", "noise_constant", "noise_per_count", "spikes"
+            )
+        )  # fmt: skip
+        law = f"{a:.0f} + {b:.2f}"
+        print(
+            f"  {name:<12}{background:>11.0f}{flat - background:>9.0f}{noise:>8.1f}{snr:>7.2f}{lines_:>8.1f}"
+            f"{law:>17}{spikes:>8}"
+        )
+    print(f"flat: signal above the background, whose prior deviation is {record['priors']['offset_std']:.0%} of it")
+    print(f"{output}\n{output.with_suffix('.png')}")

@@ -1,10 +1,11 @@
-"""First calibration of a measured scan: slow drift, background and gain from the flat border of the image.
+"""First calibration of a measured scan: spikes, noise, slow drift, background and gain, with how far to trust them.
 
 Measured stack (counts with unknown background and gain) -> the same stack in units of the beam, ready for a fit.
-The drift is taken from the border; the gain from the border, whose expected signal is known; the background from the
-darkest pixels: there the sample hides the whole aperture, and what is left above the background is multiple
-scattering, of which a share of the flat's signal is assumed. A rough first estimate: gain and offset must stay
-unknowns of the fit, with wide priors. Needs a flat border and a spot that is masked in each image.
+The drift is taken from the flat border; the gain from the border, whose expected signal is known; the background from
+the darkest pixels: there the sample hides the whole aperture, and what is left above the background is multiple
+scattering, of which a share of the flat's signal is assumed. All of that is a first estimate and fixes nothing: the
+stack carries prior deviations (provenance, `calibrate.priors`) with which gain, offset, drift and the scan lines stay
+unknowns of the fit. Needs a flat border and a spot that is masked in each image.
 """
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydantic import Field
 from helio_jax.arrays import border_mask
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
+from helio_jax.prepare.faults import estimate_noise, find_spikes, line_noise
 from helio_jax.settings import Settings
 
 
@@ -27,15 +29,31 @@ class CalibrateSettings(Settings):
     """Quantile of each image that is taken as a wholly masked spot."""
     masked_share: float = Field(default=0.27, ge=0.0, lt=0.9)
     """Multiple scattering in such a spot, as a share of the flat's signal (0.27 in the simulated sphere A)."""
+    drift: bool = True
+    """Whether drift is taken off and left as an unknown of the fit."""
+    noise_model: bool = True
+    """Whether the variance follows the counts (a + b counts, from the data); else it stays as imported."""
+    spike_limit: float = Field(default=6.0, ge=0.0, le=100.0)
+    """A pixel that exceeds all its neighbours by so many standard deviations is a spike, unobserved; 0: none is."""
+    lines: bool = True
+    """Whether offsets of single scan lines are unknowns of the fit."""
+    gain_std: float = Field(default=0.3, gt=0.0, le=1.0)
+    """Prior deviation of the gain, relative, handed on to the fit."""
+    offset_std: float = Field(default=0.3, gt=0.0, le=1.0)
+    """Prior deviation of the background, relative to the flat's signal, handed on to the fit."""
+    drift_std: float = Field(default=0.2, gt=0.0, le=1.0)
+    """Prior deviation of what drift is left, relative to the flat's signal, handed on to the fit."""
 
 
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
     """Return the drift of an image whose rows are scanned one after another, mean zero [y, x].
 
-    A polynomial in the row (time) and a slope along the row, fitted robustly to the frame's pixels.
+    A polynomial in the row (time), and along the row a parabola and a slope that changes with the row, fitted robustly
+    to the frame's pixels.
     """
     time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in image.shape), indexing="ij")
-    basis = np.concatenate([np.polynomial.legendre.legvander(time, degree), along[..., None]], -1)
+    lines = np.stack([along, along**2, along * time], -1)
+    basis = np.concatenate([np.polynomial.legendre.legvander(time, degree), lines], -1)
     keep = frame & np.isfinite(image)
     for _ in range(4):
         coefficients = np.linalg.lstsq(basis[keep], image[keep], rcond=None)[0]
@@ -45,27 +63,48 @@ def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
     return curve - curve.mean()
 
 
+def _steady(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettings) -> np.ndarray:
+    """Return the counts without drift [detector, y, x], NaN where not observed."""
+    counts = np.where(stack.is_observed, stack.counts, np.nan)
+    if not settings.drift:
+        return counts
+    if stack.fast_axis == "x":
+        return np.stack([image - _drift(image, frame, settings.drift_degree) for image in counts])
+    return np.stack([image - _drift(image.T, frame.T, settings.drift_degree).T for image in counts])
+
+
+def _without_faults(stack: MicrographStack, settings: CalibrateSettings) -> tuple[MicrographStack, dict]:
+    """Return the stack with the noise of its counts and without spikes, and what was found."""
+    model = estimate_noise(stack)
+    record = {"noise_constant": model.constant.tolist(), "noise_per_count": model.per_count.tolist()}
+    spread = model.variance(stack.counts)
+    if settings.noise_model or stack.variance is None:
+        stack = stack.replace(variance=spread)
+    spikes = np.zeros(stack.shape, bool)
+    if settings.spike_limit > 0:
+        spikes = find_spikes(stack, spread, settings.spike_limit)
+        stack = stack.replace(is_observed=stack.is_observed & ~spikes)
+    record["spikes"] = spikes.sum((1, 2)).tolist()
+    return stack, record
+
+
 def calibrate_on_border(
     stack: MicrographStack, flat_signal: np.ndarray, settings: CalibrateSettings
 ) -> MicrographStack:
-    """Return the stack in units of the beam, with background and slow drift removed.
+    """Return the stack in units of the beam, with first estimates of background and slow drift taken off.
 
     Args:
         stack: measured counts.
         flat_signal: detection probability of the flat reference plane [detector].
-        settings: border, drift, background.
+        settings: border, drift, background, priors.
 
     Raises:
         GuardError: a detector's border is not brighter than its background, so that it has no signal.
     """
-    is_row_slow = stack.fast_axis == "x"
     frame = border_mask(stack.shape[1:], settings.border_fraction)
-    steady = np.where(stack.is_observed, stack.counts, np.nan)
-    for k, image in enumerate(steady):
-        if is_row_slow:
-            steady[k] = image - _drift(image, frame, settings.drift_degree)
-        else:
-            steady[k] = image - _drift(image.T, frame.T, settings.drift_degree).T
+    stack, record = _without_faults(stack, settings)
+    assert stack.variance is not None  # estimated, if it was not known
+    steady = _steady(stack, frame, settings)
     flat = np.nanmedian(steady[:, frame], axis=1)
     darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)
     background = darkest - settings.masked_share / (1.0 - settings.masked_share) * (flat - darkest)
@@ -77,10 +116,19 @@ def calibrate_on_border(
             )
     gain = (flat - background) / flat_signal
     scale = gain[:, None, None]
-    record = {"gain": gain.tolist(), "background": background.tolist(), "settings": settings.model_dump(mode="json")}
+    pixel_std = np.sqrt(np.nanmedian(np.where(frame, stack.variance, np.nan), axis=(1, 2)))
+    of_lines = line_noise(stack, steady, frame)
+    lines = float(np.sqrt(np.mean((of_lines / (flat - background)) ** 2)))
+    record["line_noise"] = of_lines.tolist()
+    priors = {"gain_std": settings.gain_std, "offset_std": settings.offset_std}
+    priors |= {"drift_std": settings.drift_std} if settings.drift else {}
+    priors |= {"line_std": lines} if settings.lines and lines > 0 else {}
+    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": flat.tolist(), "priors": priors}
+    record |= {"snr": ((flat - background) / pixel_std).tolist(), "pixel_std": pixel_std.tolist()}
+    record["settings"] = settings.model_dump(mode="json")
     return stack.replace(
         counts=(steady - background[:, None, None]) / scale,
-        variance=None if stack.variance is None else stack.variance / scale**2,
+        variance=stack.variance / scale**2,
         background=None,
         n_rays=1.0,
         unit="detected per beam atom",

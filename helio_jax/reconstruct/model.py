@@ -106,7 +106,10 @@ class Lagged(NamedTuple):
     What is hidden follows the levels of the plateaus: `plateau` [plateau, y, x] are the weights whose sum over the
     heights is a plateau's level above the ground, `level` [plateau] its value at the prediction and `level_response`
     [plateau, detector, 3, y, x] the change of `hidden` per um of it. `noise_change` is
-    from `Model.noise_change`.
+    from `Model.noise_change`. What is hidden also follows the geometry: `hidden_moves` [move, detector, 3, y, x] is its
+    change per unit of a move (distance, polar angle, azimuth; um, rad), from where it was predicted, `predicted_moves`
+    [move, detector]; both have no moves where the geometry is known. `drift` [mode, y, x] are the shapes of the slow
+    drift, and `across` (x, y) [2, y, x] the positions [um] by which a tilt raises the border.
     """
 
     data: Any
@@ -118,6 +121,10 @@ class Lagged(NamedTuple):
     plateau: Any
     level: Any
     level_response: Any
+    hidden_moves: Any
+    predicted_moves: Any
+    drift: Any
+    across: Any
     intact_x: Any
     intact_y: Any
     edge_x: Any
@@ -129,17 +136,23 @@ class Lagged(NamedTuple):
     gain_std: Any
     offset_std: Any
     multiple_std: Any
+    drift_std: Any
+    lines_std: Any
+    distance_std: Any
+    tilt_std: Any
+    aim_std: Any
 
 
-INSTRUMENT = "log_gain", "offset", "log_multiple", "unseen", "albedo"
+INSTRUMENT = "log_gain", "offset", "log_multiple", "unseen", "albedo", "drift", "lines", "distance", "tilt", "aim"
 """Names of the unknowns that are not the surface, as the last fields of `Unknowns`."""
 
 
 class Unknowns(NamedTuple):
     """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; one for the unseen
-    side; albedo modes.
+    side; albedo modes; slow drift [detector, mode]; offsets of the scan lines [detector, line]; distance of the sample
+    [1], its tilt [2: x, y]; polar angle and azimuth of the apertures [detector, 2].
 
-    All but the surface in prior deviations.
+    All but the surface in prior deviations. Unknowns that are known have no entries.
     """
 
     height: Any
@@ -150,6 +163,11 @@ class Unknowns(NamedTuple):
     log_multiple: Any
     unseen: Any
     albedo: Any
+    drift: Any
+    lines: Any
+    distance: Any
+    tilt: Any
+    aim: Any
 
 
 def smooth_albedo(modes: jax.Array, shape: tuple[int, ...], std: float) -> jax.Array:
@@ -170,6 +188,7 @@ class Model(eqx.Module):
     dx: float = eqx.field(static=True)
     dy: float = eqx.field(static=True)
     albedo_std: float = eqx.field(static=True)
+    slow_axis: int = eqx.field(static=True, default=0)
 
     def surface(self, unknowns: Unknowns, lagged: Lagged) -> Surface:
         """Return heights and slopes of whitened unknowns."""
@@ -184,12 +203,15 @@ class Model(eqx.Module):
 
     def thinned(self, stride: int) -> "Model":
         """Return the model of every `stride`-th row and column."""
-        return Model(self.geometry, self.dx * stride, self.dy * stride, self.albedo_std)
+        return Model(self.geometry, self.dx * stride, self.dy * stride, self.albedo_std, self.slow_axis)
 
-    @property
-    def instrument_fields(self) -> tuple[str, ...]:
-        """Names of the unknowns that are not the surface and not fixed."""
-        return tuple(name for name in INSTRUMENT if name != "albedo" or self.albedo_std > 0)
+    def instrument_fields(self, unknowns: Unknowns) -> tuple[str, ...]:
+        """Return the names of the unknowns of the instrument that are not known.
+
+        Without the scan lines' offsets: a line has so many pixels that its own noise tells nothing of the others.
+        """
+        free = tuple(name for name in INSTRUMENT if name != "lines" and getattr(unknowns, name).size)
+        return tuple(name for name in free if name != "albedo" or self.albedo_std > 0)
 
     def normal(self, surface: Surface) -> jax.Array:
         """Return the unit normals [3, y, x]."""
@@ -199,16 +221,48 @@ class Model(eqx.Module):
         """Return the expected data [detector, y, x] in units of the beam."""
         rise = jnp.einsum("ryx,yx->r", lagged.plateau, surface.height) - lagged.level
         hidden = lagged.hidden + jnp.tensordot(rise, lagged.level_response, 1)
-        single = render_single(surface.height, self.normal(surface), hidden, self.geometry)
+        moves = self.moves(unknowns, lagged)
+        if moves is not None:
+            hidden = hidden + jnp.einsum("mk,mkiyx->kiyx", moves - lagged.predicted_moves, lagged.hidden_moves)
+        single = self.single(surface, self.normal(surface), hidden, moves)
         albedo = smooth_albedo(unknowns.albedo, surface.height.shape, self.albedo_std)
         gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
-        offset = (lagged.offset_std * unknowns.offset)[:, None, None]
         multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
         single = single - lagged.noise_change
-        return gain * (albedo * single + multiple + unknowns.unseen * lagged.unseen) + offset
+        read = gain * (albedo * single + multiple + unknowns.unseen * lagged.unseen)
+        return read + self.background(unknowns, lagged)
+
+    def background(self, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return what the detectors read without signal: offset, slow drift, scan lines ([detector, y, x] or less)."""
+        offset = (lagged.offset_std * unknowns.offset)[:, None, None]
+        if unknowns.drift.size:
+            offset = offset + jnp.tensordot(lagged.drift_std * unknowns.drift, lagged.drift, 1)
+        if unknowns.lines.size:
+            offset = offset + jnp.expand_dims(lagged.lines_std[:, None] * unknowns.lines, 2 - self.slow_axis)
+        return offset
+
+    def moves(self, unknowns: Unknowns, lagged: Lagged) -> jax.Array | None:
+        """Return distance [um], polar angle and azimuth [rad] beyond the stated ones [move, detector], if unknown."""
+        if not lagged.hidden_moves.size:
+            return None
+        k = lagged.data.shape[0]
+        distance = jnp.broadcast_to(jnp.sum(lagged.distance_std * unknowns.distance), (1, k))
+        aim = (lagged.aim_std * unknowns.aim).T if unknowns.aim.size else jnp.zeros((2, k))
+        return jnp.concatenate([distance, aim])
+
+    def single(self, surface: Surface, normal: jax.Array, hidden: jax.Array, moves: jax.Array | None) -> jax.Array:
+        """Return the single-scattering probabilities [detector, y, x]; the geometry as stated, or moved."""
+        if moves is None:
+            return render_single(surface.height, normal, hidden, self.geometry)
+        return render_single(surface.height - moves[0, 0], normal, hidden, self.geometry, moves[1:].T)
 
     def noise_change(
-        self, surface: Surface, hidden: jax.Array, inverse_sigma: jax.Array, largest: jax.Array
+        self,
+        surface: Surface,
+        hidden: jax.Array,
+        inverse_sigma: jax.Array,
+        largest: jax.Array,
+        moves: jax.Array | None = None,
     ) -> jax.Array:
         """Return by how much the noise of the fitted slopes changes the mean signal of their facets [detector, y, x].
 
@@ -221,13 +275,14 @@ class Model(eqx.Module):
             hidden: as in `Lagged`.
             inverse_sigma: of the data [detector, y, x].
             largest: deviation of the slopes that more noise does not exceed [y, x].
+            moves: as from `moves`.
 
         Source: Neyman and Scott, Econometrica 16 (1948) 1; second order: Box, J. R. Stat. Soc. B 33 (1971) 171.
         """
 
         def signal(x: jax.Array, y: jax.Array) -> jax.Array:
             normal = self.normal(surface._replace(slope_x=x, slope_y=y))
-            return render_single(surface.height, normal, hidden, self.geometry)
+            return self.single(surface, normal, hidden, moves)
 
         def along(function, way):
             return lambda *slopes: jax.jvp(function, slopes, way)[1]
@@ -267,12 +322,15 @@ class Model(eqx.Module):
             "data": self.data_residuals(surface, unknowns, lagged),
             "edge_x": edge_x,
             "edge_y": edge_y,
-            "border": surface.height * lagged.border,
+            "border": self.border_residuals(surface, unknowns, lagged),
             "slope_x": surface.slope_x / SLOPE_STD,
             "slope_y": surface.slope_y / SLOPE_STD,
-            "gain": unknowns.log_gain,
-            "offset": unknowns.offset,
-            "multiple": unknowns.log_multiple,
-            "unseen": unknowns.unseen,
-            "albedo": unknowns.albedo,
+            **{name: getattr(unknowns, name) for name in INSTRUMENT},
         }
+
+    def border_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return the heights' deviations from the reference plane, which may be tilted, where they are known [y, x]."""
+        height = surface.height
+        if unknowns.tilt.size:
+            height = height - jnp.tensordot(lagged.tilt_std * unknowns.tilt, lagged.across, 1)
+        return height * lagged.border

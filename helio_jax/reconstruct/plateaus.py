@@ -52,7 +52,7 @@ Misfit = Callable[[Surface], tuple[float, Surface]]
 """Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
 
 
-def _change(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
+def wall_strength(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
     """Return the change across every edge, in chi-square without the detector that changes most.
 
     Two pixels on each side are compared, averaged over 2 half + 1 pixels along the edge.
@@ -105,7 +105,8 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     data = np.where(is_known, signal, 0.0)
     spread = np.where(is_known, variance, _UNKNOWN * variance[is_known].max())
     strength = [
-        _crests(np.maximum(*(_change(data, spread, axis, half) for half in _HALF_LENGTHS)), axis) for axis in (0, 1)
+        _crests(np.maximum(*(wall_strength(data, spread, axis, half) for half in _HALF_LENGTHS)), axis)
+        for axis in (0, 1)
     ]
     is_calm = np.ones(shape, bool)
     for axis, change in enumerate(strength):

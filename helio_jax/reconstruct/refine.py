@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import INSTRUMENT, Surface, smooth_albedo
+from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
@@ -31,6 +32,10 @@ class Fit:
         normals: unit normals [y, x, 3].
         albedo: relative reflectivity [y, x].
         gain, offset: per detector, data = gain * model + offset.
+        background: offset, slow drift and scan lines together [detector, y, x], in units of the beam.
+        tilt: slopes (x, y) of the reference plane, from which the heights have been taken.
+        instrument: with the geometry that was fitted.
+        values: unknowns of the instrument, in prior deviations, by name.
         residuals: (model - data) / standard deviation [detector, y, x].
         weight: what robust weighting left of each datum [detector, y, x].
         model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].
@@ -47,6 +52,10 @@ class Fit:
     albedo: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
+    background: np.ndarray
+    tilt: np.ndarray
+    instrument: Instrument
+    values: dict[str, np.ndarray]
     residuals: np.ndarray
     weight: np.ndarray
     model_share: np.ndarray
@@ -57,6 +66,12 @@ class Fit:
     contraction: float | None
     status: str
     is_interrupted: bool = False
+
+    @property
+    def chi_square(self) -> list[float]:
+        """Mean square residual of the data of every detector, each counted by its robust weight, squared."""
+        total = np.sum((self.weight * self.residuals) ** 2, axis=(1, 2))
+        return (total / np.maximum(np.sum(self.weight**2, axis=(1, 2)), 1e-300)).tolist()
 
 
 def _thinning(shape: tuple[int, int]) -> int:
@@ -87,9 +102,10 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         Surface(*(field[thin] for field in refiner.surface)),
         settings,
         None if region is None else region[thin],
+        m.slow_axis,
     )
-    for name in INSTRUMENT:
-        setattr(part, name, getattr(refiner, name))
+    part.values = refiner.values | {"lines": refiner.values["lines"][:, ::stride]}
+    part.drift = refiner.drift[:, *thin]
     part.residuals = refiner.residuals[:, *thin]
     predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
     part.adopt(refiner.prediction.thinned(thin), predicted_on)
@@ -115,15 +131,18 @@ def misfit_on(
     surface: Surface,
     settings: ReconstructSettings,
     predict: Predict,
+    slow_axis: int = 0,
+    values: dict[str, np.ndarray] | None = None,
 ) -> tuple[float, Surface]:
     """Return half the robust chi-square that is left when a surface's relief is fitted to the data, and that surface.
 
-    Counts data, with the logarithm of their assumed deviations, and edges; the instrument is at its prior means.
-    Arguments as those of `fit_heights`.
+    Counts data, with the logarithm of their assumed deviations, and edges; the instrument stays at `values`, or at its
+    prior means. Arguments as those of `fit_heights`.
     """
     s = settings.refine
     with jax.enable_x64(True):
-        refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings)
+        refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings, None, slow_axis)
+        refiner.values |= values or {}
         refiner.predict(predict)
         for _ in range(s.reweightings):
             refiner.step(s.robust_limits[-1], s.jump_limits[-1], False)
@@ -141,6 +160,7 @@ def fit_heights(
     predict: Predict,
     report: Report | None = None,
     region: np.ndarray | None = None,
+    slow_axis: int = 0,
 ) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
 
@@ -155,12 +175,13 @@ def fit_heights(
         predict: multiple scattering and hidden form factor on a surface.
         report: called before each outer round.
         region: plateaus, from `find_plateaus` [y, x], whose masks are to follow their levels.
+        slow_axis: along which the scan moves slowly, 0 (y) or 1 (x).
 
     Source: own derivation; Levenberg-Marquardt of optimistix; lagged robust weights (Geman and McClure, 1987).
     """
     s = settings.refine
     with jax.enable_x64(True):
-        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region)
+        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, slow_axis)
         changes: list[float] = []
         is_interrupted = False
         said = "start"
@@ -170,6 +191,8 @@ def fit_heights(
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
+                if number == s.fixed_rounds:
+                    refiner.tear()
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
                     found = refiner.step(limit, cut, number >= s.fixed_rounds)
@@ -178,6 +201,7 @@ def fit_heights(
                     raise
                 refiner.surface, is_interrupted = before, True
                 break
+            refiner.torn = None
             changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
             cost = float(sum(found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
@@ -188,7 +212,7 @@ def fit_heights(
 
 
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
-    s, surface = refiner.settings, refiner.surface
+    s = refiner.settings
     contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
     last = (
         f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {s.tolerance_um:g} um)"
@@ -201,12 +225,20 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         status = f"diverging: {last}, {contraction:.2f} times the round before; raise mask_error or use nearfield"
     else:
         status = f"stopped: {last}; raise max_rounds for more"
+    _, lagged = refiner.lag(s.robust_limits[-1], s.jump_limits[-1])
+    values = Unknowns(*(None,) * 3, **{name: jnp.asarray(value) for name, value in refiner.values.items()})
+    background = np.broadcast_to(refiner.model.background(values, lagged), refiner.signal.shape)
+    surface = refiner.levelled
     return Fit(
         surface=surface,
         normals=surface.normals(refiner.shift),
-        albedo=np.asarray(smooth_albedo(jnp.asarray(refiner.albedo), surface.height.shape, s.albedo_std)),
-        gain=np.exp(s.gain_std * refiner.log_gain),
-        offset=s.offset_std * refiner.mean_signal * refiner.offset,
+        albedo=np.asarray(smooth_albedo(jnp.asarray(refiner.values["albedo"]), surface.height.shape, s.albedo_std)),
+        gain=np.exp(s.gain_std * refiner.values["log_gain"]),
+        offset=s.offset_std * refiner.mean_signal * refiner.values["offset"],
+        background=background,
+        tilt=refiner.tilt,
+        instrument=refiner.instrument,
+        values=refiner.values,
         residuals=refiner.residuals,
         weight=refiner.weight,
         model_share=refiner.model_share,

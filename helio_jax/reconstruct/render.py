@@ -9,6 +9,7 @@ touches neither of them. Compared in tests/physics/test_render.py with the trace
 import jax
 import jax.numpy as jnp
 
+from helio_jax.reconstruct.aiming import aimed_form_factor
 from helio_jax.reconstruct.beamframe import normal_of_slopes
 from helio_jax.reconstruct.formfactor import SpotGeometry, form_factor_of_height
 
@@ -19,7 +20,13 @@ def unit_normal(slope_x: jax.Array, slope_y: jax.Array, shift: tuple[float, floa
     return n / jnp.sqrt(jnp.sum(n * n, axis=0))
 
 
-def render_single(height: jax.Array, normal: jax.Array, hidden: jax.Array, geometry: SpotGeometry) -> jax.Array:
+def render_single(
+    height: jax.Array,
+    normal: jax.Array,
+    hidden: jax.Array,
+    geometry: SpotGeometry,
+    aim: jax.Array | None = None,
+) -> jax.Array:
     """Return the single-scattering detection probability of every pixel [detector, y, x].
 
     Args:
@@ -27,5 +34,7 @@ def render_single(height: jax.Array, normal: jax.Array, hidden: jax.Array, geome
         normal: unit normals there [3, y, x].
         hidden: hidden part of the form factor [detector, 3, y, x].
         geometry: where a point of a given height is, static.
+        aim: changes of the apertures' polar angles and azimuths [detector, 2], rad, or None.
     """
-    return jnp.einsum("kiyx,iyx->kyx", form_factor_of_height(geometry, height) - hidden, normal)
+    at = form_factor_of_height(geometry, height) if aim is None else aimed_form_factor(geometry, height, aim)
+    return jnp.einsum("kiyx,iyx->kyx", at - hidden, normal)

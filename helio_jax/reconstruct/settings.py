@@ -1,6 +1,6 @@
 """Settings of the reconstruction: table `[reconstruct]`. Read by the command line without importing JAX."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -18,6 +18,14 @@ class RefineSettings(Settings):
     """Prior deviation of each detector's gain, relative."""
     offset_std: float = Field(default=0.01, gt=0.0, le=1.0)
     """Prior deviation of each detector's offset, relative to its median signal."""
+    drift_std: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Prior deviation of the slow drift of each detector's offset, relative to its median signal; 0: no drift."""
+    drift_degrees: tuple[Annotated[int, Field(ge=1, le=9)], Annotated[int, Field(ge=1, le=9)]] = (4, 3)
+    """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
+    line_std: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Prior deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
+    geometry: bool = True
+    """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)

@@ -29,6 +29,12 @@ MAX_WIDTH = 0.125
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 
+GEOMETRY_DOUBT = (
+    "the geometry was fitted, too: heights behind a shadowed rim may come out low by more than their stated "
+    "deviations (benchmarks/calibration.py); compare with nearfield"
+)
+"""What the status says of a fit whose aims or distance are unknown."""
+
 if TYPE_CHECKING:
     from helio_jax.reconstruct.refine import Fit, Report
     from helio_jax.reconstruct.refiner import Predict
@@ -171,13 +177,19 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
+def _known(fit: "Fit") -> dict[str, np.ndarray]:
+    """Return what a fit knows of the instrument that does not depend on the surface."""
+    return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
+
+
 def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "Fit":
     """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit."""
     from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
-    fit = fit_heights(*problem, start, settings, predict, report)
+    slow_axis = 0 if stack.fast_axis == "x" else 1
+    fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     roughly = make_predict(max(settings.refine.rays // SEARCH_THRIFT, 1000))
     for is_last in (False, True):
@@ -191,13 +203,13 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
                 fit.surface,
                 (pitch(stack.y), pitch(stack.x)),
                 MAX_WIDTH * stack.instrument.sample_distance,
-                lambda surface: misfit_on(*problem, surface, settings, roughly),
+                lambda surface, fit=fit: misfit_on(*problem, surface, settings, roughly, slow_axis, _known(fit)),
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
             if numbers:
                 is_moved = np.isin(left, numbers)
                 levelled[is_moved] = levelled.max() + left[is_moved]
-                fit = fit_heights(*problem, moved, settings, predict, report, levelled)
+                fit = fit_heights(*problem, moved, settings, predict, report, levelled, slow_axis)
             elif np.unique(left).size == np.unique(single).size:
                 break
         except KeyboardInterrupt:
@@ -217,6 +229,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
     fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+    from helio_jax.reconstruct.findings import describe_instrument
+
     posterior = fit.posterior
     is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:
@@ -227,13 +241,14 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         depth_jumps(height, slope_x, fit.intact_x, pitch(stack.x), 1),
         depth_jumps(height, slope_y, fit.intact_y, pitch(stack.y), 0),
     )
+    is_moved = bool(fit.values["aim"].size or fit.values["distance"].size)
     n_telling = telling(fit.model_share, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack), worst, n_telling, *jumps, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,
         raster_y=stack.y,
-        instrument=stack.instrument,
+        instrument=fit.instrument,
         method="refine",
         normals=fit.normals,
         albedo=fit.albedo,
@@ -244,12 +259,14 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         residuals=fit.residuals,
         gain=fit.gain,
         offset=fit.offset,
-        status=fit.status,
+        status=f"{fit.status}; {GEOMETRY_DOUBT}" if is_moved else fit.status,
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),
             "height_changes_um": list(fit.changes),
             "contraction": fit.contraction,
             "sensitivity": sensitivity(fit, settings),
+            "instrument": describe_instrument(fit, settings.refine),
+            "chi_square": fit.chi_square,
         },
     )

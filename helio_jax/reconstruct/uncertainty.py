@@ -97,6 +97,11 @@ class Posterior:
     stride: int = 1
 
     @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the unknowns that the instrument parameters are entries of, in their order."""
+        return tuple(dict.fromkeys(name.partition("[")[0] for name in self.names))
+
+    @property
     def height_std(self) -> np.ndarray:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
@@ -194,7 +199,7 @@ class _Rows:
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
     """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
 
-    In this order: data by surface field, data by instrument, edges by instrument, data by level.
+    In this order: data by surface field, data by instrument, edges and border by instrument, data by level.
     """
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
@@ -203,16 +208,16 @@ def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lag
         return jax.jvp(function, (surface,), (direction,))[1]
 
     data = [derivative(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
-    free = {name: getattr(unknowns, name) for name in model.instrument_fields}
-    instrument, edges = (
+    free = {name: getattr(unknowns, name) for name in model.instrument_fields(unknowns)}
+    instrument, edges, border = (
         jax.jacfwd(lambda v, f=f: f(surface, unknowns._replace(**v), lagged))(free)
-        for f in (model.data_residuals, model.edge_residuals)
+        for f in (model.data_residuals, model.edge_residuals, model.border_residuals)
     )
     rise = jnp.zeros_like(lagged.level)  # all heights raised by the same, as above, raise no plateau above the ground
     levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
         rise
     )
-    return data, instrument, edges, levels
+    return data, instrument, (*edges, border), levels
 
 
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
@@ -224,7 +229,7 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
     data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
-    by_parameter = {name: found[name] for name in model.instrument_fields}
+    by_parameter = {name: found[name] for name in model.instrument_fields(unknowns)}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
@@ -242,8 +247,8 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     def of_instrument(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
         return np.concatenate([blocks[name].reshape(n, -1) for name in by_parameter], 1)
 
-    of_x, of_y = of_edges
-    parts = (found, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size)
+    of_x, of_y, of_border = of_edges
+    parts = (found, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size), (of_border, pixel.size)
     columns = np.concatenate([of_instrument(blocks, n) for blocks, n in parts])
     matrix = rows.stack(n_more=len(names))
     instrument = np.zeros((rows.n_rows + len(names), len(names)))

@@ -183,3 +183,24 @@ def test_help_is_fast():
         assert helio("--help").returncode == 0
         times.append(time.perf_counter() - start)
     assert min(times) < 0.9
+
+
+def test_calibrate_says_what_it_found(finished, tmp_path):
+    """A scan told as measured is calibrated into a file with a picture and priors; a simulated one is refused.
+
+    Catches priors that do not reach the file, and a second calibration of the same counts.
+    """
+    from helio_jax import read, write
+
+    raw, done = tmp_path / "raw.h5", tmp_path / "done.h5"
+    refused = helio("calibrate", finished / "micrographs.h5", "-o", done)
+    assert refused.returncode == 2 and "calibrated already" in refused.stderr
+    stack = read(finished / "micrographs.h5")
+    write(stack.replace(n_rays=None, noise="measured", counts=stack.counts + 800.0, by_order=None), raw)
+    found = helio("calibrate", raw, "-o", done, "--json")
+    assert found.returncode == 0, found.stderr
+    record = json.loads(found.stdout)
+    assert record["background"] == pytest.approx([800.0] * 3, abs=120.0) and len(record["snr"]) == 3
+    assert read(done).provenance["calibrate"]["priors"]["offset_std"] == 0.3
+    assert done.with_suffix(".png").stat().st_size > 10_000
+    assert helio("calibrate", done, "-o", tmp_path / "again.h5").returncode == 2
