@@ -20,7 +20,7 @@ from helio_jax import pipeline
 from helio_jax.arrays import pitch
 from helio_jax.config import SceneFile, load_scene
 from helio_jax.effects import EFFECTS, LAG, Images
-from helio_jax.errors import HelioError, SceneError
+from helio_jax.errors import HelioError, InputFileError, SceneError
 from helio_jax.evaluate.agreement import REACH, Agreement, Terms, contrast_by_cause, find_shift, normalise
 from helio_jax.evaluate.agreement_figure import save_agreement, save_effects
 from helio_jax.formats.safe import atomic_path
@@ -182,12 +182,24 @@ def compare(
         progress: called with what is done next.
 
     Raises:
-        SceneError: another number of detectors, or a raster that a scene cannot have.
+        SceneError: another number of detectors, several views, or a raster that a scene cannot have.
+        InputFileError: several scans, a list of positions, or no micrographs at all.
         GuardError: a detector does not show the simulated contrast.
     """
     data, path = stack.only() if isinstance(stack, MicrographSet) else stack, Path(scene_path)
+    if not isinstance(data, MicrographStack):
+        raise InputFileError(f"a scene is compared with micrographs, got {type(data).__name__}: name a scan's file")
+    if data.positions is not None:
+        raise InputFileError(
+            f"{data.name}: comparing needs a raster, this scan is a list of {len(data.positions)} positions"
+        )
     given = dict(overrides or {})
     scene = load_scene(path, given)
+    if scene.scan.n_views > 1:
+        raise SceneError(
+            f"{path}: scan has {scene.scan.n_views} views, comparing needs one: remove scan.rotations_deg and "
+            "scan.sample_distances_um"
+        )
     if scene.detector_names != data.instrument.detector_names:
         raise SceneError(
             f"{path}: its detectors {list(scene.detector_names)} are not those of the measured stack, "

@@ -76,8 +76,11 @@ def write_report(
 
     Raises:
         InputFileError: the truth has another raster, or the panel cannot be read or is no PNG.
+        SceneError: the file's suffix is not that of HTML.
     """
     path = Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise SceneError(f"{path}: a report is HTML: give it the suffix .html, got {path.suffix!r}")
     sections, figures = _sections(stack, rec, truth)
     body = [f"<h1>{html.escape(title)}</h1>", _headline(stack, rec), _score_table(rec, scores, references)]
     body += sections

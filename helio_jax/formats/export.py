@@ -31,10 +31,11 @@ def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> None:
     Raises:
         SceneError: nothing of this kind can be written, or not from this object; the message says what can.
     """
+    n = len(obj.stacks) if isinstance(obj, MicrographSet) else 1
+    if (view is None and n > 1) or not 0 <= (view or 0) < n:
+        given = "" if view is None else f", got {view}"
+        raise SceneError(f"{path}: holds one scan, there is a choice of {n}: give --view 0 to {n - 1}{given}")
     if isinstance(obj, MicrographSet):
-        n = len(obj.stacks)
-        if (view is None and n > 1) or not 0 <= (view or 0) < n:
-            raise SceneError(f"{path}: holds one scan, the set has {n}: choose --view 0 to {n - 1}, got {view}")
         obj = obj.stacks[view or 0]
     kind = Path(path).suffix.lower()
     if kind != ".mat" or not isinstance(obj, MicrographStack):
@@ -101,7 +102,9 @@ def _check(stack: MicrographStack, path: str) -> None:
             f"{path}: in this layout the beam travels along x, here beam.azimuth_deg is "
             f"{stack.instrument.beam.azimuth_deg:g}: turn the scene"
         )
-    if stack.positions is not None or n < 2 or min(ny, nx) < 2:
+    if stack.positions is not None:
+        raise SceneError(f"{path}: this layout holds rasters, {stack.name!r} is a list of {nx} positions")
+    if n < 2 or min(ny, nx) < 2:
         raise SceneError(
             f"{path}: this layout holds rasters of at least 2 x 2 pixels and 2 detectors, got {nx} x {ny} and {n}"
         )

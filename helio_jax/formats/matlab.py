@@ -151,7 +151,7 @@ def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) ->
         "x": _centred(counts.shape[2], step_x) + center[0],
         "y": _centred(counts.shape[1], step_y) + center[1],
         "n_rays": get_number(path, get_table(path, tree, "param"), "rays_per_pixel", low=0.0),
-        "noise": "poisson",
+        "noise": "poisson" if np.array_equal(counts, np.round(counts)) else "expected",  # helio's export may be either
         "instrument": full,
     }
     notes = {

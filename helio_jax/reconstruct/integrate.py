@@ -98,7 +98,10 @@ def _prepare(a: Image, b: Image, dx: float, dy: float, weights: Image | None) ->
     b = as_float_array("b", b, a.shape, SceneError)
     trust = np.ones(a.shape) if weights is None else as_float_array("weights", weights, a.shape, SceneError)
     if min(a.shape) < 3:
-        raise SceneError(f"slopes must cover at least 3 x 3 pixels, got {a.shape[0]} x {a.shape[1]}")
+        raise SceneError(
+            f"heights need an image of at least 3 x 3 pixels, got {a.shape[0]} rows x {a.shape[1]} columns: scan an "
+            "area, a line does not tell the slopes across it"
+        )
     for name, value in (("dx", dx), ("dy", dy)):
         if not (np.isfinite(value) and value > 0):
             raise SceneError(f"{name} must be finite and > 0 um, got {value:g}")

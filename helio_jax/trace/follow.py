@@ -97,7 +97,10 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
     if not 0 <= view < len(views):
         raise SceneError(f"view must be 0 to {len(views) - 1}, got {view}")
     if scene.plate.kind != "transparent":
-        raise SceneError(f"single atoms are followed between sample and a transparent plate, got {scene.plate.kind!r}")
+        raise SceneError(
+            f"plate.kind = {scene.plate.kind!r}: single atoms are followed with a transparent plate only: set "
+            "plate.kind = 'transparent' and leave out the plate's size and material"
+        )
     inner = np.array([i * nx + j]) if pixel else np.arange(nx * ny)
     if inner.size * settings.rays > MAX_ATOMS:
         raise SceneError(

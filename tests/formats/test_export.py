@@ -36,6 +36,7 @@ def test_round_trip(tmp_path, stacks, bshem, estimator):
     export(stack, tmp_path / "a.mat")
     back = import_micrographs(tmp_path / "a.mat", bshem)
     assert np.array_equal(back.by_order[0], stack.by_order[0]) and np.array_equal(back.by_order[1], stack.multiple)
+    assert back.noise == stack.noise  # whole counts or expectations: noise may be added to the latter only
     if estimator == "analog":
         assert np.array_equal(back.counts, stack.counts) and stack.counts.max() > 20
     for name in ("x", "y"):
@@ -82,7 +83,10 @@ def test_command_and_refusals(tmp_path, stacks):
     with pytest.raises(SceneError, match="single and multiple scattering apart"):
         export(stack.replace(by_order=None), tmp_path / "a.mat")
     both = MicrographSet((stack, stacks["analog"]))
-    with pytest.raises(SceneError, match="choose --view 0 to 1"):
+    with pytest.raises(SceneError, match=r"give --view 0 to 1$"):
         export(both, tmp_path / "a.mat")
+    for one in (stack, both):  # a view that is not there is not taken for another one
+        with pytest.raises(SceneError, match="got 2"):
+            export(one, tmp_path / "a.mat", view=2)
     export(both, tmp_path / "b.mat", view=1)
     assert (tmp_path / "b.mat").is_file()

@@ -256,6 +256,7 @@ def test_unknown_slopes_may_be_nan_but_known_ones_not():
         ({"method": "harker_oleary", "points": 4}, "points must be odd"),
         ({"method": "harker_oleary", "variant": "dirichet"}, "variant must be plain"),
         ({"method": "dct_poisson", "weights": np.arange(1.0, 43.0).reshape(6, 7)}, "0 or all equal for dct_poisson"),
+        ({"a": np.zeros((1, 31)), "b": np.zeros((1, 31))}, "3 x 3 pixels, got 1 rows x 31 columns: scan an area"),
     ],
 )
 def test_errors_name_quantity_and_limit(change, message):

@@ -100,5 +100,10 @@ def test_command_and_errors(tmp_path):
     for bad, message in ((["--pixel", "121", "0"], "row from 0 to 120"), (["--view", "1"], "view must be 0 to 0")):
         result = RUNNER.invoke(app, [*args[:4], *bad])
         assert isinstance(result.exception, SceneError) and message in str(result.exception)
+    plate = {
+        "plate": {"kind": "scattering", "radius_um": 1e4, "working_distance_um": 4e3, "sample_distance_um": 4720.0}
+    }
+    with pytest.raises(SceneError, match=r"plate.kind = 'scattering': .* set plate.kind = 'transparent'"):
+        follow_scene(load_scene(SCENE, plate), TraceSettings(rays=8), (2, 3))
     with pytest.raises(SceneError, match="at most 5000000 atoms"):
         follow_scene(load_scene(SCENE, {"trace.rays": 4096}), TraceSettings(rays=4096))

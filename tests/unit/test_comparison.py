@@ -9,10 +9,10 @@ from stats import assert_likely
 
 from helio_jax import load_scene, simulate
 from helio_jax.comparison import compare
-from helio_jax.errors import GuardError, SceneError
+from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.evaluate.agreement import Terms, find_shift, lagged, normalise
 from helio_jax.instrument import Detector, Instrument, Plate
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import MicrographSet, MicrographStack
 
 SCENE = """
 name = "cap"
@@ -173,3 +173,25 @@ def test_other_detectors_are_refused(scene_path):
     _, stack = blob_stack(np.random.default_rng(6))
     with pytest.raises(SceneError, match=r"forward.*'a'.*--instrument"):
         compare(stack, scene_path)
+
+
+def test_what_is_no_single_raster_is_refused_before_simulating(scene_path):
+    """Catches: a list read as a raster, a height map's traceback, a scene's views blamed on the data, time lost."""
+    data = measured(scene_path, {"trace.rays": 8, "scan.nx": 5, "scan.ny": 5})
+    row = MicrographStack(
+        data.counts[:, :1], data.x, data.y[:1], data.instrument, positions=np.zeros((5, 2)), name="row"
+    )
+    refused = [
+        (row, {}, InputFileError, "row: comparing needs a raster, this scan is a list of 5 positions"),
+        (data.instrument, {}, InputFileError, "with micrographs, got Instrument: name a scan's file"),
+        (MicrographSet((data, data)), {}, InputFileError, r"set of 2 scans .*stacks\[0\]"),
+        (
+            data,
+            {"scan.rotations_deg": [0.0, 90.0]},
+            SceneError,
+            "cap.toml: scan has 2 views, comparing needs one: remove",
+        ),
+    ]
+    for given, overrides, error, message in refused:
+        with pytest.raises(error, match=message):
+            compare(given, scene_path, overrides=overrides, progress=pytest.fail)

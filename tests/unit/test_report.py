@@ -134,8 +134,10 @@ def test_surface_is_drawn_at_its_own_positions():
 
 
 def test_refusals_and_atomic_write(tmp_path, monkeypatch):
-    """Catches: a half-written report, an embedded file that is no picture, a reference to no score."""
+    """Catches: a half-written report, an embedded file that is no picture, a reference to no score, HTML in a .png."""
     stack, rec, _ = make_case(21, 21, pitch=150.0)
+    with pytest.raises(SceneError, match=r"r.png: a report is HTML: give it the suffix .html, got '.png'"):
+        write_report(tmp_path / "r.png", stack, rec)
     with pytest.raises(InputFileError, match="must be a PNG"):
         write_report(tmp_path / "r.html", stack, rec, panel_png=b"<svg>")
     with pytest.raises(InputFileError, match="cannot be read"):
