@@ -26,6 +26,8 @@ from helio_jax.trace.settings import TraceSettings
 
 MAX_SCENE_MB = 1.0
 """Largest scene file."""
+ONE_MODEL = ("plate",)
+"""Tables whose kinds share their keys."""
 
 
 class SceneFile(Scene):
@@ -164,7 +166,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge tables deeply; everything else is replaced whole, and so is a table of another `kind`.
+    """Merge tables deeply; everything else is replaced whole, and so is a table of another `kind` (but `ONE_MODEL`).
 
     Of an array single elements are replaced where they are named by number, from 0 ({"spheres": {"0": ...}}).
     """
@@ -172,7 +174,7 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in over.items():
         old = out.get(key)
         both = isinstance(old, Mapping) and isinstance(value, Mapping)
-        if both and value.get("kind", old.get("kind")) == old.get("kind"):  # type: ignore[union-attr]
+        if both and (key in ONE_MODEL or value.get("kind", old.get("kind")) == old.get("kind")):  # type: ignore[union-attr]
             out[key] = _merge(old, value)  # type: ignore[arg-type]
         elif isinstance(old, list) and isinstance(value, Mapping) and all(_is_index(k, old) for k in value):
             out[key] = list(_merge(dict(zip(map(str, range(len(old))), old, strict=True)), value).values())

@@ -94,8 +94,7 @@ def _moat(scene: SceneFile) -> Mapping[str, Any] | None:
 def _scattering_plate(scene: SceneFile) -> Mapping[str, Any] | None:
     if scene.plate.kind != "transparent":
         return None
-    distances = {"working_distance_um": scene.working_distance, "sample_distance_um": scene.sample_distance}
-    return {"plate": {"kind": "scattering", "radius_um": 3.0 * scene.working_distance, **distances}}
+    return {"plate.kind": "scattering", "plate.radius_um": 3.0 * scene.working_distance}
 
 
 def _rough_law(scene: SceneFile) -> Mapping[str, Any] | None:

@@ -148,8 +148,8 @@ class MicrographSet:
         if len(self.stacks) != 1:
             raise error(
                 f"this step needs one stack on one raster, got a set of {len(self.stacks)} scans "
-                f"({', '.join(s.name for s in self.stacks)}): simulate or import the wanted one alone "
-                "(scan.rotations_deg, scan.sample_distances_um), or take it in Python: helio_jax.read(FILE).stacks[0]"
+                f"({', '.join(s.name for s in self.stacks)}): align turned scans first (helio align), or "
+                "take one in Python: helio_jax.read(FILE).stacks[0]"
             )
         return self.stacks[0]
 

@@ -17,7 +17,7 @@ from helio_jax.evaluate.before_after import save_before_after
 from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Scores, Truth, evaluate_height
 from helio_jax.evaluate.report import write_report
-from helio_jax.formats.hdf5 import read, write
+from helio_jax.formats.hdf5 import read_micrographs, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
@@ -209,9 +209,7 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
 
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
-    found = read(path)
-    if isinstance(found, Reconstruction):
-        raise SceneError(f"{path} holds a height map: give the file of its micrographs")
+    found = read_micrographs(path)
     before = found.only() if isinstance(found, MicrographSet) else found
     after = calibrate(before, **changes)
     write(after, output)

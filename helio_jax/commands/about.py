@@ -39,6 +39,7 @@ def validate(scene: SceneArg) -> None:
 
     loaded = load_scene(scene)
     loaded.read_laws()
+    loaded.read_rays()
     for key, value in check_body(loaded.build_body()).items():
         print(f"  {key}: {value}")
     for warning in loaded.warnings():

@@ -18,8 +18,19 @@ app = typer.Typer(
     help="Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map.",
 )
 
+HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
+
+
+def _with_hdf5_suffix(path: Path) -> Path:
+    """Refuse another suffix than that of HDF5, before anything is computed."""
+    if path.suffix.lower() not in HDF5_SUFFIXES:
+        raise typer.BadParameter(f"{path}: is written as HDF5: give it the suffix .h5, got {path.suffix!r}")
+    return path
+
+
 SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml")]
 OutFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.")]
+H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5).", callback=_with_hdf5_suffix)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]

@@ -9,24 +9,26 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import AsJson, Bar, Method, OutFile, app, given_options, print_table
+from helio_jax.commands.app import AsJson, Bar, H5File, Method, OutFile, app, given_options, print_table
 
 
 @app.command()
 def reconstruct(
     stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
-    output: OutFile,
+    output: H5File,
     method: Method = None,
     settings: Annotated[Path | None, typer.Option(help="Scene file whose table [reconstruct] is used.")] = None,
     border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
 ) -> None:
     """Turn three or more micrographs into a height map."""
-    from helio_jax import pipeline, read, write
+    from helio_jax import pipeline, write
     from helio_jax.config import load_scene
+    from helio_jax.formats.hdf5 import read_micrographs
 
     given = load_scene(settings).reconstruct if settings else None
+    images = read_micrographs(stack)
     with Bar("reconstructing") as bar:
-        result = pipeline.reconstruct(read(stack), method, settings=given, report=bar, **given_options(border=border))
+        result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
     write(result, output)
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
     for name, factor in result.provenance.get("sensitivity", {}).items():
@@ -44,10 +46,11 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same rays."""
-    from helio_jax import pipeline, read
+    from helio_jax import pipeline
+    from helio_jax.formats.hdf5 import read_height
     from helio_jax.truth import load_truth
 
-    rec = read(height)
+    rec = read_height(height)
     found = load_truth(truth, rec, fit_center=fit_center)
     scores = pipeline.evaluate(rec, found)
     if as_json:
@@ -68,13 +71,17 @@ def report(
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
-    from helio_jax import pipeline, read
+    from helio_jax import pipeline
+    from helio_jax.formats.hdf5 import read_height, read_micrographs
+    from helio_jax.micrograph import MicrographSet
     from helio_jax.truth import load_truth
 
-    rec = read(height)
+    rec, images = read_height(height), read_micrographs(stack) if stack else None
+    if isinstance(images, MicrographSet):
+        images = images.only()
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
-    panel = pipeline.write_report_files(output, read(stack) if stack else None, rec, known, scores, title=height.stem)
+    panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
     print(f"{output}\n{panel}")
 
 
@@ -91,23 +98,11 @@ def measure(
 ) -> None:
     """Measure on a height map: facets, a profile between two beam positions, a step, roughness."""
     from helio_jax.evaluate.measure import Wanted, measure_height_map
+    from helio_jax.formats.hdf5 import read_height
 
     wanted = Wanted(facets, profile, step, roughness, min_pixels)
-    found, lines = measure_height_map(_read_height(height), wanted, figure)
+    found, lines = measure_height_map(read_height(height), wanted, figure)
     print(json.dumps(found) if as_json else "\n".join(lines))
-
-
-def _read_height(path: Path) -> Any:
-    """Read a file that must hold a height map."""
-    from helio_jax import Reconstruction, read
-    from helio_jax.errors import InputFileError
-
-    found = read(path)
-    if not isinstance(found, Reconstruction):
-        raise InputFileError(
-            f"{path}: must hold a height map, got a {type(found).__name__}: helio reconstruct makes one"
-        )
-    return found
 
 
 def _print_instrument(found: dict[str, Any]) -> None:

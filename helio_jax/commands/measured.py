@@ -9,13 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import AsJson, OutFile, Rays, SceneArg, app, given_options, print_table, say
+from helio_jax.commands.app import AsJson, H5File, Rays, SceneArg, app, given_options, print_table, say
 
 
 @app.command("import")
 def import_files(
     files: Annotated[list[Path], typer.Argument(help="Micrographs (.mat of B-SHeM, A-SHeM, the reference simulator).")],
-    output: OutFile,
+    output: H5File,
     instrument: Annotated[Path | None, typer.Option(help="Instrument or scene file: what the file lacks.")] = None,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
@@ -54,11 +54,11 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
-    from helio_jax import read
     from helio_jax.comparison import compare as compare_with_scene
+    from helio_jax.formats.hdf5 import read_micrographs
 
     found = compare_with_scene(
-        read(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
+        read_micrographs(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
     )
     files = found.write(output)
     if as_json:
@@ -72,21 +72,17 @@ def compare(
 
 def _read_set(path: Path) -> Any:
     """Read a file of one or several scans as a set."""
-    from helio_jax import MicrographSet, MicrographStack, read
-    from helio_jax.errors import InputFileError
+    from helio_jax import MicrographSet, MicrographStack
+    from helio_jax.formats.hdf5 import read_micrographs
 
-    found = read(path)
-    if isinstance(found, MicrographStack):
-        return MicrographSet((found,))
-    if not isinstance(found, MicrographSet):
-        raise InputFileError(f"{path}: must hold micrographs, got a {type(found).__name__}")
-    return found
+    found = read_micrographs(path)
+    return MicrographSet((found,)) if isinstance(found, MicrographStack) else found
 
 
 @app.command()
 def align(
     scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
-    output: OutFile,
+    output: H5File,
     points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um).")] = None,
     auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
     settings: Annotated[
@@ -133,7 +129,7 @@ def pick(
 @app.command()
 def calibrate(
     stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5), from helio import.")],
-    output: OutFile,
+    output: H5File,
     drift: Annotated[bool, typer.Option(help="Take slow drift off, and leave it to the fit.")] = True,
     lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
     noise_model: Annotated[bool, typer.Option(help="Let the variance follow the counts.")] = True,

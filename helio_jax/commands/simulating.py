@@ -12,8 +12,8 @@ import typer
 from helio_jax.commands.app import (
     AsJson,
     Bar,
+    H5File,
     Method,
-    OutFile,
     Processes,
     Rays,
     Restart,
@@ -63,7 +63,7 @@ def run(
 @app.command()
 def simulate(
     scene: SceneArg,
-    output: OutFile,
+    output: H5File,
     rays: Rays = None,
     seed: Seed = None,
     workers: Workers = None,
@@ -86,6 +86,10 @@ def simulate(
             n, ny, nx = one.shape
             view = f"{one.name}: " if one is not stack else ""
             print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
+            if "rays_per_pixel" in stack.provenance:
+                print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel in the mean", end="")
+                missed = one.provenance.get("n_above_target")
+                print("" if missed is None else f"; {missed} of {nx * ny} pixels are above the target error")
             for name, share in one.shares().items():
                 print(f"  {name}: {share:.2%} of the counts")
 

@@ -21,6 +21,8 @@ import numpy as np
 
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
+from helio_jax.micrograph import Micrographs
+from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from helio_jax.formats.nexus import Node, Noun
@@ -114,6 +116,30 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
 
     found = _load_in_child(path, nexus.READ_PLACES, max_bytes)
     return nexus.rebuild(found["filetype"], found["entries"], str(path))
+
+
+def read_micrographs(path: str | os.PathLike) -> Micrographs:
+    """Read a helio file that must hold micrographs: a stack, or a set of several scans.
+
+    Raises:
+        InputFileError: as `read`, or the file holds a height map.
+    """
+    found = read(path)
+    if isinstance(found, Reconstruction):
+        raise InputFileError(f"{path}: holds a height map, needed are micrographs: helio simulate or import makes them")
+    return found
+
+
+def read_height(path: str | os.PathLike) -> Reconstruction:
+    """Read a helio file that must hold a height map.
+
+    Raises:
+        InputFileError: as `read`, or the file holds micrographs.
+    """
+    found = read(path)
+    if not isinstance(found, Reconstruction):
+        raise InputFileError(f"{path}: holds micrographs, needed is a height map: helio reconstruct makes one")
+    return found
 
 
 def describe(path: str | os.PathLike) -> dict[str, Any]:

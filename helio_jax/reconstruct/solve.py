@@ -113,7 +113,7 @@ def reconstruct_stack(
     if stack.shape[0] < MIN_IMAGES or not (n_usable >= MIN_IMAGES).any():
         raise GuardError(
             f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
-            f"{stack.shape[0]} detectors: add detector directions"
+            f"{stack.shape[0]} detectors: add detector directions, or align turned scans (helio align)"
         )
     geometry = SpotGeometry(stack.instrument)
     if settings.method == "refine":

@@ -328,3 +328,11 @@ def test_noise_is_reproducible_and_added_once():
         add_noise(first, NoiseSettings())
     with pytest.raises(SceneError, match=r"noise\.gain must be one number or one per detector \(2\), got 3"):
         add_noise(stack, NoiseSettings(gain=(1.0, 1.0, 1.0)))
+
+
+def test_a_plate_may_become_a_scattering_one(tmp_path):
+    """Another kind of plate keeps the distances of the file that is extended; another kind of sample starts afresh."""
+    scene = load_scene(SCENES / "sphere_a.toml", {"plate.kind": "scattering", "plate.radius_um": 9000.0})
+    assert scene.plate.is_scattering and scene.working_distance == 4000.0
+    flat = load_scene(SCENES / "sphere_a.toml", {"sample.kind": "flat"})
+    assert flat.sample.kind == "flat"
