@@ -43,7 +43,7 @@ class Beam(Settings):
     """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; else ignored [mrad]."""
     file: str | None = Field(default=None, min_length=1, max_length=4096)
     """`rays`: file of rays (.csv, .npy, .npz), relative to the scene file: position (x, y, z) relative to the pinhole's
-    centre [um], direction (x, y, z) and, if given, weight of every ray; lab axes, z up to the plate's outer side."""
+    centre in um, direction (x, y, z) and, if given, weight of every ray; lab axes, z up to the plate's outer side."""
     effusive: Effusive | None = None
     """Effusive beam, traced besides the beam and counted apart; default: none."""
 

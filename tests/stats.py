@@ -26,7 +26,7 @@ def pooled_chi2(
     is_small = e < smallest
     if is_small.any():
         o, e, v, v2 = (np.append(a[~is_small], a[is_small].sum()) for a in (o, e, v, v2))
-    if e[-1] + v[-1] == 0.0:  # nothing expected here: any count at all is impossible
+    if e[-1] + v[-1] <= 0.0:  # nothing expected here (our estimate may be below 0): any count at all is impossible
         if o[-1] > 0:
             return 0.0
         o, e, v, v2 = o[:-1], e[:-1], v[:-1], v2[:-1]
