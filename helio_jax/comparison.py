@@ -135,9 +135,7 @@ def _raster(stack: MicrographStack, scene: SceneFile, shift: tuple[float, float]
 def _images(path: Path, changes: Mapping[str, Any]) -> Images:
     """Simulate a scene with some settings changed."""
     scene = load_scene(path, dict(changes))
-    found = pipeline.simulate(scene, maps=False)
-    if isinstance(found, MicrographSet):
-        found = found.only(SceneError)
+    found = pipeline.simulate(scene, maps=False).only(SceneError)
     assert found.by_order is not None and found.variance is not None and found.n_rays is not None  # simulated
     single, multiple = found.by_order[0] / found.n_rays, found.by_order[1:].sum(0) / found.n_rays
     truth = true_surface(scene, found.x, found.y)
@@ -186,9 +184,9 @@ def compare(
         InputFileError: several scans, a list of positions, or no micrographs at all.
         GuardError: a detector does not show the simulated contrast.
     """
-    data, path = stack.only() if isinstance(stack, MicrographSet) else stack, Path(scene_path)
-    if not isinstance(data, MicrographStack):
-        raise InputFileError(f"a scene is compared with micrographs, got {type(data).__name__}: name a scan's file")
+    if not isinstance(stack, (MicrographStack, MicrographSet)):
+        raise InputFileError(f"a scene is compared with micrographs, got {type(stack).__name__}: name a scan's file")
+    data, path = stack.only(), Path(scene_path)
     if data.positions is not None:
         raise InputFileError(
             f"{data.name}: comparing needs a raster, this scan is a list of {len(data.positions)} positions"

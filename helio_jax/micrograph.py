@@ -127,6 +127,15 @@ class MicrographStack:
         found = {name: float(part.sum()) for name, part in parts.items() if part is not None}
         return {name: part / total for name, part in found.items()} if total > 0 else {}
 
+    @property
+    def stacks(self) -> tuple["MicrographStack"]:
+        """This stack alone, as a set of one would give it."""
+        return (self,)
+
+    def only(self, error: type[HelioError] = InputFileError) -> "MicrographStack":
+        """Return this stack, as a set of one would."""
+        return self
+
     def replace(self, **changes: Any) -> "MicrographStack":
         """Return a copy with some fields changed (and checked again)."""
         return replace(self, **changes)

@@ -21,12 +21,12 @@ from helio_jax.formats.hdf5 import read_micrographs, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
+from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.align import AlignSettings, align_scans
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
-from helio_jax.prepare.points import fit_points
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration
 from helio_jax.prepare.selfcalibrate import effective_instrument, self_calibrate
 from helio_jax.provenance import with_provenance
@@ -203,14 +203,19 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
             f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
             "calibrated already; calibrate the imported file itself"
         )
-    flat = SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
-    return calibrate_on_border(stack, flat, _changed(settings or CalibrateSettings(), changes))
+    return calibrate_on_border(
+        stack, _flat_signal(stack.instrument), _changed(settings or CalibrateSettings(), changes)
+    )
+
+
+def _flat_signal(instrument: Instrument) -> np.ndarray:
+    """Return the detection probability of the flat reference plane [detector]."""
+    return SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
 
 
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
-    found = read_micrographs(path)
-    before = found.only() if isinstance(found, MicrographSet) else found
+    before = read_micrographs(path).only()
     after = calibrate(before, **changes)
     write(after, output)
     save_before_after(before, after, Path(output).with_suffix(".png"))
@@ -231,8 +236,7 @@ def calibrate_turned(stack: MicrographStack) -> MicrographStack:
     """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`)."""
     found = self_calibrate(stack)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
-    flat = SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
-    return apply_calibration(stack, found, flat, instrument)
+    return apply_calibration(stack, found, _flat_signal(instrument), instrument)
 
 
 def align(
@@ -244,9 +248,8 @@ def align(
         One stack, and where the control points are in its frame [um] (empty without them).
     """
     picks = read_points(points) if points is not None else None
-    stack = align_scans(scans, picks, _changed(AlignSettings(), changes), str(points or ""))
-    places = {} if picks is None else fit_points(picks, tuple(s.name for s in scans.stacks)).places
-    return stack, places
+    stack, found = align_scans(scans, picks, _changed(AlignSettings(), changes), str(points or ""))
+    return stack, {} if found.points is None else found.points.places
 
 
 def reconstruct(
@@ -270,7 +273,7 @@ def reconstruct(
         GuardError: too few images.
         InputFileError: a set of several scans, which must be aligned first.
     """
-    one = stack.only() if isinstance(stack, MicrographSet) else stack
+    one = stack.only()
     if one.positions is not None:
         raise InputFileError(
             f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"

@@ -30,7 +30,7 @@ from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError
 from helio_jax.evaluate.sweep import save_sweep
 from helio_jax.explain import explain_errors
 from helio_jax.formats.safe import atomic_path
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.files import read_bytes
 from helio_jax.settings import Settings
 
@@ -280,7 +280,7 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
             row |= {"method": result.method, **result.scores.as_dict()}
         else:
             stack = pipeline.simulate_file(scene, point.folder / "micrographs.h5", options=options)
-            stacks = stack.stacks if isinstance(stack, MicrographSet) else (stack,) if stack else ()
+            stacks = stack.stacks if stack else ()
             for i, one in enumerate(stacks, start=1):
                 view = f"_view{i}" if len(stacks) > 1 else ""
                 row |= {f"{key}{view}": value for key, value in image_scores(one).items()}

@@ -73,12 +73,9 @@ def report(
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
     from helio_jax import pipeline
     from helio_jax.formats.hdf5 import read_height, read_micrographs
-    from helio_jax.micrograph import MicrographSet
     from helio_jax.truth import load_truth
 
-    rec, images = read_height(height), read_micrographs(stack) if stack else None
-    if isinstance(images, MicrographSet):
-        images = images.only()
+    rec, images = read_height(height), read_micrographs(stack).only() if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)

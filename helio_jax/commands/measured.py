@@ -72,11 +72,10 @@ def compare(
 
 def _read_set(path: Path) -> Any:
     """Read a file of one or several scans as a set."""
-    from helio_jax import MicrographSet, MicrographStack
+    from helio_jax import MicrographSet
     from helio_jax.formats.hdf5 import read_micrographs
 
-    found = read_micrographs(path)
-    return MicrographSet((found,)) if isinstance(found, MicrographStack) else found
+    return MicrographSet(read_micrographs(path).stacks)
 
 
 @app.command()

@@ -82,7 +82,7 @@ def simulate(
         options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, say)
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is not None:
-        for one in getattr(stack, "stacks", (stack,)):
+        for one in stack.stacks:
             n, ny, nx = one.shape
             view = f"{one.name}: " if one is not stack else ""
             print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")

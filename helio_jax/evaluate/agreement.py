@@ -221,7 +221,8 @@ def find_shift(
         thin = max(1, max(stack.shape[1:]) // 48)
         offsets = size * np.arange(-N_STEPS, N_STEPS + 1) / N_STEPS
         starts = [np.array([i, j]) for i in offsets for j in offsets]
-        simplex += min(starts, key=lambda move: _misfit(stack, probability, terms, move, thin))
+        part = _thinned(stack, thin)
+        simplex += min(starts, key=lambda move: _misfit(part, probability, terms, move, thin))
     found = minimize(
         lambda move: _misfit(stack, probability, terms, move),
         simplex[0],
@@ -234,17 +235,21 @@ def find_shift(
     return float(x), float(y)
 
 
+def _thinned(stack: MicrographStack, thin: int) -> MicrographStack:
+    """Return what `normalise` needs of every `thin`-th row and column."""
+    every = np.s_[..., ::thin, ::thin]
+    return MicrographStack(
+        counts=stack.counts[every], x=stack.x[::thin], y=stack.y[::thin], instrument=stack.instrument,
+        variance=None if stack.variance is None else stack.variance[every], is_observed=stack.is_observed[every],
+        fast_axis=stack.fast_axis, name=stack.name,
+    )  # fmt: skip
+
+
 def _misfit(stack: MicrographStack, probability: np.ndarray, terms: Terms, move: np.ndarray, thin: int = 1) -> float:
     """Return the robust misfit (Huber) of images moved by `move` pixels [y, x]; every `thin`-th row and column."""
-    every = np.s_[..., ::thin, ::thin]
-    moved = np.stack([shift_image(image, move, order=1, mode="nearest") for image in probability])
-    part = stack.replace(
-        counts=stack.counts[every], variance=None if stack.variance is None else stack.variance[every],
-        is_observed=stack.is_observed[every], x=stack.x[::thin], y=stack.y[::thin], background=None, by_order=None,
-        masked=None, shadowed=None, effuse=None, plate=None,
-    )  # fmt: skip
+    moved = np.stack([shift_image(image, move, order=1, mode="nearest")[::thin, ::thin] for image in probability])
     try:
-        r = np.abs(normalise(part, moved[every], terms).residuals)
+        r = np.abs(normalise(stack, moved, terms).residuals)
     except GuardError:
         return np.inf
     return float(np.nansum(np.where(r < OUTLIER, 0.5 * r**2, OUTLIER * (r - 0.5 * OUTLIER))))

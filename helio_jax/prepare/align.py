@@ -103,7 +103,7 @@ def align_scans(
     picks: Picks | None = None,
     settings: AlignSettings = AlignSettings(),
     source: str = "the control points",
-) -> MicrographStack:
+) -> tuple[MicrographStack, Alignment]:
     """Align scans and bring them onto one raster in the frame of the first one.
 
     Args:
@@ -113,7 +113,8 @@ def align_scans(
         source: name of the control points' file, for messages.
 
     Returns:
-        One stack, whose detectors are every scan's apertures turned back; `provenance["align"]` tells the motions.
+        One stack, whose detectors are every scan's apertures turned back (`provenance["align"]` tells the motions),
+        and the alignment.
 
     Raises:
         GuardError: the scans do not fix the alignment, or oblique incidence, where heights move pixels.
@@ -128,7 +129,7 @@ def align_scans(
         )
     stack = resample(scans, alignment.motions, settings.field, alignment.std_um)
     record = alignment.as_dict() | {"settings": settings.model_dump(mode="json")}
-    return stack.replace(provenance={**stack.provenance, "align": record})
+    return stack.replace(provenance={**stack.provenance, "align": record}), alignment
 
 
 def find_motions(

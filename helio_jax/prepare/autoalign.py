@@ -206,7 +206,7 @@ class Aligner:
                 root = np.sqrt(weight)[:, None]
                 level = np.linalg.lstsq(plain * root, image[use] * root[:, 0], rcond=None)[0]
                 misfit = plain @ level - image[use]
-                weight = 1.0 / (1.0 + (misfit / (_ROBUST * 1.4826 * np.median(np.abs(misfit)) + 1e-12)) ** 2) ** 2
+                weight = _trust(misfit)
             root = np.sqrt(weight)[:, None]
             free = slope - plain @ np.linalg.lstsq(plain * root, slope * root, rcond=None)[0]
             matrix += (free * weight[:, None]).T @ free
@@ -269,6 +269,11 @@ def _components(pictures: np.ndarray, use: np.ndarray) -> np.ndarray:
     return np.tensordot(vectors[:, : -_RANK - 1 : -1].T, pictures, 1)
 
 
+def _trust(misfit: np.ndarray) -> np.ndarray:
+    """Return robust weights: 1 at no misfit, a quarter at `_ROBUST` robust deviations."""
+    return 1.0 / (1.0 + (misfit / (_ROBUST * 1.4826 * np.median(np.abs(misfit)) + 1e-12)) ** 2) ** 2
+
+
 def _combine(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the coefficients [n] of the robust combination of columns [n, pixel] nearest to a target [pixel]."""
     weight = np.ones(target.size)
@@ -277,5 +282,5 @@ def _combine(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
         weighted = columns * weight
         coefficients = np.linalg.solve(weighted @ columns.T + ridge, weighted @ target)
         misfit = target - coefficients @ columns
-        weight = 1.0 / (1.0 + (misfit / (_ROBUST * 1.4826 * np.median(np.abs(misfit)) + 1e-12)) ** 2) ** 2
+        weight = _trust(misfit)
     return coefficients

@@ -87,7 +87,7 @@ class MeshSample(PaintedSample):
         return Body.join([mesh, surfaces.flat_body(self.flat_size_um).painted(self.material)])
 
 
-OneSample = Annotated[
+Single = (
     FlatSample
     | SpheresSample
     | StepSample
@@ -96,16 +96,15 @@ OneSample = Annotated[
     | RoughSample
     | HeightMapSample
     | ReconstructionSample
-    | MeshSample,
-    Field(discriminator="kind"),
-]
+    | MeshSample
+)
 """Any single sample."""
 
 
 class PlacedSample(Settings):
     """A sample among several; like any other it may be scaled, turned and moved by its own keys."""
 
-    sample: OneSample
+    sample: Annotated[Single, Field(discriminator="kind")]
     """The sample, with its own flat and materials."""
     shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Further shift of the sample [um]."""
@@ -144,19 +143,7 @@ class SeveralSamples(PlaceableSample):
         return Body.join([part.sample.build(base_dir).moved(part.shift_um) for part in self.parts])
 
 
-Sample = Annotated[
-    FlatSample
-    | SpheresSample
-    | StepSample
-    | TrenchSample
-    | PyramidSample
-    | RoughSample
-    | HeightMapSample
-    | ReconstructionSample
-    | MeshSample
-    | SeveralSamples,
-    Field(discriminator="kind"),
-]
+Sample = Annotated[Single | SeveralSamples, Field(discriminator="kind")]
 """Any sample; `kind` tells which."""
 
 

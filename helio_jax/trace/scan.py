@@ -254,8 +254,10 @@ class Canvas:
         effusive = scene.beam.effusive
         effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
         n_negative = int(np.sum(self.total[:, pixels] < 0))
-        limit = (settings.target_error or 0.0) * self.total[:, pixels]
-        n_above = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
+        missed = {}
+        if settings.target_error is not None:
+            limit = settings.target_error * self.total[:, pixels]
+            missed["n_above_target"] = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
         images: dict[str, Any] = {}
         for name, array, factor in (
             ("by_order", self.by_order, scale),
@@ -285,7 +287,7 @@ class Canvas:
             provenance={
                 "trace": settings.model_dump(mode="json"),
                 "n_negative": n_negative,
-                **({} if settings.target_error is None else {"n_above_target": n_above}),
+                **missed,
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
                 **({"view": view.about} if view.about else {}),
             },
