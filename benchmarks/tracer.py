@@ -371,7 +371,7 @@ def image_row(tiny: bool) -> list[Row]:
     scene = load_scene(ROOT / "scenes" / "sphere_a_full.toml", overrides)
     x, y = (g.ravel() for g in np.meshgrid(*scene.scan.positions(scene.instrument.beam)))
     n = 35_000.0
-    settings = TraceSettings(rays=8, branches=16, n_orders=2, maps=False, target_atoms=n, max_rays=512)
+    settings = TraceSettings(rays=32, branches=16, n_orders=2, maps=False, target_atoms=n, max_rays=512)
     experiment = make_experiment(scene.build_body(), scene.instrument, settings)
     trace_to_target(experiment, settings, np.arange(64), x[:64], y[:64])
     start, parts = time.process_time(), []

@@ -19,6 +19,8 @@ from helio_jax.trace.transport import Experiment, trace_block
 
 SAFETY = 1.4
 """The pilot's variance is known to 50 % only (7 degrees of freedom): so many times the rays that it asks for."""
+PILOT_BRANCHES = 4
+"""The pilot follows so many times fewer paths from each beam ray."""
 _PILOT = 1 << 62  # added to the pixels' numbers, the key of their random numbers
 
 
@@ -38,15 +40,16 @@ def trace_to_target(
     Raises:
         GuardError: rays of the pilot are unaccounted for.
     """
-    pilot = trace_block(experiment, ids + _PILOT, x, y).estimate()
+    n_rays, n_branches = experiment.sampling.n_rays, max(1, settings.branches // PILOT_BRANCHES)
+    pilot = trace_block(
+        replace(experiment, sampling=_sampling(n_rays, n_branches, settings.seed)), ids + _PILOT, x, y
+    ).estimate()
     check_rays(np.zeros(len(pilot.fates)), pilot.n_unaccounted, 1)
-    doublings = doublings_needed(pilot, settings)
+    doublings = doublings_needed(pilot, settings, n_branches / settings.branches)
     parts, order = [], []
     for k in np.unique(doublings):
         chosen = np.flatnonzero(doublings == k)
-        finer = replace(
-            experiment, sampling=_sampling(experiment.sampling.n_rays << int(k), settings.branches, settings.seed)
-        )
+        finer = replace(experiment, sampling=_sampling(n_rays << int(k), settings.branches, settings.seed))
         size = pixels_per_block(finer)
         for start in range(0, chosen.size, size):
             some = chosen[start : start + size]
@@ -56,21 +59,26 @@ def trace_to_target(
     return Estimate.join(parts).take(np.argsort(np.concatenate(order)))
 
 
-def doublings_needed(pilot: Estimate, settings: TraceSettings) -> np.ndarray:
+def doublings_needed(pilot: Estimate, settings: TraceSettings, share: float = 1.0) -> np.ndarray:
     """Return how many times the pilot's rays must be doubled [pixels], the cap being kept.
 
-    The error is taken to fall as the root of the number of rays, which low-discrepancy points better.
+    The error is taken to fall as the root of the number of rays, which low-discrepancy points better. With more
+    branches than the pilot (which has this `share` of them) only atoms of the second order and above have less
+    variance: those of the first one leave where the beam's rays meet the sample.
     """
+    first = pilot.variance[0]
     if settings.target_error is not None:
-        variance, wanted = pilot.total_variance, (settings.target_error * pilot.total_mean) ** 2
+        variance = np.minimum(first, pilot.total_variance) * (1.0 - share) + share * pilot.total_variance
+        wanted = (settings.target_error * pilot.total_mean) ** 2
     else:  # a count of so many atoms, a mean below its own error being no smaller than that
         assert settings.target_atoms is not None
         least = np.maximum(pilot.mean, np.sqrt(pilot.variance))
-        variance, wanted = np.concatenate(pilot.variance), np.concatenate(least) / settings.target_atoms
+        variance = np.concatenate([first, *(share * pilot.variance[1:])])
+        wanted = np.concatenate(least) / settings.target_atoms
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(variance > 0, SAFETY * variance / wanted, 0.0).max(0)
+        times = np.where(variance > 0, SAFETY * variance / wanted, 0.0).max(0)
     most = int(np.floor(np.log2(max(1.0, settings.max_rays / float(np.max(pilot.n_rays))))))
-    return np.ceil(np.log2(np.clip(share, 1.0, 2.0**most))).astype(np.int64)
+    return np.ceil(np.log2(np.clip(times, 1.0, 2.0**most))).astype(np.int64)
 
 
 @lru_cache(maxsize=64)

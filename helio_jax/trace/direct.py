@@ -7,9 +7,9 @@ sample point by sample point. The JAX form factor of `reconstruct` is written se
 """
 
 import numpy as np
-from numba import njit
 
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 
 RIM_POINTS = (12, 16, 24, 32, 64, 256)
 """Rim points of the trapezoid rule, the first ones for far points."""
@@ -38,7 +38,7 @@ class ApertureTable:
                 self.rims[level, k, :, :n] = a.rim(n)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def form_factor(x, y, depth, k, semi_axes, rims):
     """Return Phi (3 components) of aperture `k` seen from (x, y), `depth` below the plate (lab frame, um).
 
@@ -62,7 +62,7 @@ def form_factor(x, y, depth, k, semi_axes, rims):
     return fx / n, fy / n, fz / n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_inside(x, y, k, center, semi_axes, cos_sin):
     """Whether the plate point (x, y) lies in aperture `k`."""
     dx, dy = x - center[k, 0], y - center[k, 1]
@@ -71,7 +71,7 @@ def is_inside(x, y, k, center, semi_axes, cos_sin):
     return p * p + q * q <= 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_aperture(x, y, center, semi_axes, cos_sin):
     """Return the first aperture that contains the plate point (x, y), or -1."""
     for k in range(center.shape[0]):
@@ -80,7 +80,7 @@ def find_aperture(x, y, center, semi_axes, cos_sin):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin):
     """Return the aperture that ray `i` flies through, or -1, and its distance [um]; `x`, `y`: the plate's origin."""
     if directions[i, 2] <= 0.0:
@@ -90,7 +90,7 @@ def aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos
     return find_aperture(x, y, center, semi_axes, cos_sin), r
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def aperture_point(u, v, k, center, semi_axes, cos_sin):
     """Map two uniform numbers to a point uniform in area on aperture `k`; return (x, y) [um]."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v
@@ -105,7 +105,7 @@ def form_factors(instrument: Instrument, points: np.ndarray) -> np.ndarray:
     return _form_factors(np.ascontiguousarray(points, float), instrument.working_distance, table.semi_axes, table.rims)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _form_factors(points, plate_z, semi_axes, rims):
     out = np.empty((semi_axes.shape[0], points.shape[0], 3))
     for k in range(semi_axes.shape[0]):

@@ -9,10 +9,10 @@ Knows nothing of the sample.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.random import N_BEAM_DIMENSIONS, low_discrepancy_points, philox
 
 _MODELS = {"pencil": 0, "uniform": 1, "gaussian": 2, "effusive": 3, "rays": 4}
@@ -38,6 +38,11 @@ class Sampling:
     seed: int
     points: np.ndarray
     bounces: np.ndarray
+
+    @property
+    def per_replicate(self) -> int:
+        """Paths of a replicate; 1 for independent random rays, which do not need it."""
+        return self.n_rays * self.n_branches // self.n_replicates if self.n_replicates else 1
 
     @classmethod
     def make(cls, n_rays: int, n_branches: int, n_replicates: int, seed: int) -> "Sampling":
@@ -93,7 +98,7 @@ class Source:
         return cls(_MODELS["effusive"], exponent, frame, instrument.beam.pinhole_radius_um, np.zeros((0, 7)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def beam_numbers(pixels, n_rays, n_replicates, points, seed):
     """Return the random numbers of every beam ray [pixels * rays, 6], rays of a pixel together.
 
@@ -115,34 +120,45 @@ def beam_numbers(pixels, n_rays, n_replicates, points, seed):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bounce_number(seed, pixel_id, path, event):
     """Return four random numbers of one path of a pixel for the bounce after `event`."""
     key, zero = np.uint64(seed), np.uint64(0)
     return philox(key, _BOUNCE_STREAM, np.uint64(pixel_id), np.uint64(path), np.uint64(event), zero)
 
 
-@njit(cache=True, nogil=True)
+@kernel
+def first_bounce_shift(seed, pixel_id, replicate):
+    """Return the random shift of the low-discrepancy points of the first bounces of one replicate of a pixel."""
+    zero = np.uint64(0)
+    a, b, _, _ = philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), np.uint64(replicate), zero, zero)
+    return a, b
+
+
+@kernel
+def shifted(a, b, points, i):
+    """Return point number `i` of `points` [n, 2], shifted by (a, b) modulo 1."""
+    a, b = a + points[i, 0], b + points[i, 1]
+    return a - 1.0 if a >= 1.0 else a, b - 1.0 if b >= 1.0 else b
+
+
+@kernel
 def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, is_low_discrepancy):
     """Return two random numbers per path for the bounce after `event`, and two for the next aperture point [n, 4].
 
     `path` counts the paths of a pixel (beam ray times branch); the first bounce (event 0) is low-discrepancy.
     """
     out = np.empty((path.size, 4))
-    key, zero = np.uint64(seed), np.uint64(0)
     for i in range(path.size):
         a, b, c, d = bounce_number(seed, pixel_ids[i], path[i], event)
         if event == 0 and is_low_discrepancy:
-            pixel = np.uint64(pixel_ids[i])
-            replicate, point = path[i] // paths_per_replicate, path[i] % paths_per_replicate
-            a, b, _, _ = philox(key, _BRANCH_STREAM, pixel, np.uint64(replicate), zero, zero)
-            a, b = a + bounces[point, 0], b + bounces[point, 1]
-            a, b = a - 1.0 if a >= 1.0 else a, b - 1.0 if b >= 1.0 else b
+            a, b = first_bounce_shift(seed, pixel_ids[i], path[i] // paths_per_replicate)
+            a, b = shifted(a, b, bounces, path[i] % paths_per_replicate)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = a, b, c, d
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, rays, origins, directions):
     for i in range(numbers.shape[0]):
         p = i // n_rays

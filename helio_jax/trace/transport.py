@@ -14,10 +14,10 @@ are estimated by the atoms that hit alone.
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 
 from helio_jax.instrument import Instrument
-from helio_jax.trace.analog import fly_to_the_end, land
+from helio_jax.kernel import kernel
+from helio_jax.trace.analog import fly_to_the_end, land, leave
 from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor, is_inside
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
@@ -47,10 +47,17 @@ class Experiment:
     plate: PlateTable | None = None
     effusive: "Experiment | None" = None
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether all that is done after the first scattering is what `analog` does in one go."""
-        return not self.is_expected and self.laws is None and self.plate is None and self.intersector.has_embree
+    def is_plain(self, event: int) -> bool:
+        """Whether all that is done after the scattering with `event` events before it is what `analog` does in one go.
+
+        That is so on Embree for the cosine law and no scattering plate, and, of the expected estimator, where atoms
+        that fly on need not tell what is hidden (`_aimed_weight`).
+        """
+        if self.laws is not None or self.plate is not None or not self.intersector.has_embree:
+            return False
+        gap = self.instrument.sample_distance - self.intersector.high[2]
+        n_hits = self.sampling.n_branches if event == 0 else 1
+        return not self.is_expected or (gap > 0.0 and n_hits * self.apertures.area.max() <= np.pi * gap**2)
 
     def material_of(self, surface: np.ndarray) -> np.ndarray:
         """Return the number of each hit surface's law (`Hits.surface`, no misses) [n]."""
@@ -86,7 +93,7 @@ class _Paths:
         return _Paths(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(
     event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
     center, semi_axes, cos_sin, fates, hits, plate_hits,
@@ -117,7 +124,7 @@ def _settle(
     return keep[:m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lift_off(point, normal, surface, restart):
     """Move points on triangles off the surface; return new origins and the sphere each ray must skip."""
     origin, skip = point.copy(), np.empty(point.shape[0], np.int32)
@@ -131,7 +138,7 @@ def lift_off(point, normal, surface, restart):
     return origin, skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
     """Return the chance that an atom goes to an aperture as small as a point and `area` large, if aiming may tell it.
 
@@ -141,7 +148,7 @@ def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
     return weight if n_hits * abs(weight) <= 1.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
     """Aim at a random point of aperture `k`: direction, weight of that point, and whether it can count at all."""
     n = point.shape[0]
@@ -160,7 +167,7 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_
     return direction, weight, is_open
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
     """Add what detector `k` catches of path `i`, scattered `order` times."""
     r, p = replicate[i], pixel[i]
@@ -169,7 +176,7 @@ def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
         plate_sums[r, k, p] += value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score(
     k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, semi_axes,
     rims, sums, plate_sums,
@@ -189,13 +196,13 @@ def _score(
         _add(value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _balance(density, n_hits, square, cosine, area):
     """Return density / (density of aiming + n density of hitting): the balance heuristic of both estimates."""
     return 1.0 / n_hits if density == np.inf else density / (square / (area * cosine) + n_hits * density)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score_lobes(
     k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
     plate_z, area, sums, plate_sums,
@@ -209,7 +216,7 @@ def _score_lobes(
             _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score_hits(
     share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, center,
     semi_axes, cos_sin, area, sums, plate_sums,
@@ -224,7 +231,7 @@ def _score_hits(
                 _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _subtract_hidden(
     share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
     center, semi_axes, cos_sin, area, sums, plate_sums,
@@ -253,7 +260,7 @@ def _subtract_hidden(
                     is_hidden = True  # where apertures overlap, the first one has it
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bounce(normal, u):
     """Draw cosine-distributed directions about the normals [n, 3]."""
     out = np.empty(normal.shape)
@@ -263,7 +270,7 @@ def _bounce(normal, u):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _history(surface, normal, order, met_plate):
     """Return what is kept of each path's past once this surface has scattered it: `normal`, `order`, `met_plate`."""
     normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
@@ -348,8 +355,7 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
         hits, paths = hits.take(index), paths.take(index)
         paths.path = paths.path * s.n_branches + np.tile(np.arange(s.n_branches), index.size // s.n_branches)
     path, pixel = paths.path, paths.pixel
-    per_replicate = s.n_rays * s.n_branches // s.n_replicates if s.n_replicates else 1
-    u = bounce_numbers(ids[pixel], path, per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
+    u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
     history = _history(hits.surface, hits.normal, paths.order, paths.met_plate)
     if e.laws is None:
@@ -360,6 +366,24 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Pat
         stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
     out = _Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, *history)
     return out if leaves is None or leaves.all() else out.take(leaves)
+
+
+def _fly_plainly(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: _Paths, offset, tally: Tally) -> None:
+    """Do all that follows the scattering with `event` events before it (`Experiment.is_plain`)."""
+
+    def score(event: int, hits: Hits, pixel: np.ndarray, path: np.ndarray, target: np.ndarray) -> None:
+        n = len(pixel)
+        order, met_plate = np.full(n, event, np.int32), np.zeros(n, bool)
+        none, vectors = np.zeros(n), np.zeros((n, 3))  # what plain atoms need not remember
+        paths = _Paths(vectors, vectors, pixel, path, target, pixel, none, vectors, order, met_plate)
+        _add_next_event(e, event, ids, tally, hits, paths, offset)
+
+    flying = leave(event, hits, e.intersector.restart, paths.pixel, paths.path, ids, e.sampling)
+    plate = e.apertures, e.instrument.sample_distance
+    fly_to_the_end(
+        event + 1, e.intersector, *plate, e.max_events, e.sampling.seed, ids, offset, flying, tally,
+        score if e.is_expected else None,
+    )  # fmt: skip
 
 
 def trace_block(
@@ -399,10 +423,8 @@ def trace_block(
         hits, paths = hits.take(keep), paths.take(keep)
         if e.is_expected:
             _add_next_event(e, event, ids, tally, hits, paths, offset)
-        paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
-        if e.is_plain:
-            flying = paths.origin, paths.direction, paths.pixel, paths.path, paths.skip
-            plate = e.apertures, e.instrument.sample_distance
-            fly_to_the_end(e.intersector, *plate, e.max_events, s.seed, ids, offset, flying, tally)
+        if e.is_plain(event):
+            _fly_plainly(e, event, ids, hits, paths, offset, tally)
             break
+        paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
     return tally

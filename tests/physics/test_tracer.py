@@ -13,6 +13,7 @@ from helio_jax.trace.random import philox
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED
+from helio_jax.trace.transport import Experiment
 
 
 def sphere_a() -> Body:
@@ -51,6 +52,22 @@ def test_every_ray_is_accounted_for(bshem):
         assert tally.n_unaccounted == 0
         assert np.array_equal(tally.hits.sum((0, 1)), tally.fates[DETECTED])
         assert tally.fates[2].sum() > 0  # the cap of 2 events does stop some
+
+
+@pytest.mark.parametrize(("estimator", "branches"), [("analog", 1), ("expected", 4), ("expected", 64)])
+def test_one_kernel_gives_the_bits_of_separate_steps(bshem, monkeypatch, estimator, branches):
+    """Sphere A, fast inner loop against the general one: equal to the last bit; catches a wrong number, order, skip.
+
+    With 64 branches the first flight must be done in steps: the atoms that fly on tell what is hidden.
+    """
+    x, y = grid(9, 1200.0)
+    settings = TraceSettings(rays=16, branches=branches, estimator=estimator)
+    fast = trace_pixels(make_experiment(sphere_a(), bshem, settings), x, y)
+    monkeypatch.setattr(Experiment, "is_plain", lambda *_: False)
+    slow = trace_pixels(make_experiment(sphere_a(), bshem, settings), x, y)
+    for name in ("mean", "variance", "hits", "fates"):
+        assert np.array_equal(getattr(fast, name), getattr(slow, name)), name
+    assert fast.mean[1:].max() > 0
 
 
 def test_flat_white_furnace():
