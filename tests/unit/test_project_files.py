@@ -36,7 +36,7 @@ def shell_commands(name: str) -> list[list[str]]:
 def test_gate_runs_the_readmes_test_command():
     """Catches a gate that tests something else than a contributor does."""
     run, test = fresh_machine_commands()
-    assert run == "helio run scenes/sphere_a.toml" and test == "python -m pytest"
+    assert run == "helio run scenes/sphere_a.toml" and test == "python -m pytest -n 2 --dist worksteal"
     assert f".ci-venv/bin/{test}\n" in GATE and "-c constraints.txt -e '.[test]'" in GATE
     assert GATE.rstrip().endswith(test)  # pytest's closing line is the last thing that is printed
     for tool in ("ruff format --check", "ruff check", "pyright"):
