@@ -8,12 +8,13 @@ Does not know any sample, ray or image.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from helio_jax.detector import Aperture, Cone, Detector
+from helio_jax.errors import SceneError
 from helio_jax.settings import Settings
 
 
@@ -103,52 +104,6 @@ class Plate(Settings):
         return self.center_um or (0.0, 0.0), (0.5 * a, 0.5 * b)
 
 
-class Detector(Settings):
-    """One detector aperture: either an ellipse on the plate, or the cone it fills seen from the nominal spot."""
-
-    name: str = Field(min_length=1, max_length=64)
-    """Name shown in figures and files."""
-    center_um: tuple[float, float] | None = None
-    """Centre (x, y) of the ellipse on the plate, lab frame [um]."""
-    axes_um: tuple[float, float] | None = None
-    """FULL axes of the ellipse; the first one along x before rotation [um]."""
-    rotation_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
-    """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
-    polar_deg: float | None = Field(default=None, ge=0.0, lt=90.0)
-    """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
-    azimuth_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
-    """Azimuth of the cone's axis, counter-clockwise from +x (default 0) [deg]."""
-    half_angle_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
-    """Half-angle of the cone [deg]."""
-    channel: int | None = Field(default=None, ge=1, le=1000)
-    """Channel of a measured file that this aperture feeds (1-based); only used on import."""
-
-    @model_validator(mode="after")
-    def _is_ellipse_or_cone(self) -> "Detector":
-        ellipse = [self.center_um, self.axes_um]
-        cone = [self.polar_deg, self.half_angle_deg]
-        is_ellipse = all(v is not None for v in ellipse)
-        is_cone = all(v is not None for v in cone)
-        stray = (
-            any(v is not None for v in (*cone, self.azimuth_deg))
-            if is_ellipse
-            else any(v is not None for v in (*ellipse, self.rotation_deg))
-        )
-        if is_ellipse == is_cone or stray:
-            raise ValueError(
-                f"detector {self.name!r} must be given either by center_um and axes_um (and rotation_deg) or by "
-                "polar_deg and half_angle_deg (and azimuth_deg), not by a mixture: remove the other keys"
-            )
-        if self.axes_um is not None and min(self.axes_um) <= 0:
-            raise ValueError(f"detector {self.name!r}: axes_um must be > 0 um, got {list(self.axes_um)}")
-        if is_cone and self.polar_deg + self.half_angle_deg >= 89.0:  # type: ignore[operator]
-            raise ValueError(
-                f"detector {self.name!r}: polar_deg + half_angle_deg must be < 89 deg so that the cone meets the "
-                f"plate in an ellipse, got {self.polar_deg} + {self.half_angle_deg}"  # type: ignore[operator]
-            )
-        return self
-
-
 class Uncertainty(Settings):
     """How well the geometry is known: standard deviations, which the fit takes for priors; 0: known exactly."""
 
@@ -160,51 +115,6 @@ class Uncertainty(Settings):
     """Of the angle between each aperture's centre and the plate normal, seen from the nominal spot [deg]."""
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=30.0)
     """Of each aperture's azimuth about the nominal spot [deg]."""
-
-
-@dataclass(frozen=True)
-class Aperture:
-    """A detector aperture resolved to its ellipse on the plate (lab frame, um, radians, SEMI-axes)."""
-
-    center: tuple[float, float]
-    semi_axes: tuple[float, float]
-    rotation: float
-
-    def rim(self, n_points: int) -> np.ndarray:
-        """Return `n_points` rim points and tangents, equally spaced in the ellipse's parameter.
-
-        Returns:
-            Array [2, n_points, 2]: positions (x, y) on the plate [um] and derivatives with respect to the
-            parameter [um/rad], counter-clockwise seen from above.
-        """
-        s = 2 * np.pi * np.arange(n_points) / n_points
-        (a, b), c, d = self.semi_axes, math.cos(self.rotation), math.sin(self.rotation)
-        turn = np.array([[c, -d], [d, c]])
-        points = np.stack([a * np.cos(s), b * np.sin(s)], -1) @ turn.T + np.asarray(self.center)
-        tangents = np.stack([-a * np.sin(s), b * np.cos(s)], -1) @ turn.T
-        return np.stack([points, tangents])
-
-
-def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: float) -> Aperture:
-    """Cut a circular cone with the plate: the exact ellipse seen under `half_angle` from the nominal spot.
-
-    Valid for polar + half_angle < pi/2.
-
-    Args:
-        polar: angle of the cone's axis to the plate normal [rad].
-        azimuth: azimuth of the axis [rad].
-        half_angle: half-angle of the cone [rad].
-        distance: from the nominal spot to the plate [um].
-
-    Returns:
-        The ellipse, major axis along the azimuth.
-
-    Source: own derivation (plane section of a cone), tests/unit/test_instrument.py.
-    """
-    near, far = distance * math.tan(polar - half_angle), distance * math.tan(polar + half_angle)
-    minor = distance * math.sin(half_angle) / math.sqrt(math.cos(polar) ** 2 - math.sin(half_angle) ** 2)
-    r = 0.5 * (near + far)
-    return Aperture((r * math.cos(azimuth), r * math.sin(azimuth)), (0.5 * (far - near), minor), azimuth)
 
 
 class Instrument(Settings):
@@ -220,6 +130,16 @@ class Instrument(Settings):
         names = [d.name for d in self.detector]
         if len(set(names)) != len(names):
             raise ValueError(f"detector names must differ, got {names}: rename one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_sky_for_detectors_at_infinity(self) -> "Instrument":
+        far = [d.name for d in self.detector if d.at_infinity]
+        if far and self.plate.is_scattering:
+            raise ValueError(
+                f"detector {far[0]!r} is at infinity, which a plate of kind {self.plate.kind!r} hides: set plate.kind "
+                "= 'transparent' (without size and material), or remove at_infinity"
+            )
         return self
 
     def with_cosine_plate(self) -> "Instrument":
@@ -262,18 +182,26 @@ class Instrument(Settings):
         w = self.working_distance
         return np.array([-w * tx, -w * ty, w])
 
+    def openings(self) -> tuple[Aperture | Cone, ...]:
+        """Return the ellipse or cone of every detector, in array order; where two overlap, the earlier one wins."""
+        return tuple(d.opening(self.working_distance) for d in self.detector)
+
     def apertures(self) -> tuple[Aperture, ...]:
-        """Return the ellipse of every detector, in array order; where two overlap, the earlier one wins."""
-        out = []
-        for d in self.detector:
-            if d.center_um is not None and d.axes_um is not None:
-                semi = (0.5 * d.axes_um[0], 0.5 * d.axes_um[1])
-                out.append(Aperture(d.center_um, semi, math.radians(d.rotation_deg or 0.0)))
-            else:
-                assert d.polar_deg is not None and d.half_angle_deg is not None  # by the validator above
-                polar, azimuth, half = map(math.radians, (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg))
-                out.append(cone_ellipse(polar, azimuth, half, self.working_distance))
-        return tuple(out)
+        """Return the ellipse of every detector, in array order.
+
+        Raises:
+            SceneError: a detector is at infinity.
+        """
+        openings = self.openings()
+        out = tuple(o for o in openings if isinstance(o, Aperture))
+        if len(out) < len(openings):
+            names = [d.name for d, o in zip(self.detector, openings, strict=True) if not isinstance(o, Aperture)]
+            raise SceneError(
+                f"detector {names[0]!r} is at infinity: it can be simulated only; heights, calibration, alignment and "
+                "files in the reference's layout need apertures in the plate: remove at_infinity, or give center_um "
+                "and axes_um"
+            )
+        return out
 
     def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
         """Return the instrument with its apertures aimed elsewhere and the sample farther away.

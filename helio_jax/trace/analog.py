@@ -19,7 +19,7 @@ _CHUNK = 128
 
 
 @njit(cache=True, nogil=True)
-def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, center, semi_axes, cos_sin):
+def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, shapes):
     """Return what becomes of atom `i` after a flight (`tally.FATES`, or -1: it scatters), and its detector or -1.
 
     `x`, `y` is the plate's origin in the sample frame for this pixel; atoms straight from the source hit no detector.
@@ -29,7 +29,7 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
             return LOST, -1
         return (STOPPED if is_last else -1), -1
     if event > 0:
-        k, _ = aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin)
+        k, _ = aperture_ahead(origins, directions, i, x, y, plate_z, shapes)
         if k >= 0:
             return DETECTED, k
     return ESCAPED, -1
@@ -38,7 +38,7 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
 @njit(cache=True, nogil=True)
 def _fly_on(
     event, is_last, face, u, v, origin, direction, pixel, path, skip, o32, d32, facets, spheres, restart, middle,
-    inverse_size, offset, plate_z, center, semi_axes, cos_sin, ids, seed, fates, hits,
+    inverse_size, offset, plate_z, shapes, ids, seed, fates, hits,
 ):  # fmt: skip
     """Land all atoms in flight, tally those that end, send the others on in place; return how many go on."""
     point, normal = np.empty((_CHUNK, 3)), np.empty((_CHUNK, 3))
@@ -55,7 +55,7 @@ def _fly_on(
             j, p = i - start, pixel[i]
             fate, k = land(
                 event, is_last, origin, direction, i, surface[j], is_back[j], offset[p, 0], offset[p, 1], plate_z,
-                center, semi_axes, cos_sin,
+                shapes,
             )  # fmt: skip
             if fate >= 0:
                 fates[fate, p] += 1
@@ -109,7 +109,7 @@ def fly_to_the_end(
         n = _fly_on(
             event, event >= max_events, face, u, v, origin, direction, pixel, path, skip, o32, d32, intersector.facets,
             intersector.spheres, intersector.restart, intersector.center, 1.0 / intersector.half_size, offset, plate_z,
-            apertures.center, apertures.semi_axes, apertures.cos_sin, ids, seed, tally.fates, tally.hits,
+            apertures.shapes, ids, seed, tally.fates, tally.hits,
         )  # fmt: skip
         if n == 0:
             break

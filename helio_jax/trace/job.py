@@ -33,7 +33,7 @@ SURFACE_STEP = 1e-7
 """Surfaces are the same when their coordinates agree to this share of their size: CPUs differ in a sine's last bit."""
 LAW_STEP = 1e-9
 """Likewise for the numbers of scattering laws, which are of order 1."""
-_PROGRAM = ("trace/*.py", "scene/*.py", "instrument.py")
+_PROGRAM = ("trace/*.py", "scene/*.py", "instrument.py", "detector.py")
 _LIBRARIES = ("numpy", "numba", "embreex")
 
 
