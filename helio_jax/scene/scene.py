@@ -153,17 +153,28 @@ class Scene(Instrument):
 
     @property
     def used_materials(self) -> dict[str, Law]:
-        """Scattering laws of the materials that sample and plate use, by name, but for the default one."""
+        """Scattering laws of the materials that sample and plate use, by name, but for the default one.
+
+        Raises:
+            InputFileError: a file of the sample that brings laws along (.mtl) is missing or wrong.
+        """
         names = {*self.sample.material_names, self.plate.material}
-        return {name: law for name, law in self.material.items() if name in names}
+        own = {name: law for name, law in self.material.items() if name in names}
+        return own | {n: self.material.get(f.name, f.law) for n, f in self.sample.file_laws(self.base_dir).items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
         """Return the scattering laws of the materials that sample and plate use, and read their files.
 
         Raises:
-            InputFileError: the table of a law is missing or wrong.
+            InputFileError: the table of a law, or a file of the sample that brings laws along, is missing or wrong.
         """
-        return {name: law.terms(self.base_dir) for name, law in self.used_materials.items()}
+        from_files = self.sample.file_laws(self.base_dir)
+        return {
+            name: from_files[name].terms()
+            if name in from_files and from_files[name].name not in self.material
+            else law.terms(self.base_dir)
+            for name, law in self.used_materials.items()
+        }
 
     def read_rays(self) -> np.ndarray | None:
         """Return position [um], unit direction and weight of the beam's rays [n, 7], where it is made of such.
@@ -200,7 +211,7 @@ class Scene(Instrument):
                 f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
                 f"set sample.resolution_um to at most {coarsest:g} um"
             )
-        return out + self._plate_warnings(openings)
+        return out + self._plate_warnings(openings) + self.sample.warnings(self.base_dir)
 
     def _plate_warnings(self, openings: tuple[Aperture | Cone, ...]) -> list[str]:
         """Return what is probably not meant about a scattering plate's outline."""
