@@ -71,10 +71,20 @@ def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: floa
     return Aperture((r * math.cos(azimuth), r * math.sin(azimuth)), (0.5 * (far - near), minor), azimuth)
 
 
-class Detector(Settings):
-    """One detector: an ellipse on the plate, the cone it fills seen from the nominal spot, or a cone at infinity.
+_KINDS = (
+    (("center_um", "axes_um"), ("rotation_deg", "height_um")),
+    (("polar_deg", "half_angle_deg"), ("azimuth_deg", "at_infinity")),
+    (("part",), ()),
+)
+"""Keys that a detector of each kind needs, and those that it may have."""
 
-    Where detectors overlap, the first one in the list has what both would catch.
+
+class Detector(Settings):
+    """One detector: an ellipse on the plate, the cone it fills seen from the nominal spot, a cone at infinity, or a
+    part of the plate's mesh.
+
+    Where detectors overlap, the first one in the list has what both would catch. Under a mesh plate an atom is caught
+    by the first surface that it meets (of two ellipses in one plane, the first in the list), and by cones at last.
     """
 
     name: str = Field(min_length=1, max_length=64)
@@ -85,6 +95,9 @@ class Detector(Settings):
     """FULL axes of the ellipse; the first one along x before rotation [um]."""
     rotation_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
     """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
+    height_um: float | None = Field(default=None, ge=0.0, le=1e7)
+    """Height of the ellipse above the underside of a plate of kind "mesh": a surface that counts, behind a channel say
+    (default 0) [um]."""
     polar_deg: float | None = Field(default=None, ge=0.0, lt=90.0)
     """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
     azimuth_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
@@ -93,30 +106,27 @@ class Detector(Settings):
     """Half-angle of the cone [deg]."""
     at_infinity: bool = False
     """The cone is one of directions, wherever an atom comes from: it catches those that hit nothing any more and fly in
-    a direction within the cone (transparent plates only)."""
+    a direction within the cone (not with a flat scattering plate)."""
+    part: str | None = Field(default=None, min_length=1, max_length=200)
+    """Part of the mesh of a plate of kind "mesh" that counts what hits it: OBJ: its material (usemtl), group or object;
+    GLB: its geometry."""
     channel: int | None = Field(default=None, ge=1, le=1000)
     """Channel of a measured file that this aperture feeds (1-based); only used on import."""
 
     @model_validator(mode="after")
-    def _is_ellipse_or_cone(self) -> "Detector":
-        ellipse = [self.center_um, self.axes_um]
-        cone = [self.polar_deg, self.half_angle_deg]
-        is_ellipse = all(v is not None for v in ellipse)
-        is_cone = all(v is not None for v in cone)
-        stray = (
-            any(v is not None for v in (*cone, self.azimuth_deg)) or self.at_infinity
-            if is_ellipse
-            else any(v is not None for v in (*ellipse, self.rotation_deg))
-        )
-        if is_ellipse == is_cone or stray:
+    def _is_of_one_kind(self) -> "Detector":
+        keys = {key for needed, optional in _KINDS for key in (*needed, *optional)}
+        given = {key for key in keys if not any(getattr(self, key) is empty for empty in (None, False))}
+        if not any({*needed} <= given <= {*needed, *optional} for needed, optional in _KINDS):
             raise ValueError(
-                f"detector {self.name!r} must be given either by center_um and axes_um (and rotation_deg) or by "
-                "polar_deg and half_angle_deg (and azimuth_deg, at_infinity), not by a mixture: remove the other keys"
+                f"detector {self.name!r} must be given either by center_um and axes_um (and rotation_deg, height_um) "
+                "or by polar_deg and half_angle_deg (and azimuth_deg, at_infinity) or by part, not by a mixture: "
+                "remove the other keys"
             )
         if self.axes_um is not None and min(self.axes_um) <= 0:
             raise ValueError(f"detector {self.name!r}: axes_um must be > 0 um, got {list(self.axes_um)}")
-        if is_cone:
-            self._check_cone(self.polar_deg, self.half_angle_deg)  # type: ignore[arg-type]
+        if self.polar_deg is not None and self.half_angle_deg is not None:
+            self._check_cone(self.polar_deg, self.half_angle_deg)
         return self
 
     def _check_cone(self, polar: float, half_angle: float) -> None:
@@ -132,8 +142,15 @@ class Detector(Settings):
                 f"plate in an ellipse, got {polar} + {half_angle}: make it narrower, or set at_infinity = true"
             )
 
-    def opening(self, working_distance: float) -> Aperture | Cone:
-        """Return what it catches atoms with: the ellipse on a plate `working_distance` [um] high, or the cone."""
+    @property
+    def needs_mesh(self) -> bool:
+        """Whether it makes sense with a plate of kind "mesh" only."""
+        return self.part is not None or self.height_um is not None
+
+    def opening(self, working_distance: float) -> Aperture | Cone | None:
+        """Return the ellipse on a plate `working_distance` [um] high, the cone at infinity; None: a mesh's part."""
+        if self.part is not None:
+            return None
         if self.center_um is not None and self.axes_um is not None:
             semi = (0.5 * self.axes_um[0], 0.5 * self.axes_um[1])
             return Aperture(self.center_um, semi, math.radians(self.rotation_deg or 0.0))

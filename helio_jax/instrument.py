@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from helio_jax.detector import Aperture, Cone, Detector
 from helio_jax.errors import SceneError
-from helio_jax.settings import Settings
+from helio_jax.settings import Settings, Unit
 
 
 class Effusive(Settings):
@@ -61,9 +61,10 @@ class Beam(Settings):
 class Plate(Settings):
     """The pinhole plate: the plane that holds the pinhole and the detector apertures."""
 
-    kind: Literal["transparent", "scattering"] = "transparent"
+    kind: Literal["transparent", "scattering", "mesh"] = "transparent"
     """`transparent`: atoms that miss every aperture pass through and are gone; `scattering`: its underside sends them
-    back by the law of its material, but for the apertures and the pinhole, which are holes."""
+    back by the law of its material, but for the apertures and the pinhole, which are holes; `mesh`: a solid from a
+    file, with channels, that scatters by the law of its material (trace.estimator = "analog" only)."""
     working_distance_um: float = Field(gt=0.0, le=1e7)
     """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
     sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e7)
@@ -75,14 +76,31 @@ class Plate(Settings):
     center_um: tuple[float, float] | None = None
     """`scattering`: middle (x, y) of the plate, lab frame (default: straight above the nominal spot) [um]."""
     material: str | None = Field(default=None, min_length=1, max_length=64)
-    """`scattering`: name of its material (default: the cosine law)."""
+    """`scattering`, `mesh`: name of its material (default: the cosine law)."""
+    file: str | None = Field(default=None, min_length=1, max_length=4096)
+    """`mesh`: STL, OBJ, PLY or GLB file, relative to the scene file. Its x, y are the lab frame's (0, 0: straight above
+    the nominal spot), z = 0 the plane of the pinhole, with all of the plate at z >= 0; it moves with the beam."""
+    unit: Unit | None = None
+    """`mesh`: unit of the file's coordinates."""
+    rotate_deg: tuple[float, float, float] | None = None
+    """`mesh`: rotations about the fixed x, then y, then z axis (default: none) [deg]."""
+    translate_um: tuple[float, float, float] | None = None
+    """`mesh`: shift after turning (default: none) [um]."""
 
     @model_validator(mode="after")
-    def _has_an_outline_if_it_scatters(self) -> "Plate":
-        names = ("radius_um", "size_um", "center_um", "material")
+    def _has_the_keys_of_its_kind(self) -> "Plate":
+        own = {
+            "scattering": ("radius_um", "size_um", "center_um", "material"),
+            "mesh": ("file", "unit", "rotate_deg", "translate_um", "material"),
+        }
+        names = dict.fromkeys(name for keys in own.values() for name in keys)
         given = [name for name in names if getattr(self, name) is not None]
-        if self.kind == "transparent" and given:
-            raise ValueError(f'a transparent plate has no {given[0]}: set kind = "scattering" or remove the key')
+        stray = [name for name in given if name not in own.get(self.kind, ())]
+        if stray:
+            kinds = " or ".join(f'"{kind}"' for kind, keys in own.items() if stray[0] in keys)
+            raise ValueError(f"a {self.kind} plate has no {stray[0]}: set kind = {kinds} or remove the key")
+        if self.kind == "mesh" and (missing := [name for name in ("file", "unit") if name not in given]):
+            raise ValueError(f'a plate of kind "mesh" needs {" and ".join(missing)}: add the key')
         if self.kind == "scattering" and (self.radius_um is None) == (self.size_um is None):
             raise ValueError(
                 "a scattering plate needs its outline, either radius_um (a disc) or size_um = [x, y] (a rectangle), "
@@ -98,8 +116,13 @@ class Plate(Settings):
         return self.kind != "transparent"
 
     @property
+    def is_mesh(self) -> bool:
+        """Whether the plate is a solid from a file."""
+        return self.kind == "mesh"
+
+    @property
     def outline(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Middle (x, y) and half extents of a scattering plate, lab frame [um]."""
+        """Middle (x, y) and half extents of a flat scattering plate, lab frame [um]."""
         a, b = self.size_um if self.size_um is not None else (2.0 * (self.radius_um or 0.0),) * 2
         return self.center_um or (0.0, 0.0), (0.5 * a, 0.5 * b)
 
@@ -133,12 +156,18 @@ class Instrument(Settings):
         return self
 
     @model_validator(mode="after")
-    def _has_a_sky_for_detectors_at_infinity(self) -> "Instrument":
+    def _has_a_plate_for_its_detectors(self) -> "Instrument":
         far = [d.name for d in self.detector if d.at_infinity]
-        if far and self.plate.is_scattering:
+        if far and self.plate.kind == "scattering":
             raise ValueError(
-                f"detector {far[0]!r} is at infinity, which a plate of kind {self.plate.kind!r} hides: set plate.kind "
-                "= 'transparent' (without size and material), or remove at_infinity"
+                f"detector {far[0]!r} is at infinity, which a flat scattering plate hides: set plate.kind = "
+                "'transparent' (without size and material), or remove at_infinity"
+            )
+        behind = [d.name for d in self.detector if d.needs_mesh]
+        if behind and not self.plate.is_mesh:
+            raise ValueError(
+                f"detector {behind[0]!r} has part or height_um, which only a plate of kind 'mesh' has: set "
+                "plate.kind = 'mesh' with its file, or remove the key"
             )
         return self
 
@@ -182,26 +211,30 @@ class Instrument(Settings):
         w = self.working_distance
         return np.array([-w * tx, -w * ty, w])
 
-    def openings(self) -> tuple[Aperture | Cone, ...]:
-        """Return the ellipse or cone of every detector, in array order; where two overlap, the earlier one wins."""
+    def openings(self) -> tuple[Aperture | Cone | None, ...]:
+        """Return the ellipse or cone of every detector, in array order; where two overlap, the earlier one wins.
+
+        None: a part of the plate's mesh.
+        """
         return tuple(d.opening(self.working_distance) for d in self.detector)
 
     def apertures(self) -> tuple[Aperture, ...]:
         """Return the ellipse of every detector, in array order.
 
         Raises:
-            SceneError: a detector is at infinity.
+            SceneError: a detector is at infinity, or the plate is a mesh.
         """
         openings = self.openings()
         out = tuple(o for o in openings if isinstance(o, Aperture))
-        if len(out) < len(openings):
-            names = [d.name for d, o in zip(self.detector, openings, strict=True) if not isinstance(o, Aperture)]
-            raise SceneError(
-                f"detector {names[0]!r} is at infinity: it can be simulated only; heights, calibration, alignment and "
-                "files in the reference's layout need apertures in the plate: remove at_infinity, or give center_um "
-                "and axes_um"
-            )
-        return out
+        if len(out) == len(openings) and not self.plate.is_mesh:
+            return out
+        far = [d.name for d in self.detector if d.at_infinity]
+        raise SceneError(
+            (f"detector {far[0]!r} is at infinity" if far else "plate.kind = 'mesh'")
+            + ": that can be simulated only; heights, calibration, alignment and files in the reference's layout need "
+            "apertures in a flat plate: give every detector center_um and axes_um"
+            + ("" if not self.plate.is_mesh else " and set plate.kind = 'scattering' or 'transparent'")
+        )
 
     def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
         """Return the instrument with its apertures aimed elsewhere and the sample farther away.

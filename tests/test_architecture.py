@@ -35,6 +35,7 @@ STAGES = LEVELS[6]
 DOORS = {
     "embreex": {"trace/intersect.py"},
     "trimesh": {"scene/sample.py", "formats/meshes.py"},
+    "manifold3d": {"scene/drill.py"},
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},

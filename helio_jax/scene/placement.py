@@ -15,11 +15,6 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.mtl import FileLaw
 from helio_jax.settings import Settings
 
-UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
-"""Length units of files [um]."""
-Unit = Literal["nm", "um", "mm", "cm", "m", "inch"]
-"""Name of a length unit of a file."""
-
 
 class PlaceableSample(Settings):
     """What all samples share: where they stand, and a way to become a `Body`."""

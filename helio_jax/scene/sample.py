@@ -19,7 +19,7 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes
 from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
 from helio_jax.scene.mtl import FileLaw, mtl_files, used_laws
-from helio_jax.scene.placement import UNITS_UM, PlaceableSample, Unit
+from helio_jax.scene.placement import PlaceableSample
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.shapes import (
     FlatSample,
@@ -30,7 +30,7 @@ from helio_jax.scene.shapes import (
     StepSample,
     TrenchSample,
 )
-from helio_jax.settings import Settings
+from helio_jax.settings import UNITS_UM, Settings, Unit
 
 MAX_FACES = 5_000_000
 MESH_EXTENT_UM = (1e-2, 1e6)
@@ -255,7 +255,7 @@ def load_mesh(
     if not np.all(np.isfinite(vertices[faces])):
         raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
     if missing := [name for i, name in enumerate(names) if not np.any(parts == i + 1)]:
-        raise InputFileError(f"{path}: has no part {missing[0]!r}, to which sample.materials gives a material")
+        raise InputFileError(f"{path}: has no part {missing[0]!r}, which the scene names: correct the name")
     clean = trimesh.Trimesh(vertices, faces, process=False)
     clean.merge_vertices(merge_tex=True, merge_norm=True)
     has_area = clean.nondegenerate_faces(height=0.0)

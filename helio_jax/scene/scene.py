@@ -14,6 +14,7 @@ from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.plates import check_solid, read_plate
 from helio_jax.scene.rays import read_rays
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.sample import Sample
@@ -66,6 +67,11 @@ class Scene(Instrument):
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
         problems += self.scan.view_problems(self.beam)
+        if self.plate.is_mesh and self.scan.rotations_deg and self.scan.rotate == "detectors":
+            problems.append(
+                "scan.rotate = 'detectors': the detectors of a plate of kind 'mesh' do not turn without it: turn the "
+                "sample the other way instead (scan.rotate = 'sample')"
+            )
         if self.sample.place != "as-given" and self.scan.sample_distances_um:
             problems.append("scan.sample_distances_um: sets what sample.place sets: remove one of the keys")
         if (problem := self.scan.problem(self.beam)) is not None:
@@ -160,7 +166,8 @@ class Scene(Instrument):
         """
         names = {*self.sample.material_names, self.plate.material}
         own = {name: law for name, law in self.material.items() if name in names}
-        return own | {n: self.material.get(f.name, f.law) for n, f in self.sample.file_laws(self.base_dir).items()}
+        from_files = self.sample.file_laws(self.base_dir)
+        return own | {n: self.material.get(f.name) or f.law for n, f in from_files.items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
         """Return the scattering laws of the materials that sample and plate use, and read their files.
@@ -184,6 +191,14 @@ class Scene(Instrument):
         """
         return None if self.beam.file is None else read_rays(self.base_dir / self.beam.file)
 
+    def read_plate(self) -> Body | None:
+        """Return the plate's mesh, where it is one: see `scene.plates`.
+
+        Raises:
+            InputFileError: the file is missing or wrong, or lacks a part that a detector names.
+        """
+        return read_plate(self.plate, self.detector, self.base_dir) if self.plate.is_mesh else None
+
     def warnings(self) -> list[str]:
         """Return what is allowed but probably not meant, for `helio validate`."""
         out = []
@@ -195,6 +210,8 @@ class Scene(Instrument):
                 )
         for i, first in enumerate(openings):
             for j, second in enumerate(openings[:i]):
+                if first is None or second is None or self.plate.is_mesh:
+                    continue
                 if _catches(first, _sights(second, w), w).any() or _catches(second, _sights(first, w), w).any():
                     names = self.detector_names
                     out.append(f"detectors {names[j]!r} and {names[i]!r} overlap: atoms there count for {names[j]!r}")
@@ -211,11 +228,16 @@ class Scene(Instrument):
                 f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
                 f"set sample.resolution_um to at most {coarsest:g} um"
             )
+        if (plate := self.read_plate()) is not None and not check_solid(plate)["is_watertight"]:
+            out.append(
+                f"{self.plate.file}: the plate is not closed: atoms that enter its solid are lost; a part that no "
+                "detector names belongs to it (a channel's end, say): leave it out of the file or give it a detector"
+            )
         return out + self._plate_warnings(openings) + self.sample.warnings(self.base_dir)
 
-    def _plate_warnings(self, openings: tuple[Aperture | Cone, ...]) -> list[str]:
+    def _plate_warnings(self, openings: tuple[Aperture | Cone | None, ...]) -> list[str]:
         """Return what is probably not meant about a scattering plate's outline."""
-        if not self.plate.is_scattering:
+        if self.plate.kind != "scattering":
             return []
         out = []
         middle, half = (np.array(pair) for pair in self.plate.outline)

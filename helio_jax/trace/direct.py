@@ -29,7 +29,8 @@ class ApertureTable:
 
     Attributes:
         shapes: of an aperture centre x, y, semi-axes and cosine, sine of its rotation; of a cone at infinity its axis
-            x, y, z, its half-angle's cosine and squared sine, 0; and 1 for a cone, 0 for an aperture [k, 7].
+            x, y, z, its half-angle's cosine and squared sine, 0; and 1 for a cone, 0 for an aperture [k, 7]. Under a
+            mesh plate, which has its own way to count, NaN for all but cones: nothing is inside.
         area: of an aperture; of a cone the solid angle [k].
         rims: for each of RIM_POINTS, positions and tangents of apertures [level, k, 2, max points, 2] (zero padded).
     """
@@ -43,6 +44,9 @@ class ApertureTable:
                 b = a.half_angle
                 self.shapes[k] = *a.axis, np.cos(b), np.sin(b) ** 2, 0.0, 1.0
                 self.area[k] = a.solid_angle
+                continue
+            if a is None or instrument.plate.is_mesh:
+                self.shapes[k, :_FAR] = np.nan
                 continue
             self.shapes[k] = *a.center, *a.semi_axes, np.cos(a.rotation), np.sin(a.rotation), 0.0
             self.area[k] = np.pi * np.prod(a.semi_axes)

@@ -23,6 +23,7 @@ from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
+from helio_jax.trace.meshplate import MeshPlate, count_caught
 from helio_jax.trace.plate import PLATE, PlateTable
 from helio_jax.trace.source import Sampling, Source, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import STOPPED, Tally
@@ -44,7 +45,7 @@ class Experiment:
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
-    plate: PlateTable | None = None
+    plate: PlateTable | MeshPlate | None = None
     effusive: "Experiment | None" = None
 
     @property
@@ -389,7 +390,10 @@ def trace_block(
         else:
             hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
         if e.plate is not None and event > 0:
-            e.plate.catch(hits, paths.origin, paths.direction, paths.pixel, offset, table)
+            caught = e.plate.catch(hits, paths.origin, paths.direction, paths.pixel, offset, table)
+            if caught is not None and (ends := caught >= 0).any():
+                count_caught(tally, caught[ends], paths.pixel[ends], paths.order[ends], paths.met_plate[ends])
+                hits, paths = hits.take(~ends), paths.take(~ends)
         keep = _settle(
             event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
             hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes, tally.fates, tally.hits,
