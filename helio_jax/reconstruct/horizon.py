@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import maximum_filter
 
 from helio_jax.arrays import WALL_PITCHES
+from helio_jax.kernel import kernel
 
 OUTSIDE = -1e9
 """Height outside of the raster [um]: hides nothing."""
@@ -68,7 +68,7 @@ def plan_march(direction: np.ndarray, shape: tuple[int, int], dx: float, dy: flo
     return March(first[order], second[order], share[order], distance)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(height, top, plate, far, tail, first, second, share, distance, tall, beyond, found):
     """Write what every point sees steepest [y, x] as 8 step + 2 place + (1 if the share is rounded)."""
     ny, nx = height.shape

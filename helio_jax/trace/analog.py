@@ -6,8 +6,8 @@ does the same in separate steps for other laws, for the expected estimator and w
 """
 
 import numpy as np
-from numba import njit
 
+from helio_jax.kernel import kernel
 from helio_jax.trace.direct import ApertureTable, aperture_ahead
 from helio_jax.trace.intersect import MISS, Intersector, resolve_hit
 from helio_jax.trace.lobes import cosine_direction
@@ -18,7 +18,7 @@ _CHUNK = 128
 """Hits that are looked up together, so that the processor waits for several triangles at a time."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, shapes):
     """Return what becomes of atom `i` after a flight (`tally.FATES`, or -1: it scatters), and its detector or -1.
 
@@ -35,7 +35,7 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
     return ESCAPED, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fly_on(
     event, is_last, face, u, v, origin, direction, pixel, path, skip, o32, d32, facets, spheres, restart, middle,
     inverse_size, offset, plate_z, shapes, ids, seed, fates, hits,

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from helio_jax.kernel import kernel
 
 SMOOTH_PIXELS = 1.0
 """Gaussian width of one pass [pixels] ..."""
@@ -40,7 +41,7 @@ def passes_for(paths: float, wanted: float) -> int:
     return passes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_planes(images, normals, spacing):
     """Return the value at the pixel of the plane fitted around every pixel [y, x, image]."""
     ny, nx, n_images = images.shape

@@ -9,10 +9,10 @@ written separately so that each checks the other.
 """
 
 import numpy as np
-from numba import njit
 
 from helio_jax.detector import Cone
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.lobes import turn_to
 
 RIM_POINTS = (12, 16, 24, 32, 64, 256)
@@ -57,7 +57,7 @@ class ApertureTable:
         return len(self.area)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def form_factor(x, y, depth, k, shapes, rims):
     """Return Phi (3 components) of detector `k` seen from (x, y), `depth` below the plate (lab frame, um).
 
@@ -85,7 +85,7 @@ def form_factor(x, y, depth, k, shapes, rims):
     return fx / n, fy / n, fz / n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_inside(x, y, dx, dy, dz, k, shapes):
     """Whether detector `k` catches an atom that flies through the plate's point (x, y) in the direction d."""
     if shapes[k, _FAR] != 0.0:
@@ -96,7 +96,7 @@ def is_inside(x, y, dx, dy, dz, k, shapes):
     return p * p + q * q <= 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_aperture(x, y, dx, dy, dz, shapes):
     """Return the first detector that catches an atom at the plate's point (x, y) with the direction d, or -1."""
     for k in range(shapes.shape[0]):
@@ -105,7 +105,7 @@ def find_aperture(x, y, dx, dy, dz, shapes):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def aperture_ahead(origins, directions, i, x, y, plate_z, shapes):
     """Return the detector that ray `i` flies to, or -1, and the way to the plate [um]; `x`, `y`: the plate's origin."""
     dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
@@ -116,14 +116,14 @@ def aperture_ahead(origins, directions, i, x, y, plate_z, shapes):
     return find_aperture(x, y, dx, dy, dz, shapes), r
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def disc_point(u, v):
     """Map two uniform numbers to a point (p, q) uniform in area on the unit disc."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v
     return r * np.cos(angle), r * np.sin(angle)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def toward(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
     """Aim from point `i` at detector `k`: at an aperture's point or a cone's direction, uniform as (p, q) on a disc.
 
@@ -149,7 +149,7 @@ def toward(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
     return dx, dy, dz, r2, find_aperture(x, y, dx / r, dy / r, dz / r, shapes) == k
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spread(k, square, cosine, shapes):
     """Return squared distance and cosine by which an area counts as area cosine / square; 1, 1 for a solid angle."""
     return (1.0, 1.0) if shapes[k, _FAR] != 0.0 else (square, cosine)
@@ -161,7 +161,7 @@ def form_factors(instrument: Instrument, points: np.ndarray) -> np.ndarray:
     return _form_factors(np.ascontiguousarray(points, float), instrument.working_distance, table.shapes, table.rims)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _form_factors(points, plate_z, shapes, rims):
     out = np.empty((shapes.shape[0], points.shape[0], 3))
     for k in range(shapes.shape[0]):

@@ -9,9 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from helio_jax.errors import SceneError
+from helio_jax.kernel import kernel
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.analog import land
@@ -157,7 +157,7 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
     return Atoms(ids[pixel], point_last, direction_last, plate_point, order, fate, detector)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _land(event, is_last, origin, direction, surface, is_back, offset, plate_z, shapes):
     """Return fate (-1: it scatters) and detector of every atom after a flight [n]."""
     n = origin.shape[0]

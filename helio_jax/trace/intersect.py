@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 
 from helio_jax.errors import GuardError, SceneError
+from helio_jax.kernel import kernel
 from helio_jax.scene.body import Body
 
 RESTART = 1e-6
@@ -49,7 +49,7 @@ class Hits:
         return cls(point, normal, np.zeros(len(point), np.int32), np.zeros(len(point), bool))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_sphere(origins, directions, i, spheres, skip):
     """Return (distance, index) of the nearest sphere ahead of ray `i`, or (inf, -1)."""
     best, which = np.inf, -1
@@ -68,7 +68,7 @@ def _nearest_sphere(origins, directions, i, spheres, skip):
     return best, which
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _scale_rays(origins, directions, center, inverse_size, o32, d32):
     """Write float32 Embree rays; return the number of rays that are not finite or have no direction."""
     n_bad = 0
@@ -85,7 +85,7 @@ def _scale_rays(origins, directions, center, inverse_size, o32, d32):
     return n_bad
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def resolve_hit(origins, directions, i, skip, face, u, v, facets, spheres, points, normals, j):
     """Find where ray `i` meets the nearest of a hit triangle (or -1) and the spheres; return surface and side.
 
@@ -111,7 +111,7 @@ def resolve_hit(origins, directions, i, skip, face, u, v, facets, spheres, point
     return surface, surface != -1 and cosine > 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _resolve_hits(origins, directions, skip, faces, u, v, facets, spheres):
     n = origins.shape[0]
     point = np.zeros((n, 3))
@@ -125,7 +125,7 @@ def _resolve_hits(origins, directions, skip, faces, u, v, facets, spheres):
     return point, normal, surface, is_back
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_sphere_occlusion(origins, directions, skip, spheres, is_occluded):
     for i in range(origins.shape[0]):
         if not is_occluded[i]:
@@ -133,7 +133,7 @@ def _mark_sphere_occlusion(origins, directions, skip, spheres, is_occluded):
             is_occluded[i] = s >= 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _exhaustive_faces(origins, directions, vertices, triangles):
     """Test every ray against every triangle in float64 (Moeller and Trumbore, J. Graphics Tools 2 (1997) 21)."""
     n = origins.shape[0]

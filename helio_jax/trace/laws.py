@@ -7,8 +7,8 @@ numbers are functions of (seed, pixel, path, event, trial).
 """
 
 import numpy as np
-from numba import njit
 
+from helio_jax.kernel import kernel
 from helio_jax.scene.scattering import Shape
 from helio_jax.trace import lobes
 from helio_jax.trace.lawtable import LawTable
@@ -28,7 +28,7 @@ _COSINE, _SPECULAR, _UNIFORM, _LOBE = (int(s) for s in (Shape.COSINE, Shape.SPEC
 _COSINE_LOBE, _DIFFRACTION, _ROUGH = (int(s) for s in (Shape.COSINE_LOBE, Shape.DIFFRACTION, Shape.ROUGH))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _kept(table, t, d, x, y, z):
     """Return the Debye-Waller factor of a direction: the share that stays in the lobe."""
     if table.attenuation[t] == 0.0:
@@ -36,7 +36,7 @@ def _kept(table, t, d, x, y, z):
     return np.exp(-table.attenuation[t] * ((x - d[0]) ** 2 + (y - d[1]) ** 2 + (z - d[2]) ** 2))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _has_orders(table, t, d, n):
     """Whether any diffraction order of a term is open."""
     b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
@@ -45,7 +45,7 @@ def _has_orders(table, t, d, n):
     return lobes.diffraction_norm(d, n, b1, b2, rows, table.numbers[t, 0], nodes) > _NO_ORDER
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw(table, t, d, n, key, stream, pixel, path, event):
     """Draw from one lobe: (direction, whether it is exact); NaN where no order is open."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
@@ -81,7 +81,7 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
     return np.nan, np.nan, np.nan, False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _density(table, t, d, n, o):
     """Return the density of one lobe (0 for exact directions), attenuation included."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
@@ -104,7 +104,7 @@ def _density(table, t, d, n, o):
     return out * _kept(table, t, d, o[0], o[1], o[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lobe_density(table: LawTable, material, d, n, o):
     """Return the density per steradian of a material's lobes; 0 below the surface. The cosine part is not in it."""
     total = 0.0
@@ -115,7 +115,7 @@ def lobe_density(table: LawTable, material, d, n, o):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lobe_densities(table, material, incoming, normal, outgoing):
     """Return `lobe_density` of one material for many directions [n]; incoming, normal, outgoing: [n, 3]."""
     out = np.empty(outgoing.shape[0])
@@ -124,7 +124,7 @@ def lobe_densities(table, material, incoming, normal, outgoing):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
     """Return the share of the atoms that leave by the cosine law [n].
 
@@ -146,7 +146,7 @@ def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, wants_density=True):
     """Draw how atoms leave.
 

@@ -6,8 +6,8 @@ and pdf = eval. d is the incoming unit direction (towards the surface), n the no
 """
 
 import numpy as np
-from numba import njit
 
+from helio_jax.kernel import kernel
 from helio_jax.trace.lawtable import CUT
 
 REFUSED = (False, 0.0, 0.0, 0.0)
@@ -15,7 +15,7 @@ _EON_A = 0.5 - 2.0 / (3.0 * np.pi)
 _EON_B = 2.0 / 3.0 - 28.0 / (15.0 * np.pi)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn_to(nx, ny, nz, x, y, z):
     """Turn (x, y, z) from a frame whose third axis is the unit vector n; return a unit vector.
 
@@ -31,14 +31,14 @@ def turn_to(nx, ny, nz, x, y, z):
     return out_x / length, out_y / length, out_z / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cosine_direction(nx, ny, nz, u, v):
     """Draw a cosine-distributed direction about a unit vector (Malley's method)."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v
     return turn_to(nx, ny, nz, r * np.cos(angle), r * np.sin(angle), np.sqrt(1.0 - u))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mirror(d, n, sign):
     """Return the specular direction (sign 1) or the way back (sign -1)."""
     if sign < 0.0:
@@ -47,7 +47,7 @@ def mirror(d, n, sign):
     return d[0] - s * n[0], d[1] - s * n[1], d[2] - s * n[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def interpolate(nodes, x, x_max):
     """Return a table over [0, x_max] at x, linearly; held beyond its ends."""
     s = min(max(x / x_max, 0.0), 1.0) * (nodes.size - 1)
@@ -55,7 +55,7 @@ def interpolate(nodes, x, x_max):
     return nodes[i] + (s - i) * (nodes[i + 1] - nodes[i])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_uniform(n, cos_edge, a, b):
     """Uniform within a cone about the normal."""
     z, angle = 1.0 - a * (1.0 - cos_edge), 2.0 * np.pi * b
@@ -64,7 +64,7 @@ def try_uniform(n, cos_edge, a, b):
     return True, x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_lobe(d, n, sigma, sign, a, b, c):
     """Density ~ cos(theta) exp(-g^2 / (2 sigma^2)): a Rayleigh angle g, kept with cos(theta) sin(g) / g."""
     g, angle = sigma * np.sqrt(-2.0 * np.log(1.0 - a)), 2.0 * np.pi * b
@@ -77,7 +77,7 @@ def try_lobe(d, n, sigma, sign, a, b, c):
     return c < cosine * (s / g if g > 0.0 else 1.0), x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lobe_density(d, n, sigma, sign, norm, o):
     """Density of `try_lobe`; `norm`: its integral by tilt of the axis (`lawtable.lobe_norm`)."""
     ax, ay, az = mirror(d, n, sign)
@@ -87,7 +87,7 @@ def lobe_density(d, n, sigma, sign, norm, o):
     return cosine * np.exp(-0.5 * (g / sigma) ** 2) / interpolate(norm, tilt, 0.5 * np.pi)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_cosine_lobe(d, n, a, b):
     """Cosine law about the specular direction, cut at the horizon."""
     ax, ay, az = mirror(d, n, 1.0)
@@ -95,7 +95,7 @@ def try_cosine_lobe(d, n, a, b):
     return x * n[0] + y * n[1] + z * n[2] > 0.0, x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cosine_lobe_density(d, n, o):
     """Density of `try_cosine_lobe`: above the horizon it sums to pi/2 (1 + cos(tilt)) (half disc, half ellipse)."""
     ax, ay, az = mirror(d, n, 1.0)
@@ -103,7 +103,7 @@ def cosine_lobe_density(d, n, o):
     return max(0.0, ax * o[0] + ay * o[1] + az * o[2]) / (0.5 * np.pi * (1.0 + tilt_cosine))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fujii_albedo(cosine, r):
     """Directional albedo of the single-scattering model (FON) at white."""
     s = np.sqrt(max(0.0, 1.0 - cosine * cosine))
@@ -112,7 +112,7 @@ def _fujii_albedo(cosine, r):
     return (1.0 + r * g / np.pi) / (1.0 + _EON_A * r)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rough_density(d, n, r, o):
     """Density of the energy-preserving Oren-Nayar model at albedo 1: brdf * cos(theta).
 
@@ -128,7 +128,7 @@ def rough_density(d, n, r, o):
     return co / np.pi * (single + (both / missing if r > 0.0 else 0.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_rough(d, n, r, a, b, c, e):
     """Keep cosine or uniform directions so that `rough_density` comes out: B cos(theta) s / t <= B bounds the rest."""
     ci = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
@@ -145,7 +145,7 @@ def try_rough(d, n, r, a, b, c, e):
     return e * envelope < rough_density(d, n, r, np.array((x, y, z))), x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lattice_steps(lattice, is_turned, n):
     """Return the changes of direction of the orders (1, 0) and (0, 1) on a face (see `DiffractionLaw`)."""
     z = np.array((0.0, 0.0, 1.0)) if is_turned else n
@@ -159,7 +159,7 @@ def lattice_steps(lattice, is_turned, n):
     return b1 / volume, b2 / volume
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _peak(d, n, b1, b2, row):
     """Return the tangential direction of one order."""
     s = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
@@ -170,7 +170,7 @@ def _peak(d, n, b1, b2, row):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def diffraction_norm(d, n, b1, b2, rows, sigma, nodes):
     """Return the share of all peaks that lies above the horizon."""
     total, low = 0.0, max(0.0, 1.0 - CUT * sigma)
@@ -184,7 +184,7 @@ def diffraction_norm(d, n, b1, b2, rows, sigma, nodes):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_diffraction(d, n, b1, b2, rows, a, b, c):
     """Draw a peak by its weight and a point in it; refuse what lies below the horizon. Also say whether it is exact."""
     i = min(np.searchsorted(rows[:, 4], a * rows[-1, 4], side="right"), rows.shape[0] - 1)
@@ -200,7 +200,7 @@ def try_diffraction(d, n, b1, b2, rows, a, b, c):
     return True, x + up * n[0], y + up * n[1], z + up * n[2], rows[i, 3] == 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def diffraction_density(d, n, b1, b2, rows, sigma, nodes, o):
     """Density of the broadened peaks of `try_diffraction`; exact peaks are not part of it."""
     if sigma == 0.0:
@@ -220,7 +220,7 @@ def diffraction_density(d, n, b1, b2, rows, sigma, nodes, o):
     return total * cosine / (2.0 * np.pi * sigma * sigma * norm)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _plane_of_incidence(d, n):
     """Return the forward direction along the surface; any, at normal incidence."""
     s = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
@@ -231,7 +231,7 @@ def _plane_of_incidence(d, n):
     return x / length, y / length, z / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _between(axis, x):
     """Return the interval of a growing axis that holds x, and where in it (0 to 1, held at the ends)."""
     if axis.size == 1:
@@ -240,7 +240,7 @@ def _between(axis, x):
     return i, min(max((x - axis[i]) / (axis[i + 1] - axis[i]), 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unpack(nodes):
     """Return axes, intensity and cumulative envelope of a table (`lawtable._pack_table`)."""
     ni, nt, np_ = int(nodes[0]), int(nodes[1]), int(nodes[2])
@@ -251,13 +251,13 @@ def _unpack(nodes):
     return nodes[3:a], nodes[a:b], nodes[b:c], nodes[c:e].reshape(ni, nt, np_), nodes[e:].reshape(ni, -1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bilinear(f, j, s, k, t):
     low = f[j, k] * (1.0 - t) + f[j, k + 1] * t
     return low * (1.0 - s) + (f[j + 1, k] * (1.0 - t) + f[j + 1, k + 1] * t) * s
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def try_table(d, n, nodes, a, b, c, e, f, g):
     """Draw an incidence, a cell by its largest corner, a point in it; keep it by the interpolated intensity."""
     incidence, theta, phi, intensity, envelope = _unpack(nodes)
@@ -281,7 +281,7 @@ def try_table(d, n, nodes, a, b, c, e, f, g):
     return z > 0.0, p * tx + q * bx + z * n[0], p * ty + q * by + z * n[1], p * tz + q * bz + z * n[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def table_density(d, n, nodes, o):
     """Density of `try_table`."""
     incidence, theta, phi, intensity, _ = _unpack(nodes)

@@ -6,9 +6,9 @@ vector of the hidden form factor, by the pipeline's refinement loop.
 """
 
 import numpy as np
-from numba import njit
 
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.direct import ApertureTable, spread, toward
 from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.transport import lift_off
@@ -21,7 +21,7 @@ def aperture_samples(n_points: int) -> np.ndarray:
     return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_rays(k, sample, point, normal, offset, plate_z, shapes, area):
     """Return directions to one detector sample, vector weights cos(theta_d) r / (pi r^3) dA, and the horizon."""
     n = point.shape[0]

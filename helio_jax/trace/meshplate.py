@@ -8,10 +8,10 @@ either side; of two ellipses in one plane the first in the list. Whole atoms onl
 """
 
 import numpy as np
-from numba import njit
 
 from helio_jax.detector import Aperture
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.scene.body import Body
 from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.intersect import MISS, Hits, Intersector
@@ -77,7 +77,7 @@ class MeshPlate:
         return caught
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first(origin, direction, point, is_hit, counts, ellipses):
     """Return the detector that each ray meets before anything of the plate that does not count, or -1 [n]."""
     out = np.empty(origin.shape[0], np.int64)

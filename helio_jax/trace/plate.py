@@ -8,9 +8,9 @@ from the sample have nothing of it in front, and from the plate itself, in whose
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.direct import ApertureTable, aperture_ahead
 from helio_jax.trace.intersect import MISS, Hits
 
@@ -61,7 +61,7 @@ class PlateTable(NamedTuple):
         _catch(self, origin, direction, pixel, offset, apertures.shapes, hits.point, hits.normal, hits.surface)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_solid(plate, x, y):
     """Whether the plate point (x, y), lab frame, lies within the outline and not in the pinhole."""
     p, q = (x - plate.center[0]) / plate.half[0], (y - plate.center[1]) / plate.half[1]
@@ -70,7 +70,7 @@ def is_solid(plate, x, y):
     return is_within and dx * dx + dy * dy > plate.pinhole[2] ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _catch(plate, origin, direction, pixel, offset, shapes, point, normal, surface):
     for i in range(origin.shape[0]):
         if surface[i] != MISS or direction[i, 2] <= 0.0:

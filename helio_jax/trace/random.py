@@ -7,9 +7,11 @@ as 1, 2, 3", SC11; tested word for word against NumPy's own Philox (tests/physic
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from scipy.stats import qmc
+
+from helio_jax.kernel import kernel
 
 N_BEAM_DIMENSIONS = 6
 """Low-discrepancy dimensions of a beam ray: pinhole 2, source angle 2, first aperture point 2."""
@@ -32,7 +34,7 @@ def _multiply_high(_context, a, b):
     return types.uint64(a, b), generate
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def philox(key0, key1, c0, c1, c2, c3):
     """Return four uniform numbers in [0, 1) for one key and counter (all uint64)."""
     for i in range(10):

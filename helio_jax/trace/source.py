@@ -9,10 +9,10 @@ Knows nothing of the sample.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.random import N_BEAM_DIMENSIONS, low_discrepancy_points, philox
 
 _MODELS = {"pencil": 0, "uniform": 1, "gaussian": 2, "effusive": 3, "rays": 4}
@@ -93,7 +93,7 @@ class Source:
         return cls(_MODELS["effusive"], exponent, frame, instrument.beam.pinhole_radius_um, np.zeros((0, 7)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def beam_numbers(pixels, n_rays, n_replicates, points, seed):
     """Return the random numbers of every beam ray [pixels * rays, 6], rays of a pixel together.
 
@@ -115,14 +115,14 @@ def beam_numbers(pixels, n_rays, n_replicates, points, seed):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bounce_number(seed, pixel_id, path, event):
     """Return four random numbers of one path of a pixel for the bounce after `event`."""
     key, zero = np.uint64(seed), np.uint64(0)
     return philox(key, _BOUNCE_STREAM, np.uint64(pixel_id), np.uint64(path), np.uint64(event), zero)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, is_low_discrepancy):
     """Return two random numbers per path for the bounce after `event`, and two for the next aperture point [n, 4].
 
@@ -142,7 +142,7 @@ def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, i
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, rays, origins, directions):
     for i in range(numbers.shape[0]):
         p = i // n_rays

@@ -14,9 +14,9 @@ are estimated by the atoms that hit alone.
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 
 from helio_jax.instrument import Instrument
+from helio_jax.kernel import kernel
 from helio_jax.trace.analog import fly_to_the_end, land
 from helio_jax.trace.direct import ApertureTable, aperture_ahead, disc_point, form_factor, is_inside, spread, toward
 from helio_jax.trace.intersect import MISS, Hits, Intersector
@@ -87,7 +87,7 @@ class _Paths:
         return _Paths(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(
     event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
     shapes, fates, hits, plate_hits,
@@ -118,7 +118,7 @@ def _settle(
     return keep[:m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lift_off(point, normal, surface, restart):
     """Move points on triangles off the surface; return new origins and the sphere each ray must skip."""
     origin, skip = point.copy(), np.empty(point.shape[0], np.int32)
@@ -132,7 +132,7 @@ def lift_off(point, normal, surface, restart):
     return origin, skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
     """Return the chance that an atom goes to a detector as small as a point and `area` large, if aiming may tell it.
 
@@ -142,7 +142,7 @@ def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
     return weight if n_hits * abs(weight) <= 1.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area):
     """Aim at a random point of detector `k`: direction, weight of that point, and whether it can count at all."""
     n = point.shape[0]
@@ -160,7 +160,7 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area)
     return direction, weight, is_open
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
     """Add what detector `k` catches of path `i`, scattered `order` times."""
     r, p = replicate[i], pixel[i]
@@ -169,7 +169,7 @@ def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
         plate_sums[r, k, p] += value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score(
     k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, shapes,
     rims, sums, plate_sums,
@@ -189,13 +189,13 @@ def _score(
         _add(value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _balance(density, n_hits, square, cosine, area):
     """Return density / (density of aiming + n density of hitting): the balance heuristic of both estimates."""
     return 1.0 / n_hits if density == np.inf else density / (square / (area * cosine) + n_hits * density)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score_lobes(
     k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
     plate_z, shapes, area, sums, plate_sums,
@@ -210,7 +210,7 @@ def _score_lobes(
             _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _score_hits(
     share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, shapes,
     area, sums, plate_sums,
@@ -226,7 +226,7 @@ def _score_hits(
                 _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _subtract_hidden(
     share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
     shapes, area, sums, plate_sums,
@@ -258,7 +258,7 @@ def _subtract_hidden(
                     is_hidden = True  # where detectors overlap, the first one has it
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bounce(normal, u):
     """Draw cosine-distributed directions about the normals [n, 3]."""
     out = np.empty(normal.shape)
@@ -268,7 +268,7 @@ def _bounce(normal, u):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _history(surface, normal, order, met_plate):
     """Return what is kept of each path's past once this surface has scattered it: `normal`, `order`, `met_plate`."""
     normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
