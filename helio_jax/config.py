@@ -39,8 +39,13 @@ class SceneFile(Scene):
     truth: TruthSettings = TruthSettings()
 
     def _problems(self) -> list[str]:
-        noise = self.noise.problems(len(self.detector))
-        return super()._problems() + [f"noise.{key}: {text}" for key, text in noise]
+        problems = super()._problems()
+        if self.plate.is_mesh and self.trace.estimator != "analog":
+            problems.append(
+                f"trace.estimator = {self.trace.estimator!r}: under a plate of kind 'mesh' only whole atoms are "
+                "counted: set trace.estimator = 'analog'"
+            )
+        return problems + [f"noise.{key}: {text}" for key, text in self.noise.problems(len(self.detector))]
 
 
 def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = None) -> SceneFile:
@@ -146,7 +151,7 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
             for key, child in node.items()
         }
 
-    tables_with_files = ("beam", "sample", "material", "scan")
+    tables_with_files = ("beam", "plate", "sample", "material", "scan")
     return {key: changed(node) if key in tables_with_files else node for key, node in tables.items()}
 
 

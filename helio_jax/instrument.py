@@ -8,13 +8,14 @@ Does not know any sample, ray or image.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from helio_jax.settings import Settings
+from helio_jax.detector import Aperture, Cone, Detector
+from helio_jax.errors import SceneError
+from helio_jax.settings import Settings, Unit
 
 
 class Effusive(Settings):
@@ -60,9 +61,10 @@ class Beam(Settings):
 class Plate(Settings):
     """The pinhole plate: the plane that holds the pinhole and the detector apertures."""
 
-    kind: Literal["transparent", "scattering"] = "transparent"
+    kind: Literal["transparent", "scattering", "mesh"] = "transparent"
     """`transparent`: atoms that miss every aperture pass through and are gone; `scattering`: its underside sends them
-    back by the law of its material, but for the apertures and the pinhole, which are holes."""
+    back by the law of its material, but for the apertures and the pinhole, which are holes; `mesh`: a solid from a
+    file, with channels, that scatters by the law of its material (trace.estimator = "analog" only)."""
     working_distance_um: float = Field(gt=0.0, le=1e7)
     """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
     sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e7)
@@ -74,14 +76,31 @@ class Plate(Settings):
     center_um: tuple[float, float] | None = None
     """`scattering`: middle (x, y) of the plate, lab frame (default: straight above the nominal spot) [um]."""
     material: str | None = Field(default=None, min_length=1, max_length=64)
-    """`scattering`: name of its material (default: the cosine law)."""
+    """`scattering`, `mesh`: name of its material (default: the cosine law)."""
+    file: str | None = Field(default=None, min_length=1, max_length=4096)
+    """`mesh`: STL, OBJ, PLY or GLB file, relative to the scene file. Its x, y are the lab frame's (0, 0: straight above
+    the nominal spot), z = 0 the plane of the pinhole, with all of the plate at z >= 0; it moves with the beam."""
+    unit: Unit | None = None
+    """`mesh`: unit of the file's coordinates."""
+    rotate_deg: tuple[float, float, float] | None = None
+    """`mesh`: rotations about the fixed x, then y, then z axis (default: none) [deg]."""
+    translate_um: tuple[float, float, float] | None = None
+    """`mesh`: shift after turning (default: none) [um]."""
 
     @model_validator(mode="after")
-    def _has_an_outline_if_it_scatters(self) -> "Plate":
-        names = ("radius_um", "size_um", "center_um", "material")
+    def _has_the_keys_of_its_kind(self) -> "Plate":
+        own = {
+            "scattering": ("radius_um", "size_um", "center_um", "material"),
+            "mesh": ("file", "unit", "rotate_deg", "translate_um", "material"),
+        }
+        names = dict.fromkeys(name for keys in own.values() for name in keys)
         given = [name for name in names if getattr(self, name) is not None]
-        if self.kind == "transparent" and given:
-            raise ValueError(f'a transparent plate has no {given[0]}: set kind = "scattering" or remove the key')
+        stray = [name for name in given if name not in own.get(self.kind, ())]
+        if stray:
+            kinds = " or ".join(f'"{kind}"' for kind, keys in own.items() if stray[0] in keys)
+            raise ValueError(f"a {self.kind} plate has no {stray[0]}: set kind = {kinds} or remove the key")
+        if self.kind == "mesh" and (missing := [name for name in ("file", "unit") if name not in given]):
+            raise ValueError(f'a plate of kind "mesh" needs {" and ".join(missing)}: add the key')
         if self.kind == "scattering" and (self.radius_um is None) == (self.size_um is None):
             raise ValueError(
                 "a scattering plate needs its outline, either radius_um (a disc) or size_um = [x, y] (a rectangle), "
@@ -97,56 +116,15 @@ class Plate(Settings):
         return self.kind != "transparent"
 
     @property
+    def is_mesh(self) -> bool:
+        """Whether the plate is a solid from a file."""
+        return self.kind == "mesh"
+
+    @property
     def outline(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Middle (x, y) and half extents of a scattering plate, lab frame [um]."""
+        """Middle (x, y) and half extents of a flat scattering plate, lab frame [um]."""
         a, b = self.size_um if self.size_um is not None else (2.0 * (self.radius_um or 0.0),) * 2
         return self.center_um or (0.0, 0.0), (0.5 * a, 0.5 * b)
-
-
-class Detector(Settings):
-    """One detector aperture: either an ellipse on the plate, or the cone it fills seen from the nominal spot."""
-
-    name: str = Field(min_length=1, max_length=64)
-    """Name shown in figures and files."""
-    center_um: tuple[float, float] | None = None
-    """Centre (x, y) of the ellipse on the plate, lab frame [um]."""
-    axes_um: tuple[float, float] | None = None
-    """FULL axes of the ellipse; the first one along x before rotation [um]."""
-    rotation_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
-    """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
-    polar_deg: float | None = Field(default=None, ge=0.0, lt=90.0)
-    """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
-    azimuth_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
-    """Azimuth of the cone's axis, counter-clockwise from +x (default 0) [deg]."""
-    half_angle_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
-    """Half-angle of the cone [deg]."""
-    channel: int | None = Field(default=None, ge=1, le=1000)
-    """Channel of a measured file that this aperture feeds (1-based); only used on import."""
-
-    @model_validator(mode="after")
-    def _is_ellipse_or_cone(self) -> "Detector":
-        ellipse = [self.center_um, self.axes_um]
-        cone = [self.polar_deg, self.half_angle_deg]
-        is_ellipse = all(v is not None for v in ellipse)
-        is_cone = all(v is not None for v in cone)
-        stray = (
-            any(v is not None for v in (*cone, self.azimuth_deg))
-            if is_ellipse
-            else any(v is not None for v in (*ellipse, self.rotation_deg))
-        )
-        if is_ellipse == is_cone or stray:
-            raise ValueError(
-                f"detector {self.name!r} must be given either by center_um and axes_um (and rotation_deg) or by "
-                "polar_deg and half_angle_deg (and azimuth_deg), not by a mixture: remove the other keys"
-            )
-        if self.axes_um is not None and min(self.axes_um) <= 0:
-            raise ValueError(f"detector {self.name!r}: axes_um must be > 0 um, got {list(self.axes_um)}")
-        if is_cone and self.polar_deg + self.half_angle_deg >= 89.0:  # type: ignore[operator]
-            raise ValueError(
-                f"detector {self.name!r}: polar_deg + half_angle_deg must be < 89 deg so that the cone meets the "
-                f"plate in an ellipse, got {self.polar_deg} + {self.half_angle_deg}"  # type: ignore[operator]
-            )
-        return self
 
 
 class Uncertainty(Settings):
@@ -162,51 +140,6 @@ class Uncertainty(Settings):
     """Of each aperture's azimuth about the nominal spot [deg]."""
 
 
-@dataclass(frozen=True)
-class Aperture:
-    """A detector aperture resolved to its ellipse on the plate (lab frame, um, radians, SEMI-axes)."""
-
-    center: tuple[float, float]
-    semi_axes: tuple[float, float]
-    rotation: float
-
-    def rim(self, n_points: int) -> np.ndarray:
-        """Return `n_points` rim points and tangents, equally spaced in the ellipse's parameter.
-
-        Returns:
-            Array [2, n_points, 2]: positions (x, y) on the plate [um] and derivatives with respect to the
-            parameter [um/rad], counter-clockwise seen from above.
-        """
-        s = 2 * np.pi * np.arange(n_points) / n_points
-        (a, b), c, d = self.semi_axes, math.cos(self.rotation), math.sin(self.rotation)
-        turn = np.array([[c, -d], [d, c]])
-        points = np.stack([a * np.cos(s), b * np.sin(s)], -1) @ turn.T + np.asarray(self.center)
-        tangents = np.stack([-a * np.sin(s), b * np.cos(s)], -1) @ turn.T
-        return np.stack([points, tangents])
-
-
-def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: float) -> Aperture:
-    """Cut a circular cone with the plate: the exact ellipse seen under `half_angle` from the nominal spot.
-
-    Valid for polar + half_angle < pi/2.
-
-    Args:
-        polar: angle of the cone's axis to the plate normal [rad].
-        azimuth: azimuth of the axis [rad].
-        half_angle: half-angle of the cone [rad].
-        distance: from the nominal spot to the plate [um].
-
-    Returns:
-        The ellipse, major axis along the azimuth.
-
-    Source: own derivation (plane section of a cone), tests/unit/test_instrument.py.
-    """
-    near, far = distance * math.tan(polar - half_angle), distance * math.tan(polar + half_angle)
-    minor = distance * math.sin(half_angle) / math.sqrt(math.cos(polar) ** 2 - math.sin(half_angle) ** 2)
-    r = 0.5 * (near + far)
-    return Aperture((r * math.cos(azimuth), r * math.sin(azimuth)), (0.5 * (far - near), minor), azimuth)
-
-
 class Instrument(Settings):
     """Beam, plate and detectors of one scan, with the geometry derived from them (um, radians)."""
 
@@ -220,6 +153,22 @@ class Instrument(Settings):
         names = [d.name for d in self.detector]
         if len(set(names)) != len(names):
             raise ValueError(f"detector names must differ, got {names}: rename one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_plate_for_its_detectors(self) -> "Instrument":
+        far = [d.name for d in self.detector if d.at_infinity]
+        if far and self.plate.kind == "scattering":
+            raise ValueError(
+                f"detector {far[0]!r} is at infinity, which a flat scattering plate hides: set plate.kind = "
+                "'transparent' (without size and material), or remove at_infinity"
+            )
+        behind = [d.name for d in self.detector if d.needs_mesh]
+        if behind and not self.plate.is_mesh:
+            raise ValueError(
+                f"detector {behind[0]!r} has part or height_um, which only a plate of kind 'mesh' has: set "
+                "plate.kind = 'mesh' with its file, or remove the key"
+            )
         return self
 
     def with_cosine_plate(self) -> "Instrument":
@@ -262,18 +211,30 @@ class Instrument(Settings):
         w = self.working_distance
         return np.array([-w * tx, -w * ty, w])
 
+    def openings(self) -> tuple[Aperture | Cone | None, ...]:
+        """Return the ellipse or cone of every detector, in array order; where two overlap, the earlier one wins.
+
+        None: a part of the plate's mesh.
+        """
+        return tuple(d.opening(self.working_distance) for d in self.detector)
+
     def apertures(self) -> tuple[Aperture, ...]:
-        """Return the ellipse of every detector, in array order; where two overlap, the earlier one wins."""
-        out = []
-        for d in self.detector:
-            if d.center_um is not None and d.axes_um is not None:
-                semi = (0.5 * d.axes_um[0], 0.5 * d.axes_um[1])
-                out.append(Aperture(d.center_um, semi, math.radians(d.rotation_deg or 0.0)))
-            else:
-                assert d.polar_deg is not None and d.half_angle_deg is not None  # by the validator above
-                polar, azimuth, half = map(math.radians, (d.polar_deg, d.azimuth_deg or 0.0, d.half_angle_deg))
-                out.append(cone_ellipse(polar, azimuth, half, self.working_distance))
-        return tuple(out)
+        """Return the ellipse of every detector, in array order.
+
+        Raises:
+            SceneError: a detector is at infinity, or the plate is a mesh.
+        """
+        openings = self.openings()
+        out = tuple(o for o in openings if isinstance(o, Aperture))
+        if len(out) == len(openings) and not self.plate.is_mesh:
+            return out
+        far = [d.name for d in self.detector if d.at_infinity]
+        raise SceneError(
+            (f"detector {far[0]!r} is at infinity" if far else "plate.kind = 'mesh'")
+            + ": that can be simulated only; heights, calibration, alignment and files in the reference's layout need "
+            "apertures in a flat plate: give every detector center_um and axes_um"
+            + ("" if not self.plate.is_mesh else " and set plate.kind = 'scattering' or 'transparent'")
+        )
 
     def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
         """Return the instrument with its apertures aimed elsewhere and the sample farther away.

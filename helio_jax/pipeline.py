@@ -374,6 +374,7 @@ def run(
             f"{scene_path}: heights come from one raster, scan.kind is {scene.scan.kind!r} with {scene.scan.n_views} "
             "view(s): use helio simulate, which writes any scan"
         )
+    scene.apertures()  # heights need them: told before anything is traced
     out = Path(folder) if folder else Path("helio-out") / scene.name
     try:
         out.mkdir(parents=True, exist_ok=True)

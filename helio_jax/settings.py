@@ -5,7 +5,14 @@ radians. Each setting is declared once, in a model beside the code that uses it,
 meaning; `config.py` only composes these models into a scene file.
 """
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict
+
+UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
+"""Length units of files [um]."""
+Unit = Literal["nm", "um", "mm", "cm", "m", "inch"]
+"""Name of a length unit of a file."""
 
 
 class Settings(BaseModel):

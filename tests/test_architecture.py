@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors"},
     {"arrays", "settings", "kernel"},
+    {"detector"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},
     {"scene"},
@@ -30,7 +31,7 @@ LEVELS = [
     {"__main__", "__init__"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
-STAGES = LEVELS[5]
+STAGES = LEVELS[6]
 DOORS = {
     "embreex": {"trace/intersect.py"},
     "trimesh": {"scene/sample.py", "formats/meshes.py"},
@@ -46,6 +47,7 @@ DOORS = {
     "lineax": {"reconstruct/refiner.py"},
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
+    "manifold3d": {"scene/drill.py"},
     "numba": {"kernel.py", "trace/random.py"},
 }
 FOLDERS = {

@@ -35,6 +35,7 @@ def info(file: Annotated[Path, typer.Argument(help="File written by helio (.h5).
 def validate(scene: SceneArg) -> None:
     """Check a scene file and its sample; list every error with place, value, limit and remedy."""
     from helio_jax.config import load_scene
+    from helio_jax.scene.plates import check_solid
     from helio_jax.scene.sample import check_body
 
     loaded = load_scene(scene)
@@ -42,6 +43,9 @@ def validate(scene: SceneArg) -> None:
     loaded.read_rays()
     for key, value in check_body(loaded.build_body()).items():
         print(f"  {key}: {value}")
+    if (plate := loaded.read_plate()) is not None:
+        for key, value in check_solid(plate).items():
+            print(f"  plate {key}: {value}")
     for warning in loaded.warnings():
         print(f"  warning: {warning}")
     ny, nx = loaded.image_shape

@@ -4,6 +4,7 @@ Each parses, calls, prints; no logic of its own.
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from helio_jax.commands.app import (
     Bar,
     H5File,
     Method,
+    OutFile,
     Processes,
     Rays,
     Restart,
@@ -175,3 +177,30 @@ def spot(
         return
     for row in found:
         print("  ".join(f"{key} {value:.4g}" for key, value in row.items()))
+
+
+@app.command()
+def plate(
+    instrument: Annotated[Path, typer.Argument(help="Instrument or scene file with apertures.", metavar="SCENE.toml")],
+    output: OutFile,
+    thickness_um: Annotated[float, typer.Option(help="Thickness of the plate [um].")],
+    radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: room for all).")] = None,
+    channel_deg: Annotated[
+        float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
+    ] = None,
+) -> None:
+    """Make the watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
+    from helio_jax.config import load_instrument
+    from helio_jax.errors import SceneError
+    from helio_jax.formats.safe import atomic_path
+    from helio_jax.scene.drill import drill_plate
+
+    if output.suffix.lower() != ".obj":
+        raise SceneError(f"{output}: plates are written as OBJ, which names their parts: give it the suffix .obj")
+    angle = None if channel_deg is None else math.radians(channel_deg)
+    found = drill_plate(load_instrument(instrument), thickness_um, radius_um, angle)
+    with atomic_path(output) as part:
+        about = f"made by helio plate from {instrument.name}, {thickness_um:g} um thick; units: um"
+        part.write_text(found.obj(about), encoding="utf-8")
+    print(f"{output}: {len(found.faces)} triangles, {len(found.ends)} channels; in a scene:\n")
+    print(found.tables(output.name))

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from helio_jax.detector import Aperture
 from helio_jax.errors import InputFileError
 from helio_jax.formats.tables import get_array, get_list, get_number, get_table
-from helio_jax.instrument import Aperture, Instrument
+from helio_jax.instrument import Instrument
 
 _SOURCES = {"Uniform": "uniform", "Gaussian": "gaussian", "Infinite": "pencil"}
 _LENGTH_TOLERANCE_UM = 1.0

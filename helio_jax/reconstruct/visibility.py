@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helio_jax.instrument import Aperture
+from helio_jax.detector import Aperture
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.horizon import OUTSIDE, March, at_horizon, find_horizons, plan_march
 

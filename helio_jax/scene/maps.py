@@ -16,8 +16,8 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_height_map
-from helio_jax.scene.placement import UNITS_UM, Unit
 from helio_jax.scene.shapes import Length, PaintedSample
+from helio_jax.settings import UNITS_UM, Unit
 
 
 class HeightMapSample(PaintedSample):

@@ -12,12 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from helio_jax.scene.body import Body
+from helio_jax.scene.mtl import FileLaw
 from helio_jax.settings import Settings
-
-UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
-"""Length units of files [um]."""
-Unit = Literal["nm", "um", "mm", "cm", "m", "inch"]
-"""Name of a length unit of a file."""
 
 
 class PlaceableSample(Settings):
@@ -40,6 +36,14 @@ class PlaceableSample(Settings):
     def build(self, base_dir: Path = Path()) -> Body:
         """Return the geometry where it stands (errors as those of its files)."""
         return self.put(self.shape(base_dir))
+
+    def file_laws(self, base_dir: Path = Path()) -> dict[str, FileLaw]:
+        """Return the scattering laws that the sample's files bring along, by the material's name in the body."""
+        return {}
+
+    def warnings(self, base_dir: Path = Path()) -> list[str]:
+        """Return what is allowed but probably not meant about the sample's files."""
+        return []
 
     def put(self, body: Body, unit: float = 1.0) -> Body:
         """Return a shape, whose lengths are in `unit` um, scaled, turned and moved."""

@@ -18,7 +18,8 @@ from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes
 from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
-from helio_jax.scene.placement import UNITS_UM, PlaceableSample, Unit
+from helio_jax.scene.mtl import FileLaw, mtl_files, used_laws
+from helio_jax.scene.placement import PlaceableSample
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.shapes import (
     FlatSample,
@@ -29,7 +30,7 @@ from helio_jax.scene.shapes import (
     StepSample,
     TrenchSample,
 )
-from helio_jax.settings import Settings
+from helio_jax.settings import UNITS_UM, Settings, Unit
 
 MAX_FACES = 5_000_000
 MESH_EXTENT_UM = (1e-2, 1e6)
@@ -49,7 +50,8 @@ class MeshSample(PaintedSample):
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
     materials: dict[str, str] = Field(default={}, max_length=1000)
-    """Material by the name of a part: OBJ: its material (usemtl), group or object; GLB: its geometry."""
+    """Material by the name of a part: OBJ: its material (usemtl), group or object; GLB: its geometry. Other parts of an
+    OBJ have the laws that the .mtl file beside it gives their materials (helio_law ...), if it does."""
 
     @property
     def material_names(self) -> tuple[str, ...]:
@@ -62,10 +64,35 @@ class MeshSample(PaintedSample):
         Raises:
             InputFileError: the file is missing, too large, unreadable, empty or non-finite.
         """
-        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials))
-        names = tuple(dict.fromkeys(self.material_names))
-        index = np.array([names.index(name) for name in self.material_names])[parts]
+        laws = self.file_laws(base_dir)
+        own = tuple(law.name for law in laws.values())
+        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials), own)
+        wanted = (*self.material_names, *laws)
+        names = tuple(dict.fromkeys(wanted))
+        index = np.array([names.index(name) for name in wanted])[parts]
         return Body(vertices, faces, materials=names, face_material=index)
+
+    def file_laws(self, base_dir: Path = Path()) -> dict[str, FileLaw]:
+        """Return the laws in the .mtl beside an OBJ of parts that `materials` does not name, by "NAME (FILE)".
+
+        Raises:
+            InputFileError: the mesh or the .mtl is missing or wrong.
+        """
+        path = base_dir / self.file
+        if path.suffix.lower() != ".obj":
+            return {}
+        laws = used_laws(path, read_bytes(path, self.max_file_mb))
+        return {f"{name} ({self.file})": law for name, law in laws.items() if name not in self.materials}
+
+    def warnings(self, base_dir: Path = Path()) -> list[str]:
+        """Return which .mtl files are named by the OBJ and not there."""
+        path = base_dir / self.file
+        missing = mtl_files(path, read_bytes(path, self.max_file_mb))[1] if path.suffix.lower() == ".obj" else []
+        return [
+            f"{path.name} names {name}, which is not beside it: laws that it may give are unknown, all parts "
+            "but those in sample.materials have sample.material"
+            for name in missing
+        ]
 
     def build(self, base_dir: Path = Path()) -> Body:
         """Read, check and place the mesh, and put the flat under it.
@@ -138,6 +165,14 @@ class SeveralSamples(PlaceableSample):
         tops = [part.sample.top + part.shift_um[2] for part in self.parts if part.sample.top is not None]
         return max(tops, default=None)
 
+    def file_laws(self, base_dir: Path = Path()) -> dict[str, FileLaw]:
+        """Return the laws that the samples' files bring along (errors as theirs)."""
+        return {name: law for part in self.parts for name, law in part.sample.file_laws(base_dir).items()}
+
+    def warnings(self, base_dir: Path = Path()) -> list[str]:
+        """Return what is probably not meant about the samples' files."""
+        return [text for part in self.parts for text in part.sample.warnings(base_dir)]
+
     def shape(self, base_dir: Path = Path()) -> Body:
         """Build and join the samples (errors as theirs)."""
         return Body.join([part.sample.build(base_dir).moved(part.shift_um) for part in self.parts])
@@ -182,11 +217,16 @@ def check_body(body: Body) -> dict[str, Any]:
     }
 
 
-def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def load_mesh(
+    path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple[str, ...] = ()
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read a mesh in file units; equal vertices are merged, a closed mesh must not be inside out.
 
+    `names` of parts must be in the file; `own` are materials of an OBJ (usemtl), for parts that `names` does not name.
+
     Returns:
-        Vertices [n, 3], faces [m, 3], and of each face 1 + the number of its name in `names`, 0: none of them [m].
+        Vertices [n, 3], faces [m, 3], and of each face 1 + the number of its name in `names` and then `own`, 0: none
+        of them [m].
 
     Raises:
         InputFileError: the file is unreadable or holds no sensible mesh, or has no part of one of the names.
@@ -198,13 +238,14 @@ def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = ()) -> tuple[n
     import trimesh
 
     try:
-        pieces = [piece for text, label in _split(data, kind, names) for piece in _pieces(text, kind, label)]
+        pieces = [piece for text, label in _split(data, kind, names, own) for piece in _pieces(text, kind, label)]
     except Exception as e:  # trimesh's readers raise anything on corrupt files
         raise InputFileError(f"{path}: cannot be read as a {kind.upper()} mesh ({type(e).__name__}: {e})") from e
     first = np.cumsum([0, *(len(vertices) for vertices, _, _ in pieces)])
     vertices = np.concatenate([np.zeros((0, 3)), *(v for v, _, _ in pieces)])
     faces = np.concatenate([np.zeros((0, 3), np.int64), *(f + n for (_, f, _), n in zip(pieces, first, strict=False))])
-    parts = np.repeat([names.index(p) + 1 if p in names else 0 for _, _, p in pieces], [len(f) for _, f, _ in pieces])
+    known = (*names, *own)
+    parts = np.repeat([known.index(p) + 1 if p in known else 0 for _, _, p in pieces], [len(f) for _, f, _ in pieces])
     if not len(faces):
         raise InputFileError(f"{path}: the mesh has no triangles: export a surface, not points or lines")
     if len(faces) > MAX_FACES:
@@ -214,7 +255,7 @@ def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = ()) -> tuple[n
     if not np.all(np.isfinite(vertices[faces])):
         raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
     if missing := [name for i, name in enumerate(names) if not np.any(parts == i + 1)]:
-        raise InputFileError(f"{path}: has no part {missing[0]!r}, to which sample.materials gives a material")
+        raise InputFileError(f"{path}: has no part {missing[0]!r}, which the scene names: correct the name")
     clean = trimesh.Trimesh(vertices, faces, process=False)
     clean.merge_vertices(merge_tex=True, merge_norm=True)
     has_area = clean.nondegenerate_faces(height=0.0)
@@ -228,9 +269,9 @@ def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = ()) -> tuple[n
     return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
 
 
-def _split(data: bytes, kind: str, names: tuple[str, ...]) -> list[tuple[bytes, str]]:
+def _split(data: bytes, kind: str, names: tuple[str, ...], own: tuple[str, ...]) -> list[tuple[bytes, str]]:
     """Return the text of an OBJ file once for each of its named parts, with that part's faces only; else all."""
-    if kind != "obj" or not names:
+    if kind != "obj" or not (names or own):
         return [(data, "")]
     rest: list[bytes] = []
     faces: dict[str, list[bytes]] = {}
@@ -240,8 +281,9 @@ def _split(data: bytes, kind: str, names: tuple[str, ...]) -> list[tuple[bytes, 
         if word in (b"usemtl", b"g", b"o"):
             current[word] = value.strip().decode("utf-8", "replace")
         elif word == b"f":
-            own = [current[w] for w in (b"usemtl", b"g", b"o") if current.get(w) in names]
-            faces.setdefault(own[0] if own else "", []).append(line)
+            found = [current[w] for w in (b"usemtl", b"g", b"o") if current.get(w) in names]
+            found += [current[b"usemtl"]] if current.get(b"usemtl") in own else []
+            faces.setdefault(found[0] if found else "", []).append(line)
         elif word in (b"v", b"vn", b"vt"):
             rest.append(line)
     return [(b"\n".join(rest + lines), name) for name, lines in faces.items()]

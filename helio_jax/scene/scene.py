@@ -10,9 +10,11 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
+from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
-from helio_jax.instrument import Aperture, Instrument
+from helio_jax.instrument import Instrument
 from helio_jax.scene.body import COSINE, Body
+from helio_jax.scene.plates import check_solid, read_plate
 from helio_jax.scene.rays import read_rays
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.sample import Sample
@@ -65,6 +67,11 @@ class Scene(Instrument):
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
         problems += self.scan.view_problems(self.beam)
+        if self.plate.is_mesh and self.scan.rotations_deg and self.scan.rotate == "detectors":
+            problems.append(
+                "scan.rotate = 'detectors': the detectors of a plate of kind 'mesh' do not turn without it: turn the "
+                "sample the other way instead (scan.rotate = 'sample')"
+            )
         if self.sample.place != "as-given" and self.scan.sample_distances_um:
             problems.append("scan.sample_distances_um: sets what sample.place sets: remove one of the keys")
         if (problem := self.scan.problem(self.beam)) is not None:
@@ -152,17 +159,29 @@ class Scene(Instrument):
 
     @property
     def used_materials(self) -> dict[str, Law]:
-        """Scattering laws of the materials that sample and plate use, by name, but for the default one."""
+        """Scattering laws of the materials that sample and plate use, by name, but for the default one.
+
+        Raises:
+            InputFileError: a file of the sample that brings laws along (.mtl) is missing or wrong.
+        """
         names = {*self.sample.material_names, self.plate.material}
-        return {name: law for name, law in self.material.items() if name in names}
+        own = {name: law for name, law in self.material.items() if name in names}
+        from_files = self.sample.file_laws(self.base_dir)
+        return own | {n: self.material.get(f.name) or f.law for n, f in from_files.items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
         """Return the scattering laws of the materials that sample and plate use, and read their files.
 
         Raises:
-            InputFileError: the table of a law is missing or wrong.
+            InputFileError: the table of a law, or a file of the sample that brings laws along, is missing or wrong.
         """
-        return {name: law.terms(self.base_dir) for name, law in self.used_materials.items()}
+        from_files = self.sample.file_laws(self.base_dir)
+        return {
+            name: from_files[name].terms()
+            if name in from_files and from_files[name].name not in self.material
+            else law.terms(self.base_dir)
+            for name, law in self.used_materials.items()
+        }
 
     def read_rays(self) -> np.ndarray | None:
         """Return position [um], unit direction and weight of the beam's rays [n, 7], where it is made of such.
@@ -172,21 +191,28 @@ class Scene(Instrument):
         """
         return None if self.beam.file is None else read_rays(self.base_dir / self.beam.file)
 
+    def read_plate(self) -> Body | None:
+        """Return the plate's mesh, where it is one: see `scene.plates`.
+
+        Raises:
+            InputFileError: the file is missing or wrong, or lacks a part that a detector names.
+        """
+        return read_plate(self.plate, self.detector, self.base_dir) if self.plate.is_mesh else None
+
     def warnings(self) -> list[str]:
         """Return what is allowed but probably not meant, for `helio validate`."""
         out = []
-        pinhole = self.pinhole_center[:2]
-        apertures = self.apertures()
-        for detector, aperture in zip(self.detector, apertures, strict=True):
-            if aperture_contains(aperture, pinhole[None])[0]:
+        pinhole, openings, w = self.pinhole_center[:2], self.openings(), self.working_distance
+        for detector, opening in zip(self.detector, openings, strict=True):
+            if isinstance(opening, Aperture) and aperture_contains(opening, pinhole[None])[0]:
                 out.append(
                     f"detector {detector.name!r}: its aperture contains the pinhole at {pinhole.round(1).tolist()} um"
                 )
-        for i, first in enumerate(apertures):
-            for j, second in enumerate(apertures[:i]):
-                points = np.concatenate([second.rim(256)[0], np.array([second.center])])
-                back = np.concatenate([first.rim(256)[0], np.array([first.center])])
-                if aperture_contains(first, points).any() or aperture_contains(second, back).any():
+        for i, first in enumerate(openings):
+            for j, second in enumerate(openings[:i]):
+                if first is None or second is None or self.plate.is_mesh:
+                    continue
+                if _catches(first, _sights(second, w), w).any() or _catches(second, _sights(first, w), w).any():
                     names = self.detector_names
                     out.append(f"detectors {names[j]!r} and {names[i]!r} overlap: atoms there count for {names[j]!r}")
         reach = max(float(np.abs(a).max()) for a in self._positions_on_flat())
@@ -202,16 +228,23 @@ class Scene(Instrument):
                 f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
                 f"set sample.resolution_um to at most {coarsest:g} um"
             )
-        return out + self._plate_warnings(apertures)
+        if (plate := self.read_plate()) is not None and not check_solid(plate)["is_watertight"]:
+            out.append(
+                f"{self.plate.file}: the plate is not closed: atoms that enter its solid are lost; a part that no "
+                "detector names belongs to it (a channel's end, say): leave it out of the file or give it a detector"
+            )
+        return out + self._plate_warnings(openings) + self.sample.warnings(self.base_dir)
 
-    def _plate_warnings(self, apertures: tuple[Aperture, ...]) -> list[str]:
+    def _plate_warnings(self, openings: tuple[Aperture | Cone | None, ...]) -> list[str]:
         """Return what is probably not meant about a scattering plate's outline."""
-        if not self.plate.is_scattering:
+        if self.plate.kind != "scattering":
             return []
         out = []
         middle, half = (np.array(pair) for pair in self.plate.outline)
         rims = {
-            f"detector {d.name!r}: its aperture": a.rim(64)[0] for d, a in zip(self.detector, apertures, strict=True)
+            f"detector {d.name!r}: its aperture": a.rim(64)[0]
+            for d, a in zip(self.detector, openings, strict=True)
+            if isinstance(a, Aperture)
         }
         for what, points in {**rims, "the pinhole": self.pinhole_center[None, :2]}.items():
             share = np.abs(points - middle) / half
@@ -243,6 +276,30 @@ def aperture_contains(aperture: Aperture, points: np.ndarray) -> np.ndarray:
     d = points - np.asarray(aperture.center)
     u, v = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
     return (u / aperture.semi_axes[0]) ** 2 + (v / aperture.semi_axes[1]) ** 2 <= 1.0
+
+
+def _catches(opening: Aperture | Cone, sights: np.ndarray, distance: float) -> np.ndarray:
+    """Return which directions [n, 3] from the nominal spot, `distance` um below the plate, a detector catches [n]."""
+    if isinstance(opening, Cone):
+        return sights @ np.asarray(opening.axis) >= math.cos(opening.half_angle)
+    up = sights[:, 2] > 0.0
+    out = np.zeros(len(sights), bool)
+    out[up] = aperture_contains(opening, distance * sights[up, :2] / sights[up, 2:])
+    return out
+
+
+def _sights(opening: Aperture | Cone, distance: float) -> np.ndarray:
+    """Return unit directions from the nominal spot to a detector's rim and middle [n, 3]."""
+    if isinstance(opening, Aperture):
+        plane = np.concatenate([opening.rim(256)[0], np.array([opening.center])])
+        sights = np.column_stack([plane, np.full(len(plane), distance)])
+        return sights / np.linalg.norm(sights, axis=1, keepdims=True)
+    axis = np.asarray(opening.axis)
+    first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    turn = 2.0 * np.pi * np.arange(256)[:, None] / 256
+    side = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
+    return np.concatenate([math.cos(opening.half_angle) * axis + math.sin(opening.half_angle) * side, axis[None]])
 
 
 def _too_high(top: float, distance: float) -> str:

@@ -26,7 +26,7 @@ _CHUNK = 128
 
 
 @kernel
-def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, center, semi_axes, cos_sin):
+def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, shapes):
     """Return what becomes of atom `i` after a flight (`tally.FATES`, or -1: it scatters), and its detector or -1.
 
     `x`, `y` is the plate's origin in the sample frame for this pixel; atoms straight from the source hit no detector.
@@ -36,7 +36,7 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
             return LOST, -1
         return (STOPPED if is_last else -1), -1
     if event > 0:
-        k, _ = aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin)
+        k, _ = aperture_ahead(origins, directions, i, x, y, plate_z, shapes)
         if k >= 0:
             return DETECTED, k
     return ESCAPED, -1
@@ -92,7 +92,7 @@ def leave(
 @kernel
 def _fly_on(
     event, is_last, face, u, v, origin, direction, pixel, path, skip, o32, d32, facets, spheres, restart, middle,
-    inverse_size, offset, plate_z, center, semi_axes, cos_sin, ids, seed, fates, hits, points, normals, surfaces,
+    inverse_size, offset, plate_z, shapes, ids, seed, fates, hits, points, normals, surfaces,
     targets,
 ):  # fmt: skip
     """Land all atoms in flight, tally those that end, send the others on in place; return how many go on.
@@ -114,7 +114,7 @@ def _fly_on(
             j, p = i - start, pixel[i]
             fate, k = land(
                 event, is_last, origin, direction, i, surface[j], is_back[j], offset[p, 0], offset[p, 1], plate_z,
-                center, semi_axes, cos_sin,
+                shapes,
             )  # fmt: skip
             if fate >= 0:
                 fates[fate, p] += 1
@@ -180,8 +180,7 @@ def fly_to_the_end(
         n = _fly_on(
             now, now >= max_events, face, u, v, origin, direction, pixel, path, skip, o32, d32, intersector.facets,
             intersector.spheres, intersector.restart, intersector.center, 1.0 / intersector.half_size, offset, plate_z,
-            apertures.center, apertures.semi_axes, apertures.cos_sin, ids, seed, tally.fates, tally.hits, points,
-            normals, surfaces, targets,
+            apertures.shapes, ids, seed, tally.fates, tally.hits, points, normals, surfaces, targets,
         )  # fmt: skip
         if n == 0:
             break

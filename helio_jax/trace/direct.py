@@ -1,15 +1,19 @@
-"""How much of a diffuse emitter's flux a detector aperture catches: the tracer's own form factor (numba).
+"""How much of a diffuse emitter's flux a detector catches: the tracer's own form factor (numba).
 
 For a point with normal n and an aperture that is neither hidden nor cut by the point's horizon, the detection
 probability is P = n . Phi with the vector form factor Phi = (1/2 pi) contour integral (r x dl)/|r|^2 (DESIGN.md
 section 2; Lambert's formula, Baum et al., SIGGRAPH 1989). Hidden parts are subtracted by the caller,
-sample point by sample point. The JAX form factor of `reconstruct` is written separately so that each checks the other.
+sample point by sample point. A detector at infinity, a cone of directions, has its own Phi; besides it is aimed at and
+hit like an aperture, a solid angle standing for area cosine / distance^2. The JAX form factor of `reconstruct` is
+written separately so that each checks the other.
 """
 
 import numpy as np
 
+from helio_jax.detector import Cone
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
+from helio_jax.trace.lobes import turn_to
 
 RIM_POINTS = (12, 16, 24, 32, 64, 256)
 """Rim points of the trapezoid rule, the first ones for far points."""
@@ -17,34 +21,62 @@ RIM_RATIOS = (4.0, 2.0, 1.2, 0.7, 0.3)
 """Distance to the plate in largest semi-axes above which each of RIM_POINTS is used (error < 1e-9)."""
 
 
+_FAR = 6
+
+
 class ApertureTable:
-    """The apertures of an instrument as flat arrays for the numba kernels (lab x, y; um).
+    """The detectors of an instrument as flat arrays for the numba kernels (lab frame; um).
 
     Attributes:
-        center, semi_axes: [k, 2].
-        cos_sin: of the rotation [k, 2].
-        rims: for each of RIM_POINTS, positions and tangents [level, k, 2, max points, 2] (zero padded).
+        shapes: of an aperture centre x, y, semi-axes and cosine, sine of its rotation; of a cone at infinity its axis
+            x, y, z, its half-angle's cosine and squared sine, 0; and 1 for a cone, 0 for an aperture [k, 7]. Under a
+            mesh plate, which has its own way to count, NaN for all but cones: nothing is inside.
+        area: of an aperture; of a cone the solid angle [k].
+        rims: for each of RIM_POINTS, positions and tangents of apertures [level, k, 2, max points, 2] (zero padded).
     """
 
     def __init__(self, instrument: Instrument) -> None:
-        apertures = instrument.apertures()
-        self.center = np.array([a.center for a in apertures])
-        self.semi_axes = np.array([a.semi_axes for a in apertures])
-        self.cos_sin = np.array([(np.cos(a.rotation), np.sin(a.rotation)) for a in apertures])
-        self.area = np.pi * self.semi_axes.prod(1)
-        self.rims = np.zeros((len(RIM_POINTS), len(apertures), 2, max(RIM_POINTS), 2))
-        for level, n in enumerate(RIM_POINTS):
-            for k, a in enumerate(apertures):
+        openings = instrument.openings()
+        self.shapes, self.area = np.zeros((len(openings), 7)), np.zeros(len(openings))
+        self.rims = np.zeros((len(RIM_POINTS), len(openings), 2, max(RIM_POINTS), 2))
+        for k, a in enumerate(openings):
+            if isinstance(a, Cone):
+                b = a.half_angle
+                self.shapes[k] = *a.axis, np.cos(b), np.sin(b) ** 2, 0.0, 1.0
+                self.area[k] = a.solid_angle
+                continue
+            if a is None or instrument.plate.is_mesh:
+                self.shapes[k, :_FAR] = np.nan
+                continue
+            self.shapes[k] = *a.center, *a.semi_axes, np.cos(a.rotation), np.sin(a.rotation), 0.0
+            self.area[k] = np.pi * np.prod(a.semi_axes)
+            for level, n in enumerate(RIM_POINTS):
                 self.rims[level, k, :, :n] = a.rim(n)
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+    def largest_weight(self, gap: float) -> float:
+        """Return a bound of the chance that an atom flies to a detector, all of it taken to be at `gap` [um] or more.
+
+        The detector as small as a point: area / (pi gap^2) for an aperture, solid angle / pi for a cone.
+        """
+        square = np.where(self.shapes[:, _FAR] != 0.0, 1.0, max(gap, 0.0) ** 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.max(np.nan_to_num(self.area / (np.pi * square), nan=np.inf)))
 
 
 @kernel
-def form_factor(x, y, depth, k, semi_axes, rims):
-    """Return Phi (3 components) of aperture `k` seen from (x, y), `depth` below the plate (lab frame, um).
+def form_factor(x, y, depth, k, shapes, rims):
+    """Return Phi (3 components) of detector `k` seen from (x, y), `depth` below the plate (lab frame, um).
 
-    Valid for depth > 0; relative error < 1e-9 from 0.3 semi-axes up. Source: DESIGN.md section 2.
+    Apertures: valid for depth > 0; relative error < 1e-9 from 0.3 semi-axes up. Source: DESIGN.md section 2. Cones at
+    infinity: sin^2(b) a, with half-angle b and axis a: the integral of omega / pi over the cone.
     """
-    ratio = depth / max(semi_axes[k, 0], semi_axes[k, 1])
+    if shapes[k, _FAR] != 0.0:
+        sin2 = shapes[k, 4]
+        return sin2 * shapes[k, 0], sin2 * shapes[k, 1], sin2 * shapes[k, 2]
+    ratio = depth / max(shapes[k, 2], shapes[k, 3])
     level = len(RIM_POINTS) - 1
     for i in range(len(RIM_RATIOS)):
         if ratio > RIM_RATIOS[i]:
@@ -63,52 +95,85 @@ def form_factor(x, y, depth, k, semi_axes, rims):
 
 
 @kernel
-def is_inside(x, y, k, center, semi_axes, cos_sin):
-    """Whether the plate point (x, y) lies in aperture `k`."""
-    dx, dy = x - center[k, 0], y - center[k, 1]
-    c, s = cos_sin[k, 0], cos_sin[k, 1]
-    p, q = (dx * c + dy * s) / semi_axes[k, 0], (dy * c - dx * s) / semi_axes[k, 1]
+def is_inside(x, y, dx, dy, dz, k, shapes):
+    """Whether detector `k` catches an atom that flies through the plate's point (x, y) in the direction d."""
+    if shapes[k, _FAR] != 0.0:
+        return dx * shapes[k, 0] + dy * shapes[k, 1] + dz * shapes[k, 2] >= shapes[k, 3]
+    ax, ay = x - shapes[k, 0], y - shapes[k, 1]
+    c, s = shapes[k, 4], shapes[k, 5]
+    p, q = (ax * c + ay * s) / shapes[k, 2], (ay * c - ax * s) / shapes[k, 3]
     return p * p + q * q <= 1.0
 
 
 @kernel
-def find_aperture(x, y, center, semi_axes, cos_sin):
-    """Return the first aperture that contains the plate point (x, y), or -1."""
-    for k in range(center.shape[0]):
-        if is_inside(x, y, k, center, semi_axes, cos_sin):
+def find_aperture(x, y, dx, dy, dz, shapes):
+    """Return the first detector that catches an atom at the plate's point (x, y) with the direction d, or -1."""
+    for k in range(shapes.shape[0]):
+        if is_inside(x, y, dx, dy, dz, k, shapes):
             return k
     return -1
 
 
 @kernel
-def aperture_ahead(origins, directions, i, x, y, plate_z, center, semi_axes, cos_sin):
-    """Return the aperture that ray `i` flies through, or -1, and its distance [um]; `x`, `y`: the plate's origin."""
-    if directions[i, 2] <= 0.0:
+def aperture_ahead(origins, directions, i, x, y, plate_z, shapes):
+    """Return the detector that ray `i` flies to, or -1, and the way to the plate [um]; `x`, `y`: the plate's origin."""
+    dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+    if dz <= 0.0:
         return -1, 0.0
-    r = (plate_z - origins[i, 2]) / directions[i, 2]
-    x, y = origins[i, 0] + r * directions[i, 0] - x, origins[i, 1] + r * directions[i, 1] - y
-    return find_aperture(x, y, center, semi_axes, cos_sin), r
+    r = (plate_z - origins[i, 2]) / dz
+    x, y = origins[i, 0] + r * dx - x, origins[i, 1] + r * dy - y
+    return find_aperture(x, y, dx, dy, dz, shapes), r
 
 
 @kernel
-def aperture_point(u, v, k, center, semi_axes, cos_sin):
-    """Map two uniform numbers to a point uniform in area on aperture `k`; return (x, y) [um]."""
+def disc_point(u, v):
+    """Map two uniform numbers to a point (p, q) uniform in area on the unit disc."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v
-    p, q = r * np.cos(angle) * semi_axes[k, 0], r * np.sin(angle) * semi_axes[k, 1]
-    c, s = cos_sin[k, 0], cos_sin[k, 1]
-    return center[k, 0] + c * p - s * q, center[k, 1] + s * p + c * q
+    return r * np.cos(angle), r * np.sin(angle)
+
+
+@kernel
+def toward(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
+    """Aim from point `i` at detector `k`: at an aperture's point or a cone's direction, uniform as (p, q) on a disc.
+
+    Returns:
+        The way there [um], its squared length and whether no detector before `k` has it; to a cone a unit vector.
+    """
+    if shapes[k, _FAR] != 0.0:
+        u = p * p + q * q
+        axial = 1.0 - u * (shapes[k, 4] / (1.0 + shapes[k, 3]))
+        wide = np.sqrt((1.0 - axial) * (1.0 + axial) / u) if u > 0.0 else 0.0
+        dx, dy, dz = turn_to(shapes[k, 0], shapes[k, 1], shapes[k, 2], wide * p, wide * q, axial)
+        if dz <= 0.0:
+            return dx, dy, dz, 1.0, False
+        r = (plate_z - point[i, 2]) / dz
+        x, y = point[i, 0] + r * dx - offset_x, point[i, 1] + r * dy - offset_y
+        return dx, dy, dz, 1.0, find_aperture(x, y, dx, dy, dz, shapes) == k
+    p, q = p * shapes[k, 2], q * shapes[k, 3]
+    c, s = shapes[k, 4], shapes[k, 5]
+    x, y = shapes[k, 0] + c * p - s * q, shapes[k, 1] + s * p + c * q
+    dx, dy, dz = x + offset_x - point[i, 0], y + offset_y - point[i, 1], plate_z - point[i, 2]
+    r2 = dx * dx + dy * dy + dz * dz
+    r = np.sqrt(r2)
+    return dx, dy, dz, r2, find_aperture(x, y, dx / r, dy / r, dz / r, shapes) == k
+
+
+@kernel
+def spread(k, square, cosine, shapes):
+    """Return squared distance and cosine by which an area counts as area cosine / square; 1, 1 for a solid angle."""
+    return (1.0, 1.0) if shapes[k, _FAR] != 0.0 else (square, cosine)
 
 
 def form_factors(instrument: Instrument, points: np.ndarray) -> np.ndarray:
-    """Return Phi of every aperture for lab-frame points [n, 3] as [detector, n, 3] (see `form_factor`)."""
+    """Return Phi of every detector for lab-frame points [n, 3] as [detector, n, 3] (see `form_factor`)."""
     table = ApertureTable(instrument)
-    return _form_factors(np.ascontiguousarray(points, float), instrument.working_distance, table.semi_axes, table.rims)
+    return _form_factors(np.ascontiguousarray(points, float), instrument.working_distance, table.shapes, table.rims)
 
 
 @kernel
-def _form_factors(points, plate_z, semi_axes, rims):
-    out = np.empty((semi_axes.shape[0], points.shape[0], 3))
-    for k in range(semi_axes.shape[0]):
+def _form_factors(points, plate_z, shapes, rims):
+    out = np.empty((shapes.shape[0], points.shape[0], 3))
+    for k in range(shapes.shape[0]):
         for i in range(points.shape[0]):
-            out[k, i] = form_factor(points[i, 0], points[i, 1], plate_z - points[i, 2], k, semi_axes, rims)
+            out[k, i] = form_factor(points[i, 0], points[i, 1], plate_z - points[i, 2], k, shapes, rims)
     return out

@@ -138,7 +138,7 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
         point_last[atoms], direction_last[atoms], order[atoms] = start, direction, event
         fate[atoms], detector[atoms] = _land(
             event, event >= e.max_events, origin, direction, hits.surface, hits.is_back, offset[pixel[atoms]],
-            e.instrument.sample_distance, e.apertures.center, e.apertures.semi_axes, e.apertures.cos_sin,
+            e.instrument.sample_distance, e.apertures.shapes,
         )  # fmt: skip
         goes_on = fate[atoms] < 0
         if not goes_on.any():
@@ -158,14 +158,13 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
 
 
 @kernel
-def _land(event, is_last, origin, direction, surface, is_back, offset, plate_z, center, semi_axes, cos_sin):
+def _land(event, is_last, origin, direction, surface, is_back, offset, plate_z, shapes):
     """Return fate (-1: it scatters) and detector of every atom after a flight [n]."""
     n = origin.shape[0]
     fate, detector = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
         fate[i], detector[i] = land(
-            event, is_last, origin, direction, i, surface[i], is_back[i], offset[i, 0], offset[i, 1], plate_z, center,
-            semi_axes, cos_sin,
+            event, is_last, origin, direction, i, surface[i], is_back[i], offset[i, 0], offset[i, 1], plate_z, shapes,
         )  # fmt: skip
     return fate, detector
 

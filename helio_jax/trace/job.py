@@ -33,7 +33,7 @@ SURFACE_STEP = 1e-7
 """Surfaces are the same when their coordinates agree to this share of their size: CPUs differ in a sine's last bit."""
 LAW_STEP = 1e-9
 """Likewise for the numbers of scattering laws, which are of order 1."""
-_PROGRAM = ("trace/*.py", "scene/*.py", "instrument.py")
+_PROGRAM = ("trace/*.py", "scene/*.py", "instrument.py", "detector.py")
 _LIBRARIES = ("numpy", "numba", "embreex")
 
 
@@ -64,6 +64,8 @@ class Job:
     def of(cls, scene: Scene, settings: TraceSettings, body: Body) -> "Job":
         """Describe the tracing of a scene whose surface is `body`."""
         file = getattr(scene.sample, "file", None)
+        if scene.plate.is_mesh:  # maps of cause are of apertures in a flat plate
+            settings = settings.model_copy(update={"maps": False})
         about = {
             "scene": scene.model_dump(mode="json", include=set(Scene.model_fields) - {"description"}),
             "trace": settings.model_dump(mode="json", exclude={"workers"}),
@@ -71,6 +73,7 @@ class Job:
             "the beam's rays": _hash(scene.read_rays(), LAW_STEP),
             "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
             **_list_of_positions(scene),
+            **({} if (plate := scene.read_plate()) is None else {"the plate's surface": _hash_body(plate)}),
             "program": {
                 "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
                 **{name: _version(name) for name in _LIBRARIES},

@@ -9,7 +9,7 @@ import numpy as np
 
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
-from helio_jax.trace.direct import ApertureTable, find_aperture
+from helio_jax.trace.direct import ApertureTable, spread, toward
 from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.transport import lift_off
 
@@ -22,20 +22,17 @@ def aperture_samples(n_points: int) -> np.ndarray:
 
 
 @kernel
-def _sample_rays(k, sample, point, normal, offset, plate_z, center, semi_axes, cos_sin, area):
-    """Return directions to one aperture sample, vector weights cos(theta_d) r / (pi r^3) dA, and the horizon."""
+def _sample_rays(k, sample, point, normal, offset, plate_z, shapes, area):
+    """Return directions to one detector sample, vector weights cos(theta_d) r / (pi r^3) dA, and the horizon."""
     n = point.shape[0]
     direction, weight, is_up = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-    p, q = sample[0] * semi_axes[k, 0], sample[1] * semi_axes[k, 1]
-    x = center[k, 0] + cos_sin[k, 0] * p - cos_sin[k, 1] * q
-    y = center[k, 1] + cos_sin[k, 1] * p + cos_sin[k, 0] * q
-    is_own = find_aperture(x, y, center, semi_axes, cos_sin) == k
     for i in range(n):
-        dx, dy, dz = x + offset[i, 0] - point[i, 0], y + offset[i, 1] - point[i, 1], plate_z - point[i, 2]
-        r2 = dx * dx + dy * dy + dz * dz
+        x, y = offset[i, 0], offset[i, 1]
+        dx, dy, dz, r2, is_own = toward(k, sample[0], sample[1], point, i, x, y, plate_z, shapes)
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
-        w = area * (dz / r) / r2 / np.pi
+        square, flat = spread(k, r2, dz / r, shapes)
+        w = area * flat / square / np.pi
         for a in range(3):
             weight[i, a] = w * direction[i, a]
         is_up[i] = is_own and normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz > 0.0
@@ -70,15 +67,15 @@ def hidden_form_factor(
     """
     table = ApertureTable(instrument)
     origin, skip = lift_off(point, normal, surface, intersector.restart)
-    n_detectors, n = len(table.center), len(point)
+    n_detectors, n = len(table), len(point)
     hidden, fraction = np.zeros((n_detectors, n, 3)), np.zeros((n_detectors, n))
     samples = aperture_samples(n_samples)
     for k in range(n_detectors):
         solid_angle = np.zeros(n)
         for sample in samples:
             direction, weight, is_open = _sample_rays(
-                k, sample, point, normal, offset, instrument.sample_distance, table.center, table.semi_axes,
-                table.cos_sin, table.area[k] / n_samples,
+                k, sample, point, normal, offset, instrument.sample_distance, table.shapes,
+                table.area[k] / n_samples,
             )  # fmt: skip
             todo = np.flatnonzero(is_open)
             is_open[todo] = ~intersector.is_occluded(origin[todo], direction[todo], skip[todo])

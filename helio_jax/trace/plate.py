@@ -58,8 +58,7 @@ class PlateTable(NamedTuple):
             offset: the plate's origin in the sample frame for every pixel [pixels, 2], um.
             apertures: its holes.
         """
-        holes = apertures.center, apertures.semi_axes, apertures.cos_sin
-        _catch(self, origin, direction, pixel, offset, *holes, hits.point, hits.normal, hits.surface)
+        _catch(self, origin, direction, pixel, offset, apertures.shapes, hits.point, hits.normal, hits.surface)
 
 
 @kernel
@@ -72,12 +71,12 @@ def is_solid(plate, x, y):
 
 
 @kernel
-def _catch(plate, origin, direction, pixel, offset, center, semi_axes, cos_sin, point, normal, surface):
+def _catch(plate, origin, direction, pixel, offset, shapes, point, normal, surface):
     for i in range(origin.shape[0]):
         if surface[i] != MISS or direction[i, 2] <= 0.0:
             continue
         x, y = offset[pixel[i], 0], offset[pixel[i], 1]
-        k, r = aperture_ahead(origin, direction, i, x, y, plate.z, center, semi_axes, cos_sin)
+        k, r = aperture_ahead(origin, direction, i, x, y, plate.z, shapes)
         px, py = origin[i, 0] + r * direction[i, 0], origin[i, 1] + r * direction[i, 1]
         if k < 0 and is_solid(plate, px - x, py - y):
             surface[i] = PLATE

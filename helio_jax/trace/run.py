@@ -20,6 +20,7 @@ from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_law_table
 from helio_jax.trace.masks import axis_rays
+from helio_jax.trace.meshplate import MeshPlate
 from helio_jax.trace.plate import FACING_DOWN, PlateTable
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import Sampling, Source
@@ -56,6 +57,7 @@ def make_experiment(
     settings: TraceSettings,
     laws: Mapping[str, tuple[Term, ...]] | None = None,
     rays: np.ndarray | None = None,
+    plate: Body | None = None,
 ) -> Experiment:
     """Prepare the shared state of a run.
 
@@ -65,12 +67,14 @@ def make_experiment(
         settings: rays, estimator, seed.
         laws: scattering law of each of the body's materials and the plate's; "cosine" need not be given.
         rays: position [um], direction and weight of the beam's rays, where it is made of such [n, 7].
+        plate: mesh of a plate of kind "mesh", in its frame.
 
     Raises:
-        SceneError: a material has no law, the beam's rays are missing, or a lattice stands upright on a face.
+        SceneError: a material has no law, the beam's rays or the plate's mesh are missing, or a lattice stands upright
+            on a face; or expected counts are asked for under a mesh plate.
     """
     intersector = body if isinstance(body, Intersector) else Intersector(body)
-    plate = PlateTable.of(instrument, len(intersector.materials)) if instrument.plate.is_scattering else None
+    solid = _plate_of(instrument, settings, plate, len(intersector.materials))
     experiment = Experiment(
         intersector=intersector,
         instrument=instrument,
@@ -80,8 +84,8 @@ def make_experiment(
         n_orders=settings.n_orders,
         max_events=settings.max_events,
         is_expected=settings.estimator == "expected",
-        laws=_law_table(intersector, instrument.plate, {COSINE: COSINE_LAW} | dict(laws or {})),
-        plate=plate,
+        laws=_law_table(intersector, instrument.plate, solid, {COSINE: COSINE_LAW} | dict(laws or {})),
+        plate=solid,
     )
     if (effusive := instrument.beam.effusive) is None:
         return experiment
@@ -99,7 +103,27 @@ def _sampling(settings: TraceSettings, seed: int) -> Sampling:
     return Sampling.make(*paths_of(settings), N_REPLICATES if settings.estimator == "expected" else 0, seed)
 
 
-def _law_table(intersector: Intersector, plate: Plate, laws: Mapping[str, tuple[Term, ...]]) -> LawTable | None:
+def _plate_of(
+    instrument: Instrument, settings: TraceSettings, body: Body | None, material: int
+) -> PlateTable | MeshPlate | None:
+    """Return what scatters above the sample; `material` is its number among the laws."""
+    if not instrument.plate.is_scattering:
+        return None
+    if not instrument.plate.is_mesh:
+        return PlateTable.of(instrument, material)
+    if settings.estimator != "analog":
+        raise SceneError(
+            f"estimator = {settings.estimator!r}: under a plate of kind 'mesh' only whole atoms are counted: set "
+            "trace.estimator = 'analog'"
+        )
+    if body is None:
+        raise SceneError(f"plate.file: the mesh {instrument.plate.file} is not known here: trace from the scene file")
+    return MeshPlate(body, instrument, material)
+
+
+def _law_table(
+    intersector: Intersector, plate: Plate, solid: PlateTable | MeshPlate | None, laws: Mapping[str, tuple[Term, ...]]
+) -> LawTable | None:
     """Return the laws of the body's materials, and at last a scattering plate's; None if all are the cosine law."""
     names = (*intersector.materials, *((plate.material or COSINE,) if plate.is_scattering else ()))
     if missing := [name for name in names if name not in laws]:
@@ -107,9 +131,10 @@ def _law_table(intersector: Intersector, plate: Plate, laws: Mapping[str, tuple[
     found = [laws[name] for name in names]
     if all(map(is_cosine, found)):
         return None
-    normals = np.vstack([intersector.normals, FACING_DOWN])
+    above = solid.normals if isinstance(solid, MeshPlate) else FACING_DOWN[None]
     faces = intersector.material_of(np.arange(len(intersector.normals)))
-    check_lattices(found, names, normals, np.append(faces, len(intersector.materials)))
+    faces = np.append(faces, np.full(len(above), len(intersector.materials)))
+    check_lattices(found, names, np.vstack([intersector.normals, above]), faces)
     return make_law_table(found)
 
 

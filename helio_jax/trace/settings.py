@@ -35,7 +35,7 @@ class TraceSettings(Settings):
     workers: int | None = Field(default=None, ge=1, le=4096)
     """Threads (or processes); default: one per CPU."""
     maps: bool = True
-    """Also make the masking and shadowing maps."""
+    """Also make the masking and shadowing maps (never under a plate of kind "mesh")."""
 
     @property
     def has_target(self) -> bool:

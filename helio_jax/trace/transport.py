@@ -18,11 +18,12 @@ import numpy as np
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
 from helio_jax.trace.analog import fly_to_the_end, land, leave
-from helio_jax.trace.direct import ApertureTable, aperture_ahead, aperture_point, find_aperture, form_factor, is_inside
+from helio_jax.trace.direct import ApertureTable, aperture_ahead, disc_point, form_factor, is_inside, spread, toward
 from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.laws import cosine_shares, lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
+from helio_jax.trace.meshplate import MeshPlate, count_caught
 from helio_jax.trace.plate import PLATE, PlateTable
 from helio_jax.trace.source import Sampling, Source, beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import STOPPED, Tally
@@ -44,7 +45,7 @@ class Experiment:
     max_events: int
     is_expected: bool
     laws: LawTable | None = None
-    plate: PlateTable | None = None
+    plate: PlateTable | MeshPlate | None = None
     effusive: "Experiment | None" = None
 
     def is_plain(self, event: int) -> bool:
@@ -55,9 +56,9 @@ class Experiment:
         """
         if self.laws is not None or self.plate is not None or not self.intersector.has_embree:
             return False
-        gap = self.instrument.sample_distance - self.intersector.high[2]
+        gap = self.instrument.sample_distance - float(self.intersector.high[2])
         n_hits = self.sampling.n_branches if event == 0 else 1
-        return not self.is_expected or (gap > 0.0 and n_hits * self.apertures.area.max() <= np.pi * gap**2)
+        return not self.is_expected or n_hits * self.apertures.largest_weight(gap) <= 1.0
 
     def material_of(self, surface: np.ndarray) -> np.ndarray:
         """Return the number of each hit surface's law (`Hits.surface`, no misses) [n]."""
@@ -96,7 +97,7 @@ class _Paths:
 @kernel
 def _settle(
     event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
-    center, semi_axes, cos_sin, fates, hits, plate_hits,
+    shapes, fates, hits, plate_hits,
 ):  # fmt: skip
     """Tally the rays that end after this flight; return the indices of those that scatter.
 
@@ -110,7 +111,7 @@ def _settle(
         p = pixel[i]
         fate, k = land(
             event, event >= max_events, origin, direction, i, surface[i], is_back[i], offset[p, 0], offset[p, 1],
-            plate_z, center, semi_axes, cos_sin,
+            plate_z, shapes,
         )  # fmt: skip
         if fate < 0:
             keep[m] = i
@@ -140,7 +141,7 @@ def lift_off(point, normal, surface, restart):
 
 @kernel
 def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
-    """Return the chance that an atom goes to an aperture as small as a point and `area` large, if aiming may tell it.
+    """Return the chance that an atom goes to a detector as small as a point and `area` large, if aiming may tell it.
 
     It is 0 where `n_hits` atoms that fly on tell it with less variance. Signed as the cosine at the surface.
     """
@@ -149,21 +150,20 @@ def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
 
 
 @kernel
-def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, center, semi_axes, cos_sin, area):
-    """Aim at a random point of aperture `k`: direction, weight of that point, and whether it can count at all."""
+def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area):
+    """Aim at a random point of detector `k`: direction, weight of that point, and whether it can count at all."""
     n = point.shape[0]
     direction, weight, is_open = np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
     for i in range(n):
-        x, y = aperture_point(target[i, 0], target[i, 1], k, center, semi_axes, cos_sin)
-        dx = x + offset[pixel[i], 0] - point[i, 0]
-        dy = y + offset[pixel[i], 1] - point[i, 1]
-        dz = plate_z - point[i, 2]
-        r2 = dx * dx + dy * dy + dz * dz
+        u, v = disc_point(target[i, 0], target[i, 1])
+        x, y = offset[pixel[i], 0], offset[pixel[i], 1]
+        dx, dy, dz, r2, is_own = toward(k, u, v, point, i, x, y, plate_z, shapes)
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
         cosine = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
-        weight[i] = _aimed_weight(n_hits, r2, cosine, dz / r, area[k])
-        is_open[i] = cosine > 0.0 and find_aperture(x, y, center, semi_axes, cos_sin) == k
+        square, flat = spread(k, r2, dz / r, shapes)
+        weight[i] = _aimed_weight(n_hits, square, cosine, flat, area[k])
+        is_open[i] = cosine > 0.0 and is_own
     return direction, weight, is_open
 
 
@@ -178,7 +178,7 @@ def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
 
 @kernel
 def _score(
-    k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, semi_axes,
+    k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, shapes,
     rims, sums, plate_sums,
 ):  # fmt: skip
     """Add P = n . Phi - (hidden part), times the share of cosine atoms, of every vertex to its pixel and replicate."""
@@ -187,7 +187,7 @@ def _score(
             continue
         p = pixel[i]
         fx, fy, fz = form_factor(
-            point[i, 0] - offset[p, 0], point[i, 1] - offset[p, 1], plate_z - point[i, 2], k, semi_axes, rims
+            point[i, 0] - offset[p, 0], point[i, 1] - offset[p, 1], plate_z - point[i, 2], k, shapes, rims
         )
         value = normal[i, 0] * fx + normal[i, 1] * fy + normal[i, 2] * fz
         if not is_open[i]:
@@ -205,38 +205,40 @@ def _balance(density, n_hits, square, cosine, area):
 @kernel
 def _score_lobes(
     k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
-    plate_z, area, sums, plate_sums,
+    plate_z, shapes, area, sums, plate_sums,
 ):  # fmt: skip
-    """Add what the lobes of every vertex send to the aperture point it aims at."""
+    """Add what the lobes of every vertex send to where it aims at."""
     for i in range(point.shape[0]):
         if is_open[i]:
             density = lobe_density(table, material[i], incoming[i], normal[i], direction[i])
             r = (plate_z - point[i, 2]) / direction[i, 2]
-            value = _balance(density, n_hits, r * r, direction[i, 2], area[k]) if density > 0.0 else 0.0
+            square, flat = spread(k, r * r, direction[i, 2], shapes)
+            value = _balance(density, n_hits, square, flat, area[k]) if density > 0.0 else 0.0
             _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
 
 @kernel
 def _score_hits(
-    share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, center,
-    semi_axes, cos_sin, area, sums, plate_sums,
+    share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, shapes,
+    area, sums, plate_sums,
 ):  # fmt: skip
-    """Add the lobes' atoms that hit an aperture."""
+    """Add the lobes' atoms that hit a detector."""
     for i in range(origin.shape[0]):
         if density[i] > 0.0 and surface[i] == MISS:
             p = pixel[i]
-            k, r = aperture_ahead(origin, direction, i, offset[p, 0], offset[p, 1], plate_z, center, semi_axes, cos_sin)
+            k, r = aperture_ahead(origin, direction, i, offset[p, 0], offset[p, 1], plate_z, shapes)
             if k >= 0:
-                value = _balance(density[i], n_hits, r * r, direction[i, 2], area[k])
+                square, flat = spread(k, r * r, direction[i, 2], shapes)
+                value = _balance(density[i], n_hits, square, flat, area[k])
                 _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
 
 
 @kernel
 def _subtract_hidden(
     share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
-    center, semi_axes, cos_sin, area, sums, plate_sums,
+    shapes, area, sums, plate_sums,
 ):  # fmt: skip
-    """Subtract the wide apertures that cosine atoms do not reach though they fly towards them: what `_score` left.
+    """Subtract the wide detectors that cosine atoms do not reach though they fly towards them: what `_score` left.
 
     The mirror image of an atom's direction below the surface it leaves tells of the parts below the horizon there.
     """
@@ -246,18 +248,21 @@ def _subtract_hidden(
         n, d = normal[i], direction[i]
         cosine = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
         for sign in (1.0, -1.0):
-            dz = d[2] if sign > 0.0 else d[2] - 2.0 * cosine * n[2]
+            dx, dy, dz = d[0], d[1], d[2]
+            if sign < 0.0:
+                dx, dy, dz = dx - 2.0 * cosine * n[0], dy - 2.0 * cosine * n[1], dz - 2.0 * cosine * n[2]
             is_hidden = sign < 0.0 or surface[i] != MISS
             if dz <= 0.0 or cosine <= 0.0:
                 continue
             r = (plate_z - origin[i, 2]) / dz
-            x = origin[i, 0] - offset[pixel[i], 0] + r * (d[0] if sign > 0.0 else d[0] - 2.0 * cosine * n[0])
-            y = origin[i, 1] - offset[pixel[i], 1] + r * (d[1] if sign > 0.0 else d[1] - 2.0 * cosine * n[1])
-            for k in range(center.shape[0]):
-                if is_inside(x, y, k, center, semi_axes, cos_sin):
-                    if is_hidden and _aimed_weight(n_hits, r * r, cosine, dz, area[k]) == 0.0:
+            x = origin[i, 0] - offset[pixel[i], 0] + r * dx
+            y = origin[i, 1] - offset[pixel[i], 1] + r * dy
+            for k in range(shapes.shape[0]):
+                if is_inside(x, y, dx, dy, dz, k, shapes):
+                    square, flat = spread(k, r * r, dz, shapes)
+                    if is_hidden and _aimed_weight(n_hits, square, cosine, flat, area[k]) == 0.0:
                         _add(-sign * share, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
-                    is_hidden = True  # where apertures overlap, the first one has it
+                    is_hidden = True  # where detectors overlap, the first one has it
 
 
 @kernel
@@ -295,27 +300,26 @@ def _add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hi
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
     point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
     whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
-    shape = (table.center, table.semi_axes, table.cos_sin)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
     if e.laws is not None:
         material = e.material_of(hits.surface)
         key = (ids[paths.pixel], paths.path, event, e.sampling.seed)
         cosine = cosine_shares(e.laws, material, paths.direction, normal, *key)
-    for k in range(len(table.center)):
+    for k in range(len(table)):
         direction, weight, is_open = _aim(
-            k, n_hits, point, normal, paths.pixel, offset, plate_z, paths.target, *shape, table.area
+            k, n_hits, point, normal, paths.pixel, offset, plate_z, paths.target, table.shapes, table.area
         )
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
-            k, 1.0 / n_branches, cosine, point, normal, *whose, offset, plate_z, weight, is_open, table.semi_axes,
+            k, 1.0 / n_branches, cosine, point, normal, *whose, offset, plate_z, weight, is_open, table.shapes,
             table.rims, tally.sums, tally.plate_sums,
         )  # fmt: skip
         if e.laws is not None:
             _score_lobes(
                 k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *whose, direction,
-                is_open, plate_z, table.area, tally.sums, tally.plate_sums,
+                is_open, plate_z, table.shapes, table.area, tally.sums, tally.plate_sums,
             )  # fmt: skip
 
 
@@ -325,7 +329,7 @@ def _add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, path
     weight = 1.0 / n_branches, n_branches if event == 1 else 1
     whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
     flight = paths.origin, paths.direction, *whose, surface
-    plate = offset, e.instrument.sample_distance, table.center, table.semi_axes, table.cos_sin, table.area
+    plate = offset, e.instrument.sample_distance, table.shapes, table.area
     _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
     if e.laws is not None:
         _score_hits(*weight, paths.density, *flight, *plate, tally.sums, tally.plate_sums)
@@ -399,7 +403,7 @@ def trace_block(
     """
     e, s, table = experiment, experiment.sampling, experiment.apertures
     tally = Tally.zeros(
-        e.n_orders, len(table.center), len(pixel_ids), s.n_replicates if e.is_expected else 0, s.n_rays, s.n_branches
+        e.n_orders, len(table), len(pixel_ids), s.n_replicates if e.is_expected else 0, s.n_rays, s.n_branches
     )
     ids = np.ascontiguousarray(pixel_ids, np.int64)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
@@ -410,11 +414,14 @@ def trace_block(
         else:
             hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
         if e.plate is not None and event > 0:
-            e.plate.catch(hits, paths.origin, paths.direction, paths.pixel, offset, table)
+            caught = e.plate.catch(hits, paths.origin, paths.direction, paths.pixel, offset, table)
+            if caught is not None and (ends := caught >= 0).any():
+                count_caught(tally, caught[ends], paths.pixel[ends], paths.order[ends], paths.met_plate[ends])
+                hits, paths = hits.take(~ends), paths.take(~ends)
         keep = _settle(
             event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
-            hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.center, table.semi_axes,
-            table.cos_sin, tally.fates, tally.hits, tally.plate_hits,
+            hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes, tally.fates, tally.hits,
+            tally.plate_hits,
         )  # fmt: skip
         if e.is_expected and event > 0:
             _add_hits(e, event, tally, hits.surface, paths, offset)

@@ -9,6 +9,7 @@ from scipy.stats import t as student
 from stats import assert_likely, assert_mean, pooled_chi2
 
 from benchmarks import tracer
+from helio_jax.instrument import Detector
 from helio_jax.scene.body import Body
 from helio_jax.scene.shapes import Sphere, SpheresSample, TrenchSample
 from helio_jax.trace.run import make_experiment, trace_pixels
@@ -68,6 +69,14 @@ def test_engines_agree_at_edges_and_grazing():
         assert found["reached"], found
 
 
+HEMISPHERE = Detector(name="sky", polar_deg=0.0, half_angle_deg=90.0, at_infinity=True)
+SKIES = {
+    "aperture": (tracer.above(4000.0, 4e6), 4e-4, 0.1),
+    "infinity": (tracer.above(4000.0, 4e6).model_copy(update={"detector": (HEMISPHERE,)}), 2e-3, 0.3),
+}
+"""A detector all over the sky, and limits of `expected`: standard error of the mean, deviation of the worst pixel."""
+
+
 def furnace(name: str) -> tuple[Body, np.ndarray, np.ndarray]:
     """Return a sphere or a slot, and beam positions all over it."""
     if name == "sphere":
@@ -80,9 +89,10 @@ def furnace(name: str) -> tuple[Body, np.ndarray, np.ndarray]:
     return body, x, y
 
 
+@pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize("name", ["sphere", "slot"])
-def test_white_furnace(name):
-    """With a detector all over the sky every analog atom is detected, from every pixel of a sphere and a slot.
+def test_white_furnace(name, sky):
+    """With a detector all over the sky, every analog atom is detected, from every pixel of a sphere and a slot.
 
     Exactly launched - stopped - lost - escaped: escaped are the few that leave below 0.06 degrees, lost those that
     start within the restart distance of a corner (at most 1e-4). Catches atoms lost at a bounce, at a wall or between
@@ -90,7 +100,7 @@ def test_white_furnace(name):
     """
     body, x, y = furnace(name)
     settings = TraceSettings(rays=400, estimator="analog", max_events=500, maps=False)
-    found = trace_pixels(make_experiment(body, tracer.above(4000.0, 4e6), settings), x, y)
+    found = trace_pixels(make_experiment(body, SKIES[sky][0], settings), x, y)
     fates = found.fates
     assert found.n_unaccounted == 0 and fates[STOPPED].sum() == 0
     assert np.array_equal(fates[DETECTED], found.hits.sum((0, 1)))
@@ -98,17 +108,19 @@ def test_white_furnace(name):
     assert fates[ESCAPED].sum() <= 1e-3 * fates.sum() and fates[LOST].sum() <= 1e-4 * fates.sum()
 
 
+@pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize("name", ["sphere", "slot"])
-def test_expected_white_furnace(name):
+def test_expected_white_furnace(name, sky):
     """The expected counts of a detector all over the sky are 1 in every pixel, but for the analog escapes (< 1e-3).
 
-    Student's t of 8 replicates, Sidak over the pixels; the mean of all rejects 0.2 % (3e-4 standard error). Catches a
-    hidden part counted once only (aimed or flown, not both), a wrong weight of either, and the heavy tails of aiming at
-    an aperture a thousand times wider than it is away, with which stated errors meant nothing (worst pixel 31, not 1).
+    Student's t of 8 replicates, Sidak over the pixels; the mean of all rejects 0.2 % (3e-4 standard error; 1 % at
+    infinity, where half of the hidden part is aimed at: 1.3e-3). Catches a hidden part counted once only (aimed or
+    flown, not both), a wrong weight of either, and the heavy tails of aiming at an aperture a thousand times wider than
+    it is away, with which stated errors meant nothing (worst pixel 31, not 1).
     """
-    body, x, y = furnace(name)
+    (instrument, most, worst), (body, x, y) = SKIES[sky], furnace(name)
     settings = TraceSettings(rays=256, branches=4, max_events=500, maps=False)
-    found = trace_pixels(make_experiment(body, tracer.above(4000.0, 4e6), settings), x, y)
+    found = trace_pixels(make_experiment(body, instrument, settings), x, y)
     mean, variance = (a[0] for a in found.total())
     n = found.fates.sum(0)
     escaped = found.fates[ESCAPED].sum() / n.sum()
@@ -116,4 +128,4 @@ def test_expected_white_furnace(name):
     p = 2.0 * student.sf(np.abs(z), 7)
     assert_likely(float(-np.expm1(p.size * np.log1p(-p.min()))), f"furnace over a {name}, worst pixel")
     assert_mean(mean.mean(), 1.0 - escaped, np.sqrt(variance.sum()) / variance.size, f"furnace over a {name}")
-    assert np.sqrt(variance.sum()) / variance.size < 4e-4 and np.abs(mean - 1.0).max() < 0.1
+    assert np.sqrt(variance.sum()) / variance.size < most and np.abs(mean - 1.0).max() < worst

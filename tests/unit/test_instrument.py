@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from helio_jax.instrument import Aperture, Beam, Detector, Instrument, Plate, cone_ellipse
+from helio_jax.detector import Aperture, Detector, cone_ellipse
+from helio_jax.instrument import Beam, Instrument, Plate
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:

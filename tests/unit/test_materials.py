@@ -119,6 +119,112 @@ def test_geometries_of_a_glb(tmp_path):
     assert is_b.sum() == 12
 
 
+MTL = """# from a CAD program
+newmtl gold
+Kd 0.8 0.7 0.1
+helio_law broad_specular   # as measured
+helio_sigma_deg 20
+helio_diffuse_fraction 0.25
+newmtl salt
+Ns 10
+helio_law diffraction
+helio_wavelength_nm 0.1
+helio_lattice_nm [[0.3, 0.0], [0.0, 0.4]]
+helio_debye_waller {energy_mev = 60, mass_u = 29, temperature_k = 300, debye_k = 300}
+newmtl plain
+Kd 1 1 1
+newmtl unused
+helio_law specular
+"""
+
+
+def mtl_scene(tmp_path, text: str = "", obj: str = f"mtllib parts.mtl\n{OBJ}"):
+    """A scene of the mesh OBJ, in a folder of its own, and further tables."""
+    (tmp_path / "cad").mkdir(exist_ok=True)
+    (tmp_path / "cad" / "m.obj").write_text(obj)
+    table = 'kind = "mesh"\nfile = "cad/m.obj"\nunit = "um"\nmaterial = "x"\n[material.x]\nkind = "uniform"\n'
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE.replace('kind = "flat"\nmaterial = "x"', table + text))
+    return load_scene(path)
+
+
+def test_laws_of_an_mtl_file(tmp_path):
+    """Faces have the law that the .mtl gives their material; others the sample's, and the scene's tables win.
+
+    What is traced equals to the bit the same mesh with the laws in the scene. Catches laws that
+    come along but are not used, optical keys taken for laws, materials that no face uses, and a file that wins.
+    """
+    (tmp_path / "cad").mkdir()
+    (tmp_path / "cad" / "parts.mtl").write_text(MTL)
+    scene = mtl_scene(tmp_path)
+    body, laws = scene.build_body(), scene.read_laws()
+    where = {
+        tuple(c[:2]): body.materials[m] for c, m in zip(body.triangles.mean(1).round(), body.face_material, strict=True)
+    }
+    gold, salt = "gold (cad/m.obj)", "salt (cad/m.obj)"
+    assert where == {(3.0, 3.0): gold, (7.0, 7.0): salt, (27.0, 3.0): "x", (23.0, 7.0): "x"}
+    assert set(laws) == {gold, salt, "x"} and scene.warnings() == []
+    assert [(t.share, t.numbers[:1]) for t in laws[gold]] == [(0.25, ()), (0.75, (pytest.approx(np.radians(20.0)),))]
+    assert laws[salt][0].attenuation > 1.0 and laws[salt][0].lattice[1] == pytest.approx([0.0, 4.0, 0.0])
+    names = {name: law.kind for name, law in scene.used_materials.items()}
+    assert names == {gold: "broad_specular", salt: "diffraction", "x": "uniform"}
+    winner = mtl_scene(tmp_path, '[material.gold]\nkind = "specular"\n')
+    assert len(winner.read_laws()[gold]) == 1 and winner.used_materials[gold].kind == "specular"
+    mapped = mtl_scene(tmp_path, '[sample.materials]\ngold = "cosine"\ntip = "cosine"\n')
+    assert mapped.build_body().materials == ("x", "cosine", salt) and set(mapped.read_laws()) == {salt, "x"}
+    settings = TraceSettings(rays=16, seed=4)
+    by_hand = mtl_scene(
+        tmp_path,
+        '[sample.materials]\ngold = "gold"\nsalt = "salt"\n[material.gold]\nkind = "broad_specular"\nsigma_deg = 20\n'
+        'diffuse_fraction = 0.25\n[material.salt]\nkind = "diffraction"\nwavelength_nm = 0.1\n'
+        "lattice_nm = [[0.3, 0.0], [0.0, 0.4]]\n"
+        "debye_waller = {energy_mev = 60, mass_u = 29, temperature_k = 300, debye_k = 300}\n",
+    )
+    assert np.array_equal(trace_scene(scene, settings).counts, trace_scene(by_hand, settings).counts)
+    assert not np.array_equal(trace_scene(scene, settings).counts, trace_scene(winner, settings).counts)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("newmtl gold\nhelio_law broad_specula\n", "line 2: helio_law broad_specula: must be one of 'cosine', "),
+        (
+            "newmtl gold\nhelio_law broad_specular\n",
+            "line 2: helio_law broad_specular needs helio_sigma_deg: add the line",
+        ),
+        (
+            "newmtl gold\nKd 1 1 1\nhelio_law specular\nhelio_sigma_deg 3\n",
+            "line 4: helio_sigma_deg: the law 'specular' has",
+        ),
+        (
+            "newmtl gold\nhelio_law specular\nhelio_albedo 2\n",
+            "line 3: helio_albedo 2: should be less than or equal to 1",
+        ),
+        ("newmtl gold\nhelio_law specular\nhelio_albedo much\n", "line 3: helio_albedo much: should be a valid number"),
+        ("newmtl gold\nhelio_albedo 0.5\n", "line 2: the material 'gold' has no helio_law: add one"),
+        ("newmtl gold\nHelio_law specular\n", "line 2: Helio_law: keys are written helio_law and helio_KEY"),
+        ("helio_law specular\n", "line 1: helio_law: stands before any newmtl NAME"),
+        ("newmtl cosine\nhelio_law specular\n", "line 2: helio_law: 'cosine' stands for the cosine law itself"),
+        ("newmtl gold\nhelio_law specular\nhelio_law cosine\n", "line 3: helio_law: 'gold' has it already in line 2"),
+    ],
+)
+def test_bad_mtl(tmp_path, text, expected):
+    """Each mistake is told with file, line and remedy; catches keys that are skipped as if they were optical ones."""
+    (tmp_path / "cad").mkdir()
+    (tmp_path / "cad" / "parts.mtl").write_text(text)
+    with pytest.raises(InputFileError) as error:
+        mtl_scene(tmp_path).build_body()
+    assert f"parts.mtl, {expected}" in str(error.value)
+
+
+def test_mtl_beside_the_mesh_only(tmp_path):
+    """A missing file is a warning, and names lead to no other folder. Catches an untrusted path followed."""
+    (tmp_path / "parts.mtl").write_text(MTL)
+    scene = mtl_scene(tmp_path, obj=f"mtllib ../parts.mtl\n{OBJ}")
+    assert set(scene.read_laws()) == {"x"}
+    assert ["m.obj names parts.mtl, which is not beside it" in w for w in scene.warnings()] == [True]
+
+
 def test_several_samples(tmp_path):
     """Two spheres on two flats, each with its own law, and the hits know it; catches indices mixed up when joined."""
     sphere = "kind = 'spheres', size_um = 200, spheres = [{radius_um = 20, material = 'y'}]"

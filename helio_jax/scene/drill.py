@@ -1,0 +1,170 @@
+"""Make the mesh of a pinhole plate from a few dimensions: a solid with one channel for each aperture and the pinhole.
+
+The only door to manifold3d, which makes the solid watertight whatever the channels do to one another. Plate frame:
+scene/plates.py. The result names its parts: the solid, and at the upper end of every channel a surface that counts.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from helio_jax.detector import Aperture
+from helio_jax.errors import MissingDependencyError, SceneError
+from helio_jax.instrument import Instrument
+
+SEGMENTS = 128
+"""Sides of the polygon that stands for an ellipse or a disc, of the same area."""
+SOLID_NAME = "plate_solid"
+"""Part of the OBJ file that scatters."""
+_ROOM = 1.25
+"""Radius of the plate by default, in distances of the farthest edge of a channel from its middle."""
+_OVERLAP = 1e-9
+"""Volume of the plate that two channels may share, by rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrilledPlate:
+    """The mesh of a plate (plate frame, um).
+
+    Attributes:
+        vertices, faces: of the solid, watertight [n, 3], [m, 3].
+        ends: rim of every channel's upper end, counter-clockwise seen from above, by detector [SEGMENTS, 3].
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    ends: dict[str, np.ndarray]
+
+    def obj(self, comment: str = "") -> str:
+        """Return it as an OBJ file: the solid, and for each detector a part of its name, the surface that counts."""
+        lines = [f"# {line}" for line in comment.splitlines()]
+        start = 1
+        rims = [(name, rim, _fan(len(rim))) for name, rim in self.ends.items()]
+        for name, vertices, faces in [(SOLID_NAME, self.vertices, self.faces), *rims]:
+            lines += [f"o {name}", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices)]
+            lines += [f"f {a} {b} {c}" for a, b, c in faces + start]
+            start += len(vertices)
+        return "\n".join(lines) + "\n"
+
+    def tables(self, file: str) -> str:
+        """Return the tables of a scene that uses the file."""
+        text = [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "um"']
+        text += [f"[[detector]]\nname = {json.dumps(name)}\npart = {json.dumps(name)}" for name in self.ends]
+        return "\n\n".join([*text, '[trace]\nestimator = "analog"'])
+
+
+@dataclass(frozen=True)
+class _Bore:
+    """A straight channel: its outline in the underside [n, 2], and how far it leans per um of height (x, y)."""
+
+    name: str
+    outline: np.ndarray
+    lean: tuple[float, float]
+
+    def at(self, z: float) -> np.ndarray:
+        """Return the outline at a height [n, 3], um."""
+        return np.column_stack([self.outline + z * np.asarray(self.lean), np.full(len(self.outline), z)])
+
+
+def drill_plate(
+    instrument: Instrument, thickness: float, radius: float | None = None, angle: float | None = None
+) -> DrilledPlate:
+    """Make a plate with channels for an instrument's apertures and pinhole.
+
+    A channel has its aperture for cross-section parallel to the plate, all the way, and leans away from the point
+    straight below the pinhole's nominal spot; the pinhole's runs along the beam.
+
+    Args:
+        instrument: apertures, pinhole and, of a flat scattering plate, its outline.
+        thickness: of the plate, um.
+        radius: of the disc, um; default: the outline of a scattering plate, else a disc with room for all channels.
+        angle: between channels and plate normal, rad; default: each looks at the nominal spot.
+
+    Raises:
+        SceneError: the plate has no thickness, a channel leaves it sideways or meets another one, a detector is not an
+            aperture in a flat plate or has no name for a part of a mesh.
+        MissingDependencyError: manifold3d is not installed.
+    """
+    if not 0.0 < thickness <= 1e6:
+        raise SceneError(f"the plate's thickness must be > 0 um and <= 1e6 um, got {thickness:g}")
+    if angle is not None and not 0.0 <= angle < math.radians(80.0):
+        raise SceneError(f"the channels' angle must be >= 0 deg and < 80 deg, got {math.degrees(angle):g}")
+    try:
+        import manifold3d
+    except ImportError:
+        raise MissingDependencyError("helio plate needs manifold3d: pip install 'helio-jax[plates]'") from None
+    bores = _bores(instrument, angle)
+    block = _prism(manifold3d, _outline(instrument, bores, thickness, radius), (0.0, 0.0), 0.0, thickness)
+    tools = [_prism(manifold3d, b.outline, b.lean, -0.5 * thickness, 1.5 * thickness) for b in bores]
+    _check(manifold3d, bores, tools, block, thickness)
+    solid = block - manifold3d.Manifold.batch_boolean(tools, manifold3d.OpType.Add)
+    mesh = solid.to_mesh64()
+    names = set(instrument.detector_names)
+    ends = {b.name: b.at(thickness) for b in bores if b.name in names}
+    return DrilledPlate(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), ends)
+
+
+def _bores(instrument: Instrument, angle: float | None) -> list[_Bore]:
+    """Return the channels of all detectors and of the pinhole."""
+    out = []
+    for detector, a in zip(instrument.detector, instrument.apertures(), strict=True):
+        if detector.name == SOLID_NAME or not detector.name.isprintable() or detector.name != detector.name.strip():
+            raise SceneError(f"detector {detector.name!r}: cannot name a part of a mesh: rename it")
+        x, y = a.center
+        far = math.hypot(x, y)
+        slope = far / instrument.working_distance if angle is None else math.tan(angle)
+        lean = (slope * x / far, slope * y / far) if far > 0.0 else (0.0, 0.0)
+        out.append(_Bore(detector.name, _polygon(a), lean))
+    if (r := instrument.beam.pinhole_radius_um) > 0.0:
+        (x, y, _), (tx, ty) = instrument.pinhole_center, instrument.beam_shift
+        out.append(_Bore("", _polygon(Aperture((x, y), (r, r), 0.0)), (-tx, -ty)))
+    return out
+
+
+def _polygon(aperture: Aperture, n: int = SEGMENTS) -> np.ndarray:
+    """Return a polygon of an ellipse's area [n, 2], counter-clockwise."""
+    points, center = aperture.rim(n)[0], np.asarray(aperture.center)
+    return center + (points - center) * math.sqrt(2.0 * math.pi / n / math.sin(2.0 * math.pi / n))
+
+
+def _outline(instrument: Instrument, bores: list[_Bore], thickness: float, radius: float | None) -> np.ndarray:
+    """Return the outline of the plate [n, 2]."""
+    plate = instrument.plate
+    if radius is None and plate.kind == "scattering":
+        (x, y), (a, b) = plate.outline
+        if plate.radius_um is None:
+            return np.array([[x - a, y - b], [x + a, y - b], [x + a, y + b], [x - a, y + b]])
+        return _polygon(Aperture((x, y), (a, b), 0.0))
+    if radius is None:
+        radius = _ROOM * max(float(np.hypot(*b.at(z)[:, :2].T).max()) for b in bores for z in (0.0, thickness))
+    return _polygon(Aperture((0.0, 0.0), (radius, radius), 0.0))
+
+
+def _prism(manifold3d: Any, outline: np.ndarray, lean: tuple[float, float], low: float, high: float) -> Any:
+    """Return a leaning prism between two heights, whose cross-section at z = 0 is the outline."""
+    upright = manifold3d.CrossSection([outline]).extrude(high - low).translate([0.0, 0.0, low])
+    return upright.transform(np.array([[1.0, 0.0, lean[0], 0.0], [0.0, 1.0, lean[1], 0.0], [0.0, 0.0, 1.0, 0.0]]))
+
+
+def _check(manifold3d: Any, bores: list[_Bore], tools: list[Any], block: Any, thickness: float) -> None:
+    """Refuse channels that leave the plate sideways or meet one another."""
+    for i, (bore, tool) in enumerate(zip(bores, tools, strict=True)):
+        what = f"the channel of {bore.name!r}" if bore.name else "the pinhole's channel"
+        slab = tool.trim_by_plane([0.0, 0.0, 1.0], 0.0).trim_by_plane([0.0, 0.0, -1.0], -thickness)
+        if (slab - block).volume() > _OVERLAP * block.volume():
+            raise SceneError(f"{what} leaves the plate at its rim: enlarge the radius, or make the plate thinner")
+        for other, second in zip(bores[:i], tools[:i], strict=True):
+            if (slab ^ second).volume() > _OVERLAP * block.volume():
+                with_what = f"that of {other.name!r}" if other.name else "the pinhole's"
+                raise SceneError(
+                    f"{what} meets {with_what} within the plate: make the plate thinner, or change the channels' angle"
+                )
+
+
+def _fan(n: int) -> np.ndarray:
+    """Return the triangles of a convex polygon [n - 2, 3], as it is run through."""
+    k = np.arange(1, n - 1)
+    return np.stack([np.zeros_like(k), k, k + 1], 1)

@@ -1,0 +1,156 @@
+"""Scattering laws in the .mtl file beside an OBJ mesh, so that a CAD part brings its materials along.
+
+Among the optical keys of a material (`newmtl NAME`), which are skipped, it may say
+
+    helio_law broad_specular
+    helio_sigma_deg 20
+    helio_diffuse_fraction 0.5
+
+helio_law is the `kind` of a table [material.NAME] of a scene, every other helio_KEY one of its keys with a value as in
+TOML (a single word needs no quotes). A scene's table [material.NAME] wins over the file's material of that name.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from helio_jax.errors import InputFileError
+from helio_jax.scene.body import COSINE
+from helio_jax.scene.files import read_bytes
+from helio_jax.scene.scattering import Law, Term
+
+MAX_MTL_MB = 16.0
+"""Largest .mtl file."""
+_LAW: TypeAdapter = TypeAdapter(Law)
+_PREFIX = "helio"
+
+
+@dataclass(frozen=True)
+class FileLaw:
+    """A law from a .mtl file.
+
+    Attributes:
+        name: of the material in the file.
+        law: the settings.
+        folder: at which the law's own file names start.
+    """
+
+    name: str
+    law: Any
+    folder: Path
+
+    def terms(self) -> tuple[Term, ...]:
+        """Return what the law is made of.
+
+        Raises:
+            InputFileError: the table of a law is missing or wrong.
+        """
+        return self.law.terms(self.folder)
+
+
+def mtl_files(obj: Path, data: bytes) -> tuple[list[Path], list[str]]:
+    """Return the .mtl files that an OBJ file names (mtllib) and that lie beside it, and the names of those that do not.
+
+    Folders in the names are left out: files are untrusted, and what is looked for lies beside the OBJ.
+    """
+    found, missing = [], []
+    for line in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, re.MULTILINE):
+        text = line.decode("utf-8", "replace")
+        for name in [text] if text.count(".mtl") == 1 else text.split():
+            path = obj.parent / name.replace("\\", "/").rpartition("/")[2]
+            (found if path.is_file() else missing).append(path)
+    return list(dict.fromkeys(found)), [path.name for path in dict.fromkeys(missing)]
+
+
+def used_laws(obj: Path, data: bytes) -> dict[str, FileLaw]:
+    """Return the laws of the materials that an OBJ file uses, by the names that its .mtl files give them.
+
+    Raises:
+        InputFileError: a .mtl file cannot be read, or what it says of a law is wrong.
+    """
+    used = {
+        name.decode("utf-8", "replace")
+        for name in re.findall(rb"^[ \t]*usemtl[ \t]+(.+?)[ \t\r]*$", data, re.MULTILINE)
+    }
+    laws: dict[str, FileLaw] = {}
+    for path in mtl_files(obj, data)[0]:
+        laws |= {name: law for name, law in read_mtl(path).items() if name in used}
+    return laws
+
+
+def read_mtl(path: Path) -> dict[str, FileLaw]:
+    """Read the laws of a .mtl file: those of its materials that have a helio_law.
+
+    Raises:
+        InputFileError: as `read_bytes`; an unknown law or key, a value out of range: with file and line.
+    """
+    text = read_bytes(path, MAX_MTL_MB).decode("utf-8", "replace")
+    keys: dict[str, tuple[int, str]] = {}
+    name, out = "", {}
+    for number, line in enumerate([*text.splitlines(), "newmtl"], 1):
+        word, _, value = line.strip().partition(" ")
+        value = value.split("#")[0].strip()
+        if word == "newmtl":
+            if keys:
+                out[name] = FileLaw(name, _law(path, name, keys), path.parent)
+            keys, name = {}, value
+        elif word.lower().startswith(_PREFIX):
+            _check_place(path, number, word, name, keys)
+            keys[word.removeprefix(f"{_PREFIX}_")] = number, value
+    return out
+
+
+def _check_place(path: Path, number: int, word: str, name: str, keys: dict[str, tuple[int, str]]) -> None:
+    """Refuse a key that stands where no material is, stands there twice, or is misspelt."""
+    key = word.removeprefix(f"{_PREFIX}_")
+    where = f"{path}, line {number}: {word}"
+    if not word.startswith(f"{_PREFIX}_") or key == "kind":
+        raise InputFileError(f"{where}: keys are written helio_law and helio_KEY, in small letters: correct it")
+    if name in ("", COSINE):
+        wrong = "stands before any newmtl NAME" if not name else f"{COSINE!r} stands for the cosine law itself"
+        raise InputFileError(f"{where}: {wrong}: put it below a newmtl NAME of another name")
+    if key in keys:
+        raise InputFileError(f"{where}: {name!r} has it already in line {keys[key][0]}: remove one of them")
+
+
+def _law(path: Path, name: str, keys: dict[str, tuple[int, str]]) -> Any:
+    """Return the law that the keys of a material (line number and text each) describe."""
+    first = min(number for number, _ in keys.values())
+    if "law" not in keys:
+        raise InputFileError(
+            f"{path}, line {first}: the material {name!r} has no helio_law: add one, the kind of its scattering law"
+        )
+    table = {key: _value(text) for key, (_, text) in keys.items() if key != "law"}
+    kind = keys["law"][1].strip("\"'")
+    try:
+        return _LAW.validate_python({"kind": kind, **table})
+    except ValidationError as e:
+        problem = e.errors(include_url=False)[0]
+        raise InputFileError(f"{path}, {_sentence(problem, kind, keys)}") from None
+
+
+def _sentence(problem: Any, kind: str, keys: dict[str, tuple[int, str]]) -> str:
+    """Say which line is wrong, and how."""
+    inner = [str(part) for part in problem["loc"] if part != kind]
+    key = inner[0] if inner else "law"
+    if problem["type"] == "union_tag_invalid":
+        return f"line {keys['law'][0]}: helio_law {kind}: must be one of {problem['ctx']['expected_tags']}"
+    if problem["type"] == "missing" and key not in keys:
+        return f"line {keys['law'][0]}: helio_law {kind} needs helio_{key}: add the line"
+    number, text = keys.get(key, keys["law"])
+    if problem["type"] == "extra_forbidden":
+        return f"line {number}: helio_{key}: the law {kind!r} has no such key: correct or remove it (helio schema)"
+    reason = str(problem["ctx"]["error"]) if problem["type"] == "value_error" else problem["msg"].lower()
+    return f"line {number}: helio_{'.'.join(inner) or 'law'} {text}: {reason.removeprefix('input ')}: correct it"
+
+
+def _value(text: str) -> Any:
+    """Return a value as in TOML; what is none is a text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

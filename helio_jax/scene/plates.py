@@ -1,0 +1,66 @@
+"""A plate from a mesh file: a solid with channels, and the parts of it that count atoms.
+
+Plate frame: x, y of the lab, z = 0 in the plane of the pinhole and z up, um; all of the mesh lies at z >= 0.
+The tracer moves it with the beam (trace/meshplate.py).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from helio_jax.detector import Detector
+from helio_jax.errors import InputFileError
+from helio_jax.instrument import Plate
+from helio_jax.scene.body import Body
+from helio_jax.scene.placement import rotation_matrix
+from helio_jax.scene.sample import MESH_EXTENT_UM, check_body, load_mesh
+from helio_jax.settings import UNITS_UM
+
+MAX_PLATE_MB = 200.0
+"""Largest mesh file of a plate."""
+SOLID = "the plate"
+"""Material of a plate's faces that do not count atoms."""
+
+
+def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = Path()) -> Body:
+    """Read the mesh of a plate, in its frame; its materials are `SOLID` and the names of the parts that count atoms.
+
+    Raises:
+        InputFileError: the file is missing, too large, unreadable, lacks a part, is of absurd size, reaches below the
+            plane of the pinhole, is inside out, or is nothing but parts that count.
+    """
+    assert plate.file is not None and plate.unit is not None  # by the plate's validator
+    path = base_dir / plate.file
+    parts = tuple(dict.fromkeys(d.part for d in detectors if d.part is not None))
+    vertices, faces, index = load_mesh(path, MAX_PLATE_MB, parts)
+    body = Body(vertices, faces, materials=(SOLID, *parts), face_material=index)
+    body = body.transformed(
+        rotation_matrix(plate.rotate_deg or (0.0, 0.0, 0.0)),
+        UNITS_UM[plate.unit],
+        plate.translate_um or (0.0, 0.0, 0.0),
+    )
+    (low, high), (least, most) = body.bounds, MESH_EXTENT_UM
+    extent = float((high - low).max())
+    if not least <= extent <= most:
+        raise InputFileError(
+            f"{path}: the plate is {extent:g} um across, sensible are {least:g} to {most:g} um: check plate.unit (now "
+            f"{plate.unit!r})"
+        )
+    if low[2] < -1e-6 * extent:
+        raise InputFileError(
+            f"{path}: the plate reaches down to z = {low[2]:g} um, it must lie at z >= 0, the plane of the pinhole "
+            "from which all distances count: move it with plate.translate_um"
+        )
+    if not np.any(index == 0):
+        raise InputFileError(f"{path}: all parts of the mesh are detectors: there is no plate between them")
+    if check_solid(body)["is_inside_out"]:
+        raise InputFileError(
+            f"{path}: the plate is inside out (volume < 0): flip its normals in the program that made it"
+        )
+    return body
+
+
+def check_solid(body: Body) -> dict:
+    """Report on the faces of a plate that do not count atoms, as `check_body` does."""
+    return check_body(replace(body, faces=body.faces[body.face_material == 0], face_material=None))
