@@ -10,8 +10,8 @@ folder per verb. Which file does what:
 * `scene/` what is imaged: `sample` (kinds of samples), `placement` (where they stand), `surfaces` (their geometry),
   `scan` (positions), `views` (distances, rotations), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
-  `random`, `direct` (form factor), `transport` (paths), `tally`, `masks` (masked fraction, shadow), `denoise`, `run`
-  (blocks on threads), `converge` (a wanted error), `job`, `units` (units of work), `scan` (threads, processes,
+  `random`, `direct` (form factor), `experiment`, `transport` (paths), `next_event` (the expected estimator), `tally`,
+  `masks` (masked fraction, shadow), `denoise`, `run` (blocks on threads), `converge` (a wanted error), `job`, `units` (units of work), `scan` (threads, processes,
   cluster), `follow` (single atoms).
 * `prepare/` `noise` (counting noise), `response` (lag, drift), `calibrate` (first background and gain).
 * `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes

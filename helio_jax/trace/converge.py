@@ -11,11 +11,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.run import N_REPLICATES, check_rays, pixels_per_block
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import Estimate
-from helio_jax.trace.transport import Experiment, trace_block
+from helio_jax.trace.transport import trace_block
 
 SAFETY = 1.4
 """The pilot's variance is known to 50 % only (7 degrees of freedom): so many times the rays that it asks for."""

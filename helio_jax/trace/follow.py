@@ -15,13 +15,13 @@ from helio_jax.kernel import kernel
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.analog import land
+from helio_jax.trace.experiment import Experiment, lift_off
 from helio_jax.trace.laws import scatter_atoms
 from helio_jax.trace.lawtable import make_law_table
 from helio_jax.trace.run import make_experiment
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import DETECTED, ESCAPED, FATES, STOPPED
-from helio_jax.trace.transport import Experiment, lift_off
 
 MAX_ATOMS = 5_000_000
 """Atoms kept at most."""

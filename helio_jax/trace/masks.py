@@ -10,8 +10,8 @@ import numpy as np
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
 from helio_jax.trace.direct import ApertureTable, spread, toward
+from helio_jax.trace.experiment import lift_off
 from helio_jax.trace.intersect import MISS, Intersector
-from helio_jax.trace.transport import lift_off
 
 
 def aperture_samples(n_points: int) -> np.ndarray:

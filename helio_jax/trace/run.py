@@ -17,6 +17,7 @@ from helio_jax.instrument import Effusive, Instrument, Plate
 from helio_jax.scene.body import COSINE, Body
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.trace.direct import ApertureTable
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_law_table
 from helio_jax.trace.masks import axis_rays
@@ -25,7 +26,7 @@ from helio_jax.trace.plate import FACING_DOWN, PlateTable
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.source import Sampling, Source
 from helio_jax.trace.tally import LOST, Estimate
-from helio_jax.trace.transport import Experiment, trace_block
+from helio_jax.trace.transport import trace_block
 
 RAYS_PER_BLOCK = 65536
 """Rays traced together: Embree is fastest with about 64k neighbouring rays."""

@@ -24,11 +24,11 @@ from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.job import Job, Unit
 from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
-from helio_jax.trace.transport import Experiment
 from helio_jax.trace.units import Patch, experiment_of, join_pieces, tasks, trace_unit
 
 MAX_DEATHS = 3

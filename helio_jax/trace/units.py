@@ -17,12 +17,13 @@ import numpy as np
 from helio_jax.errors import ResumeError
 from helio_jax.scene.body import Body
 from helio_jax.trace.converge import trace_to_target
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import MISS
 from helio_jax.trace.job import Job, Unit, differences, instruction_set
 from helio_jax.trace.masks import hidden_form_factor, is_shadowed
 from helio_jax.trace.run import check_rays, first_hits, make_experiment, pixels_per_block
 from helio_jax.trace.tally import FATES, Estimate
-from helio_jax.trace.transport import Experiment, trace_block
+from helio_jax.trace.transport import trace_block
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from helio_jax.errors import GuardError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.shapes import Sphere, SpheresSample, TrenchSample
 from helio_jax.scene.surfaces import Body, flat_body
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.random import philox
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED
-from helio_jax.trace.transport import Experiment
 
 
 def sphere_a() -> Body:
