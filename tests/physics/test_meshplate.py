@@ -300,3 +300,24 @@ def test_what_is_refused(tmp_path):
     )
     with pytest.raises(InputFileError, match="the plate is inside out"):
         scene.read_plate()
+
+
+def test_the_mesh_stays_beside_its_instrument(tmp_path):
+    """A scene elsewhere extends an instrument file with a plate: the mesh is found beside it. Catches a lost folder."""
+    from helio_jax.config import load_instrument
+
+    folder = tmp_path / "instruments"
+    folder.mkdir()
+    drilled = drill_plate(flat_plate(), 100.0)
+    mesh, _ = from_mesh(folder, flat_plate(), drilled)
+    tables = '[plate]\nkind = "mesh"\nfile = "plate.obj"\nunit = "um"\nworking_distance_um = 1000\n'
+    tables += "".join(f'[[detector]]\nname = "{d.name}"\npart = "{d.part}"\n' for d in mesh.detector)
+    (folder / "own.toml").write_text(tables + '[trace]\nestimator = "analog"\n')
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        'extends = "instruments/own.toml"\n[sample]\nkind = "flat"\n[scan]\nnx = 2\nny = 2\npixel_size_um = 9\n'
+    )
+    scene = load_scene(path)
+    assert scene.plate.file == "instruments/plate.obj" and scene.read_plate() is not None
+    with pytest.raises(SceneError, match=r"plate\.kind = 'mesh'"):
+        drill_plate(load_instrument(folder / "own.toml"), 10.0)
