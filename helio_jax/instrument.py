@@ -82,6 +82,9 @@ class Plate(Settings):
     the nominal spot), z = 0 the plane of the pinhole, with all of the plate at z >= 0; it moves with the beam."""
     unit: Unit | None = None
     """`mesh`: unit of the file's coordinates."""
+    part: str | None = Field(default=None, min_length=1, max_length=200)
+    """`mesh`: part of the file that is the plate (see detector.part); others that no detector names are left out
+    (default: all that no detector names is the plate)."""
     rotate_deg: tuple[float, float, float] | None = None
     """`mesh`: rotations about the fixed x, then y, then z axis (default: none) [deg]."""
     translate_um: tuple[float, float, float] | None = None
@@ -91,7 +94,7 @@ class Plate(Settings):
     def _has_the_keys_of_its_kind(self) -> "Plate":
         own = {
             "scattering": ("radius_um", "size_um", "center_um", "material"),
-            "mesh": ("file", "unit", "rotate_deg", "translate_um", "material"),
+            "mesh": ("file", "unit", "part", "rotate_deg", "translate_um", "material"),
         }
         names = dict.fromkeys(name for keys in own.values() for name in keys)
         given = [name for name in names if getattr(self, name) is not None]
@@ -163,6 +166,8 @@ class Instrument(Settings):
                 f"detector {far[0]!r} is at infinity, which a flat scattering plate hides: set plate.kind = "
                 "'transparent' (without size and material), or remove at_infinity"
             )
+        if self.plate.part is not None and self.plate.part in [d.part for d in self.detector]:
+            raise ValueError(f"plate.part = {self.plate.part!r} is a detector's part, too: it can be one of both only")
         behind = [d.name for d in self.detector if d.needs_mesh]
         if behind and not self.plate.is_mesh:
             raise ValueError(

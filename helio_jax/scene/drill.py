@@ -51,7 +51,7 @@ class DrilledPlate:
 
     def tables(self, file: str) -> str:
         """Return the tables of a scene that uses the file."""
-        text = [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "um"']
+        text = [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "um"\npart = "{SOLID_NAME}"']
         text += [f"[[detector]]\nname = {json.dumps(name)}\npart = {json.dumps(name)}" for name in self.ends]
         return "\n\n".join([*text, '[trace]\nestimator = "analog"'])
 

@@ -33,7 +33,10 @@ def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = P
     assert plate.file is not None and plate.unit is not None  # by the plate's validator
     path = base_dir / plate.file
     parts = tuple(dict.fromkeys(d.part for d in detectors if d.part is not None))
-    vertices, faces, index = load_mesh(path, MAX_PLATE_MB, parts)
+    own = () if plate.part is None else (plate.part,)
+    vertices, faces, index = load_mesh(path, MAX_PLATE_MB, (*parts, *own))
+    if own:
+        faces, index = faces[index > 0], index[index > 0] % (len(parts) + 1)
     body = Body(vertices, faces, materials=(SOLID, *parts), face_material=index)
     body = body.transformed(
         rotation_matrix(plate.rotate_deg or (0.0, 0.0, 0.0)),

@@ -231,7 +231,7 @@ class Scene(Instrument):
         if (plate := self.read_plate()) is not None and not check_solid(plate)["is_watertight"]:
             out.append(
                 f"{self.plate.file}: the plate is not closed: atoms that enter its solid are lost; a part that no "
-                "detector names belongs to it (a channel's end, say): leave it out of the file or give it a detector"
+                "detector names belongs to it (a channel's end, say) unless plate.part names what is the plate"
             )
         return out + self._plate_warnings(openings) + self.sample.warnings(self.base_dir)
 

@@ -206,10 +206,10 @@ def test_without_manifold(monkeypatch):
     assert error.value.exit_code == 5
 
 
-def scene_of(folder: Path, text: str = "") -> Path:
+def scene_of(folder: Path, text: str = "", part: str = "") -> Path:
     """Write a scene that extends an instrument and uses plate.obj beside it."""
     path = folder / "scene.toml"
-    tables = '[plate]\nkind = "mesh"\nfile = "plate.obj"\nunit = "um"\n' + "".join(
+    tables = f'[plate]\nkind = "mesh"\nfile = "plate.obj"\nunit = "um"\n{part}' + "".join(
         f'[[detector]]\nname = "{name}"\npart = "{name}"\n' for name in ("forward", "right", "left")
     )
     rest = '[sample]\nkind = "flat"\n[scan]\nnx = 2\nny = 2\npixel_size_um = 20.0\n[trace]\nrays = 4000\n'
@@ -232,8 +232,8 @@ def test_from_instrument_to_file(tmp_path, capsys):
     instrument = SCENES / "instruments" / "bshem_wd4.toml"
     assert run("plate", instrument, "-o", tmp_path / "plate.obj", "--thickness-um", 300) == 0
     printed = capsys.readouterr().out
-    path = scene_of(tmp_path, 'estimator = "analog"\n')
-    assert all(line in printed for line in path.read_text().splitlines()[1:13])
+    path = scene_of(tmp_path, 'estimator = "analog"\n', f'part = "{SOLID_NAME}"\n')
+    assert all(line in printed for line in path.read_text().splitlines()[1:14])
     assert run("validate", path) == 0
     told = capsys.readouterr().out
     assert "plate is_watertight: True" in told and "warning" not in told
@@ -287,11 +287,37 @@ def test_what_is_refused(tmp_path):
     )
     assert moved.read_plate().bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
     assert "the plate is not closed" not in str(scene.warnings())
-    one_less = load_scene(scene_of(tmp_path, 'estimator = "analog"\n'), {"detector.2": {"name": "o", "part": "right"}})
+    one = [{"name": "o", "part": "right"}]
+    one_less = load_scene(scene_of(tmp_path, 'estimator = "analog"\n'), {"detector": one})
     assert ["the plate is not closed" in w for w in one_less.warnings()].count(True) == 1
+    alone = load_scene(scene_of(tmp_path, 'estimator = "analog"\n'), {"plate.part": SOLID_NAME, "detector": one})
+    assert len(alone.read_plate().materials) == 2 and "not closed" not in str(alone.warnings())
+    with pytest.raises(SceneError, match=r"plate\.part = 'right' is a detector's part, too"):
+        load_scene(scene_of(tmp_path, 'estimator = "analog"\n'), {"plate.part": "right"})
     lines = [line.split() for line in (tmp_path / "plate.obj").read_text().splitlines()]
     (tmp_path / "plate.obj").write_text(
         "\n".join(" ".join([w, *rest[::-1]] if w == "f" else [w, *rest]) for w, *rest in lines)
     )
     with pytest.raises(InputFileError, match="the plate is inside out"):
         scene.read_plate()
+
+
+def test_the_mesh_stays_beside_its_instrument(tmp_path):
+    """A scene elsewhere extends an instrument file with a plate: the mesh is found beside it. Catches a lost folder."""
+    from helio_jax.config import load_instrument
+
+    folder = tmp_path / "instruments"
+    folder.mkdir()
+    drilled = drill_plate(flat_plate(), 100.0)
+    mesh, _ = from_mesh(folder, flat_plate(), drilled)
+    tables = '[plate]\nkind = "mesh"\nfile = "plate.obj"\nunit = "um"\nworking_distance_um = 1000\n'
+    tables += "".join(f'[[detector]]\nname = "{d.name}"\npart = "{d.part}"\n' for d in mesh.detector)
+    (folder / "own.toml").write_text(tables + '[trace]\nestimator = "analog"\n')
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        'extends = "instruments/own.toml"\n[sample]\nkind = "flat"\n[scan]\nnx = 2\nny = 2\npixel_size_um = 9\n'
+    )
+    scene = load_scene(path)
+    assert scene.plate.file == "instruments/plate.obj" and scene.read_plate() is not None
+    with pytest.raises(SceneError, match=r"plate\.kind = 'mesh'"):
+        drill_plate(load_instrument(folder / "own.toml"), 10.0)
