@@ -11,8 +11,8 @@ folder per verb. Which file does what:
   `scan` (positions), `views` (distances, rotations), `scene`.
 * `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
   `random`, `direct` (form factor), `experiment`, `transport` (paths), `next_event` (the expected estimator), `tally`,
-  `masks` (masked fraction, shadow), `denoise`, `run` (blocks on threads), `converge` (a wanted error), `job`, `units` (units of work), `scan` (threads, processes,
-  cluster), `follow` (single atoms).
+  `masks` (masked fraction, shadow), `denoise`, `run` (blocks on threads), `converge` (a wanted error), `job`, `units`
+  (units of work), `scan` (threads, processes, cluster), `follow` (single atoms).
 * `prepare/` `noise` (counting noise), `response` (lag, drift), `calibrate` (first background and gain).
 * `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
   -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
