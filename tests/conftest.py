@@ -1,9 +1,27 @@
 """Shared fixtures of the tests."""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
+
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_OWN = pytest.StashKey[str]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let all processes of this run share what JAX compiles, which is two thirds of the time of a small fit."""
+    if _CACHE not in os.environ:
+        config.stash[_OWN] = os.environ[_CACHE] = tempfile.mkdtemp(prefix="helio-jax-tests-")
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove it."""
+    if _OWN in config.stash:
+        shutil.rmtree(config.stash[_OWN], ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
