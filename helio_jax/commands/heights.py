@@ -9,7 +9,18 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import AsJson, Bar, H5File, Method, OutFile, app, given_options, print_table
+from helio_jax.commands.app import (
+    FIGURE,
+    AsJson,
+    Bar,
+    H5File,
+    HtmlFile,
+    Method,
+    SpacedCommand,
+    app,
+    given_options,
+    print_table,
+)
 
 
 @app.command()
@@ -23,10 +34,10 @@ def reconstruct(
     """Turn three or more micrographs into a height map."""
     from helio_jax import pipeline, write
     from helio_jax.config import load_scene
-    from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.formats.hdf5 import read_stack
 
     given = load_scene(settings).reconstruct if settings else None
-    images = read_micrographs(stack)
+    images = read_stack(stack)
     with Bar("reconstructing") as bar:
         result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
     write(result, output)
@@ -65,24 +76,24 @@ def evaluate(
 @app.command()
 def report(
     height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
-    output: OutFile,
+    output: HtmlFile,
     stack: Annotated[Path | None, typer.Option(help="Its micrographs (.h5).")] = None,
     truth: Annotated[Path | None, typer.Option(help="Scene file or height map to compare with.")] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
     from helio_jax import pipeline
-    from helio_jax.formats.hdf5 import read_height, read_micrographs
+    from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.truth import load_truth
 
-    rec, images = read_height(height), read_micrographs(stack).only() if stack else None
+    rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
     print(f"{output}\n{panel}")
 
 
-@app.command()
+@app.command(cls=SpacedCommand)
 def measure(
     height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
     facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
@@ -90,7 +101,9 @@ def measure(
     step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
     roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
     min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
-    figure: Annotated[Path | None, typer.Option(help="Facets as a picture (.png, .pdf, .svg).")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Facets as a picture (.png, .pdf, .svg).", callback=FIGURE)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure on a height map: facets, a profile between two beam positions, a step, roughness."""
