@@ -100,18 +100,24 @@ def measure(
     profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
     step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
     roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
+    ripple: Annotated[bool, typer.Option("--ripple", help="The strongest ripple: wavelength, amplitude.")] = False,
+    region: Annotated[
+        list[str] | None, typer.Option(help="'X,Y X,Y ...': corners in um, for roughness and ripple (repeat).")
+    ] = None,
+    stack: Annotated[Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple?")] = None,
     min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
     figure: Annotated[
-        Path | None, typer.Option(help="Facets as a picture (.png, .pdf, .svg).", callback=FIGURE)
+        Path | None, typer.Option(help="Facets or ripple as a picture (.png, .pdf, .svg).", callback=FIGURE)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on a height map: facets, a profile between two beam positions, a step, roughness."""
+    """Measure on a height map: facets, a profile between two beam positions, a step, roughness, a ripple."""
     from helio_jax.evaluate.measure import Wanted, measure_height_map
-    from helio_jax.formats.hdf5 import read_height
+    from helio_jax.formats.hdf5 import read_height, read_stack
 
-    wanted = Wanted(facets, profile, step, roughness, min_pixels)
-    found, lines = measure_height_map(read_height(height), wanted, figure)
+    wanted = Wanted(facets, profile, step, roughness, min_pixels, ripple, tuple(region or ()))
+    images = read_stack(stack) if stack else None
+    found, lines = measure_height_map(read_height(height), wanted, figure, images)
     print(json.dumps(found) if as_json else "\n".join(lines))
 
 

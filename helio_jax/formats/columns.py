@@ -19,7 +19,7 @@ def check_table_target(path: str | os.PathLike) -> str:
     kind = Path(path).suffix.lower()
     if kind not in (".csv", ".npz"):
         raise SceneError(f"{path}: a table is written as .csv or .npz, got {kind or 'no suffix'!r}")
-    check_target(path)
+    check_target(Path(path))
     return kind
 
 
