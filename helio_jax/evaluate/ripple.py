@@ -31,7 +31,8 @@ from helio_jax.reconstruction import Reconstruction
 
 Pair = tuple[float, float]
 _SURE = 1e-3
-"""What is less likely than this is taken for no accident."""
+_UNLIKELY = 1e-2
+"""What is less likely than this is taken for no accident: that there is a wave; that detectors disagree so much."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ class Agreement:
         """What the micrographs say, in words."""
         if self.false_alarm > _SURE:
             return "the micrographs do not show it: noise, or left by the reconstruction"
-        if self.misfit < _SURE:
+        if self.misfit < _UNLIKELY:
             return (
                 "NOT a wave of the surface alone: the detectors disagree (albedo, masks, drift, or one detector's own)"
             )
