@@ -139,7 +139,7 @@ def test_micrographs_tell_a_wave_of_the_surface_from_others():
 
 
 def test_regions():
-    """A triangle of 880 um legs has 22 x 44 pixels, two corners are a rectangle; other texts and empty ones are told."""
+    """A triangle of 880 um legs has 22 x 44 pixels, two corners are a rectangle; other texts, empty ones are told."""
     assert TRIANGLE.sum() == pytest.approx(44 * 44 / 2, abs=30) and TRIANGLE[10, 10] and not TRIANGLE[40, 40]
     assert inside_polygon(parse_region("-100,0 100,50"), AXIS, AXIS).sum() == pytest.approx(10 * 2.5, abs=6)
     for text in ("1,2", "1 2 3", "a,b c,d", "1,2 3,4,5", "nan,0 1,1"):
