@@ -10,12 +10,11 @@ from helio_jax.errors import SceneError
 from helio_jax.evaluate.facets import Facets, FacetSettings, find_facets
 from helio_jax.evaluate.figures import save_figure
 from helio_jax.evaluate.overlay import facet_map
+from helio_jax.evaluate.regions import inside_polygon, parse_region
 from helio_jax.evaluate.ripple import (
     compare_with_images,
     height_ripple,
     image_spectra,
-    inside_polygon,
-    parse_region,
 )
 from helio_jax.evaluate.ripple_figure import ripple_panel
 from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
@@ -24,7 +23,7 @@ from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `ripple.parse_region`): where the last two."""
+    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where the last two."""
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None

@@ -11,12 +11,11 @@ from test_measure import PITCH, make_rec
 
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.evaluate.measure import Wanted, measure_height_map
+from helio_jax.evaluate.regions import inside_polygon, parse_region
 from helio_jax.evaluate.ripple import (
     compare_with_images,
     height_ripple,
     image_ripple,
-    inside_polygon,
-    parse_region,
 )
 from helio_jax.evaluate.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
 from helio_jax.instrument import Detector, Instrument, Plate
