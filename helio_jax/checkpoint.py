@@ -11,11 +11,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from helio_jax.errors import GuardError, InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
+from helio_jax.formats.hdf5 import describe
 from helio_jax.formats.parts import Parts
 from helio_jax.micrograph import Micrographs
 from helio_jax.scene.scene import Scene
@@ -118,7 +120,8 @@ class Keeper:
         if changes := differences(about, job.about, ("then", "now")):
             raise ResumeError(
                 f"{parts.folder} holds an unfinished run of something else:\n  " + "\n  ".join(changes) + "\nput back "
-                "what was changed to go on, or give --restart to discard the run, or name another output"
+                "what was changed to go on; to discard that run, give the command that began it (simulate, run) with "
+                "--restart; or name another output"
             )
         if not parts.exist or self.shard is None:  # the last command given is the one that is resumed
             parts.begin({"format": FORMAT, "command": self.command, "about": job.about, "n_units": n_units})
@@ -180,6 +183,23 @@ class Keeper:
 def _label(job: Job, unit: Unit) -> np.ndarray:
     """Return what tells a part of one run from one of another."""
     return np.array(f"{job.key} {unit.start} {unit.stop}")
+
+
+def is_finished(output: Path) -> bool:
+    """Whether a file without parts is there and what a finished run leaves: whole micrographs.
+
+    Raises:
+        ResumeError: it is empty, damaged or of another kind.
+    """
+    if not output.is_file():
+        return False
+    try:
+        kind = describe(output)["kind"]
+    except InputFileError as e:
+        raise ResumeError(f"{e}; no parts of it are left to go on with: remove it and start anew") from None
+    if not kind.startswith("micrograph"):
+        raise ResumeError(f"{output} holds a {kind}, nothing that is traced: name the file of micrographs")
+    return True
 
 
 class _Terminated(KeyboardInterrupt):

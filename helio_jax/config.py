@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from helio_jax.errors import InputFileError, SceneError
+from helio_jax.errors import SceneError
 from helio_jax.evaluate.settings import TruthSettings
 from helio_jax.explain import explain_errors
 from helio_jax.instrument import Instrument
@@ -61,7 +61,7 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
             table, value, limit and remedy.
     """
     path = Path(path)
-    data = named_kind(_merge(_read_extended(path), _nest(overrides or {})))
+    data = {"name": path.stem[:200], **named_kind(_merge(_read_extended(path), _nest(overrides or {})))}
     try:
         scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
@@ -75,12 +75,9 @@ def read_reconstruction(path: Path) -> Reconstruction:
     Raises:
         InputFileError: missing, damaged, or something else.
     """
-    from helio_jax.formats.hdf5 import read
+    from helio_jax.formats.hdf5 import read_height
 
-    found = read(path)
-    if not isinstance(found, Reconstruction):
-        raise InputFileError(f"{path}: a sample must be a reconstruction, the file holds a {type(found).__name__}")
-    return found
+    return read_height(path)
 
 
 def load_instrument(path: str | os.PathLike) -> Instrument:

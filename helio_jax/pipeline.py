@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from helio_jax.checkpoint import Keeper, Shard
+from helio_jax.checkpoint import Keeper, Shard, is_finished
 from helio_jax.config import SceneFile, load_scene
 from helio_jax.errors import InputFileError, ResumeError, SceneError
 from helio_jax.evaluate.before_after import save_before_after
 from helio_jax.evaluate.figures import panel, save_figure
 from helio_jax.evaluate.metrics import Scores, Truth, evaluate_height
 from helio_jax.evaluate.report import write_report
-from helio_jax.formats.hdf5 import read_micrographs, write
+from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
@@ -143,7 +143,7 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     output = path / "micrographs.h5" if path.is_dir() else path
     parts = Parts(output)
     if not parts.exist:
-        if output.is_file():
+        if is_finished(output):
             parts.remove()  # what is left when a process is killed while it cleans up
             say(f"{output} is complete: nothing to resume")
             return []
@@ -215,7 +215,7 @@ def _flat_signal(instrument: Instrument) -> np.ndarray:
 
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
-    before = read_micrographs(path).only()
+    before = read_stack(path)
     after = calibrate(before, **changes)
     write(after, output)
     save_before_after(before, after, Path(output).with_suffix(".png"))

@@ -25,9 +25,11 @@ def draw_spot(scene: Scene, heights: Sequence[float], path: str | Path | None, s
         seed: of the random numbers.
 
     Raises:
-        SceneError: a height is not below the plate.
+        SceneError: a height is not finite, or not below the plate.
     """
-    if wrong := [h for h in heights if not -math.inf < h < scene.sample_distance]:
+    if wrong := [h for h in heights if not math.isfinite(h)]:
+        raise SceneError(f"heights must be finite numbers of um, got {wrong[0]:g}: correct or remove it")
+    if wrong := [h for h in heights if h >= scene.sample_distance]:
         limit = f"{scene.sample_distance:g} um above the reference plane"
         raise SceneError(f"heights must lie below the plate, which is {limit}, got {wrong[0]:g} um: choose lower ones")
     points = footprint(scene.instrument, np.array(heights), SPOT_RAYS, seed, scene.read_rays())

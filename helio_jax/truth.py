@@ -8,7 +8,7 @@ from helio_jax.config import SceneFile, load_scene
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.metrics import Region, Truth
 from helio_jax.evaluate.metrics import fit_center as fit_sphere_center
-from helio_jax.formats.hdf5 import read
+from helio_jax.formats.hdf5 import HDF5_SUFFIXES, read_height
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres
@@ -61,12 +61,11 @@ def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = Fals
         fit_center: for a scene of one sphere: fit its position first, as for measured data (DATA.md).
 
     Raises:
+        InputFileError: the file is missing, damaged or of another kind, or on another raster.
         SceneError: `fit_center` without a scene of one sphere and a scored region.
     """
-    if Path(path).suffix == ".h5":
-        other = read(path)
-        if not isinstance(other, Reconstruction):
-            raise SceneError(f"{path}: the truth must be a scene or a height map, got {type(other).__name__}")
+    if Path(path).suffix.lower() in HDF5_SUFFIXES:
+        other = read_height(path)
         return Truth(other.height, other.normals)
     scene = load_scene(path)
     return _fitted_truth(path, scene, rec) if fit_center else true_height(scene, rec)

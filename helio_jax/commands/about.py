@@ -4,6 +4,7 @@ Each parses, calls, prints; no logic of its own.
 """
 
 import json
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +29,9 @@ def info(file: Annotated[Path, typer.Argument(help="File written by helio (.h5).
             shape = " x ".join(map(str, field.get("shape", ()))) or "scalar"
             print(f"  {place:<24} {shape:<18} {field.get('unit', ''):<10} {field.get('long_name', '')}".rstrip())
         for key in ("instrument", "provenance"):
-            print(f"  {key}: {json.dumps(entry.get(key))[:600]}")
+            print(f"  {key}:")
+            for name, value in (entry.get(key) or {}).items():
+                print(f"    {name}: {textwrap.shorten(json.dumps(value), 300, placeholder=' ... (--json: all)')}")
 
 
 @app.command()
@@ -41,8 +44,11 @@ def validate(scene: SceneArg) -> None:
     loaded = load_scene(scene)
     loaded.read_laws()
     loaded.read_rays()
-    for key, value in check_body(loaded.build_body()).items():
+    body = check_body(loaded.build_body(), loaded.sample.shape(loaded.base_dir) if loaded.sample.is_tilted else None)
+    for key, value in body.items():
         print(f"  {key}: {value}")
+    if body["n_open_edges"] and not body["n_inner_open_edges"]:
+        print("  open edges: all on the outer border; a flat with structure is an open surface by design")
     if (plate := loaded.read_plate()) is not None:
         for key, value in check_solid(plate).items():
             print(f"  plate {key}: {value}")

@@ -5,10 +5,12 @@ Light at import (`helio --help` in under 0.3 s): every command imports what it n
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -18,19 +20,49 @@ app = typer.Typer(
     help="Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map.",
 )
 
-HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
+
+HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")  # as in formats/hdf5.py, which is too heavy to ask here
 
 
-def _with_hdf5_suffix(path: Path) -> Path:
-    """Refuse another suffix than that of HDF5, before anything is computed."""
-    if path.suffix.lower() not in HDF5_SUFFIXES:
-        raise typer.BadParameter(f"{path}: is written as HDF5: give it the suffix .h5, got {path.suffix!r}")
-    return path
+def _written_as(what: str, *suffixes: str) -> Callable[[Path | None], Path | None]:
+    """Return a check of an output's suffix that refuses another one before anything is computed (exit code 2)."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and path.suffix.lower() not in suffixes:
+            known = " or ".join(suffixes)
+            raise typer.BadParameter(f"{path}: is written as {what}: give it the suffix {known}, got {path.suffix!r}")
+        return path
+
+    return check
+
+
+class SpacedCommand(TyperCommand):
+    """A command with options of several numbers, which stand with spaces between: a comma is told with its remedy."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse as usual, once no option of several values has been given one word with commas."""
+        several = {name: option for option in self.params if option.nargs > 1 for name in option.opts}
+        for word, following in zip(args, [*args[1:], ""], strict=True):
+            name, _, value = word.partition("=")
+            value = value or following
+            if name in several and "," in value:
+                shown = " ".join(v for v in value.split(",") if v)
+                raise typer.BadParameter(
+                    f"{name} takes its {several[name].nargs} values with spaces between, got "
+                    f"{value!r}: write {name} {shown}"
+                )
+        return super().parse_args(ctx, args)
 
 
 SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml")]
-OutFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.")]
-H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5).", callback=_with_hdf5_suffix)]
+H5File = Annotated[
+    Path, typer.Option("--output", "-o", help="File to write (.h5).", callback=_written_as("HDF5", *HDF5_SUFFIXES))
+]
+HtmlFile = Annotated[
+    Path, typer.Option("--output", "-o", help="File to write (.html).", callback=_written_as("HTML", ".html", ".htm"))
+]
+FIGURE = _written_as("a figure", ".png", ".pdf", ".svg")
+"""Callback of options that name a picture to write."""
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]

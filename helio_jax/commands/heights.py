@@ -9,7 +9,18 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import AsJson, Bar, H5File, Method, OutFile, app, given_options, print_table
+from helio_jax.commands.app import (
+    FIGURE,
+    AsJson,
+    Bar,
+    H5File,
+    HtmlFile,
+    Method,
+    SpacedCommand,
+    app,
+    given_options,
+    print_table,
+)
 
 
 @app.command()
@@ -23,10 +34,10 @@ def reconstruct(
     """Turn three or more micrographs into a height map."""
     from helio_jax import pipeline, write
     from helio_jax.config import load_scene
-    from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.formats.hdf5 import read_stack
 
     given = load_scene(settings).reconstruct if settings else None
-    images = read_micrographs(stack)
+    images = read_stack(stack)
     with Bar("reconstructing") as bar:
         result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
     write(result, output)
@@ -65,40 +76,48 @@ def evaluate(
 @app.command()
 def report(
     height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
-    output: OutFile,
+    output: HtmlFile,
     stack: Annotated[Path | None, typer.Option(help="Its micrographs (.h5).")] = None,
     truth: Annotated[Path | None, typer.Option(help="Scene file or height map to compare with.")] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
     from helio_jax import pipeline
-    from helio_jax.formats.hdf5 import read_height, read_micrographs
+    from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.truth import load_truth
 
-    rec, images = read_height(height), read_micrographs(stack).only() if stack else None
+    rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
     print(f"{output}\n{panel}")
 
 
-@app.command()
+@app.command(cls=SpacedCommand)
 def measure(
     height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
     facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
     profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
     step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
     roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
+    ripple: Annotated[bool, typer.Option("--ripple", help="The strongest ripple: wavelength, amplitude.")] = False,
+    region: Annotated[
+        list[str] | None, typer.Option(help="'X,Y X,Y ...': corners in um, for roughness and ripple (repeat).")
+    ] = None,
+    stack: Annotated[Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple?")] = None,
     min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
-    figure: Annotated[Path | None, typer.Option(help="Facets as a picture (.png, .pdf, .svg).")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Facets or ripple as a picture (.png, .pdf, .svg).", callback=FIGURE)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on a height map: facets, a profile between two beam positions, a step, roughness."""
+    """Measure on a height map: facets, a profile between two beam positions, a step, roughness, a ripple."""
     from helio_jax.evaluate.measure import Wanted, measure_height_map
-    from helio_jax.formats.hdf5 import read_height
+    from helio_jax.formats.hdf5 import read_height, read_stack
 
-    wanted = Wanted(facets, profile, step, roughness, min_pixels)
-    found, lines = measure_height_map(read_height(height), wanted, figure)
+    wanted = Wanted(facets, profile, step, roughness, min_pixels, ripple, tuple(region or ()))
+    images = read_stack(stack) if stack else None
+    found, lines = measure_height_map(read_height(height), wanted, figure, images)
     print(json.dumps(found) if as_json else "\n".join(lines))
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import AsJson, H5File, Rays, SceneArg, app, given_options, print_table, say
+from helio_jax.commands.app import FIGURE, AsJson, H5File, Rays, SceneArg, app, given_options, print_table, say
 
 
 @app.command("import")
@@ -40,8 +40,10 @@ def export(
     from helio_jax import read
     from helio_jax.formats.export import export as write_foreign
 
-    write_foreign(read(file), output, view)
+    left_out = write_foreign(read(file), output, view)
     print(output)
+    for what in left_out:
+        print(f"  not written: {what}")
 
 
 @app.command()
@@ -55,10 +57,10 @@ def compare(
 ) -> None:
     """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
     from helio_jax.comparison import compare as compare_with_scene
-    from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.formats.hdf5 import read_stack
 
     found = compare_with_scene(
-        read_micrographs(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
+        read_stack(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
     )
     files = found.write(output)
     if as_json:
@@ -87,7 +89,9 @@ def align(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")
     ] = None,
-    figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).", callback=FIGURE)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""

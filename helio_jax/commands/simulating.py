@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from helio_jax.commands.app import (
+    FIGURE,
     AsJson,
     Bar,
     H5File,
@@ -22,6 +23,7 @@ from helio_jax.commands.app import (
     SceneArg,
     Scheduler,
     Seed,
+    SpacedCommand,
     Workers,
     app,
     given_options,
@@ -96,22 +98,27 @@ def simulate(
                 print(f"  {name}: {share:.2%} of the counts")
 
 
-@app.command()
+@app.command(cls=SpacedCommand)
 def rays(
     scene: SceneArg,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz).")],
-    pixel: Annotated[tuple[int, int] | None, typer.Option(help="Row and column, from 0 (default: all).")] = None,
-    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, to write too.")] = None,
+    pixel: Annotated[tuple[int, int] | None, typer.Option(metavar="ROW COLUMN", help="From 0 (default: all).")] = None,
+    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, too (.csv or .npz).")] = None,
     view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
     n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
     seed: Seed = None,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
     from helio_jax.config import load_scene
-    from helio_jax.formats.columns import write_columns
+    from helio_jax.errors import SceneError
+    from helio_jax.formats.columns import check_table_target, write_columns
     from helio_jax.trace.follow import follow_scene
     from helio_jax.trace.tally import FATES
 
+    for target in filter(None, (output, directions)):
+        check_table_target(target)
+    if directions and directions.resolve() == output.resolve():
+        raise SceneError(f"{output}: -o and --directions name one file: give them two names")
     loaded = load_scene(scene, given_options(**{"trace.rays": n, "trace.seed": seed}))
     atoms = follow_scene(loaded, loaded.trace, pixel, view)
     write_columns(output, atoms.columns())
@@ -158,7 +165,9 @@ def study(
 @app.command()
 def spot(
     scene: SceneArg,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg).", callback=FIGURE)
+    ] = None,
     heights: Annotated[str, typer.Option(help="Heights above the reference plane [um], commas between.")] = "0",
     as_json: AsJson = False,
 ) -> None:

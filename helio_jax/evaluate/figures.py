@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from helio_jax.arrays import pitch
-from helio_jax.errors import InputFileError
+from helio_jax.errors import SceneError
 from helio_jax.evaluate.metrics import Scores, Truth, height_error
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS, Reconstruction
@@ -375,15 +375,17 @@ def save_figure(fig: "Figure", path: str | Path, *, dpi: float = 150.0, formats:
     """Write the figure by suffix, atomically (temporary file, then replace).
 
     Raises:
-        InputFileError: the suffix is none of `formats`.
+        SceneError: the suffix is none of `formats`, or the file cannot be written.
     """
     path = Path(path)
     kind = path.suffix.lower().lstrip(".")
     if kind not in formats:
-        raise InputFileError(f"a figure's suffix must be one of {', '.join(formats)}, got {path.name!r}")
+        raise SceneError(f"{path}: a figure's suffix must be one of {', '.join(formats)}, got {kind or 'none'!r}")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         fig.savefig(part, format=kind, dpi=dpi)
         os.replace(part, path)
+    except OSError as e:
+        raise SceneError(f"cannot write {path}: {e.strerror or e}; check the folder, rights and space") from None
     finally:
         part.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What `helio measure` answers: facets, a profile, a step, roughness, as JSON and as lines of text."""
+"""What `helio measure` answers: facets, a profile, a step, roughness, a ripple, as JSON and as lines of text."""
 
 import math
 from pathlib import Path
@@ -10,35 +10,56 @@ from helio_jax.errors import SceneError
 from helio_jax.evaluate.facets import Facets, FacetSettings, find_facets
 from helio_jax.evaluate.figures import save_figure
 from helio_jax.evaluate.overlay import facet_map
+from helio_jax.evaluate.regions import inside_polygon, parse_region
+from helio_jax.evaluate.ripple import (
+    compare_with_images,
+    height_ripple,
+    image_spectra,
+)
+from helio_jax.evaluate.ripple_figure import ripple_panel
 from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
+from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """What to measure; `profile` is x0, y0, x1, y1 [um]."""
+    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where the last two."""
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None
     step: bool = False
     roughness: bool = False
     min_pixels: int = 60
+    ripple: bool = False
+    regions: tuple[str, ...] = ()
 
 
 def measure_height_map(
-    rec: Reconstruction, wanted: Wanted, figure: str | Path | None = None
+    rec: Reconstruction, wanted: Wanted, figure: str | Path | None = None, stack: MicrographStack | None = None
 ) -> tuple[dict[str, Any], list[str]]:
     """Measure what is wanted; return a JSON-compatible record and lines to print.
+
+    Args:
+        rec: heights.
+        wanted: what to measure.
+        figure: picture of the facets or of the ripple.
+        stack: calibrated micrographs of these heights, to ask about the ripple.
 
     Raises:
         SceneError: nothing is wanted, or a step or a figure without what it needs.
         GuardError: too little is known there.
     """
-    if not (wanted.facets or wanted.profile or wanted.roughness):
-        raise SceneError("measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness")
+    if not (wanted.facets or wanted.profile or wanted.roughness or wanted.ripple):
+        raise SceneError("measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple")
     if wanted.step and not wanted.profile:
         raise SceneError("--step needs --profile X0 Y0 X1 Y1 across the step")
-    if figure and not wanted.facets:
-        raise SceneError("--figure draws the facets: give --facets, too")
+    if figure and wanted.facets == wanted.ripple:
+        raise SceneError("--figure draws the facets or the ripple: give one of --facets and --ripple with it")
+    if wanted.regions and not (wanted.ripple or wanted.roughness):
+        raise SceneError("--region says where --ripple and --roughness measure: give one of them, too")
+    if stack is not None and not wanted.ripple:
+        raise SceneError("--stack is asked about the ripple: give --ripple, too")
+    regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
     found: dict[str, Any] = {"reconstructed": reconstructed_area(rec)}
     lines = [f"reconstructed: {found['reconstructed']['share']:.1%} of the raster"]
     if wanted.facets:
@@ -63,11 +84,42 @@ def measure_height_map(
         else:
             lines += [f"{d:10.2f} {h:10.3f}" for d, h in zip(line.distance, line.height, strict=True)]
     if wanted.roughness:
-        numbers = vars(measure_roughness(rec))
+        numbers = vars(measure_roughness(rec, np.any(regions, axis=0) if regions else None))
         found["roughness"] = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in numbers.items()}
         units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
         lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
+    if wanted.ripple:
+        found["ripple"], more = _ripple(rec, regions or [np.ones(rec.height.shape, bool)], figure, stack)
+        lines += more
     return found, lines
+
+
+def _ripple(
+    rec: Reconstruction, regions: list[np.ndarray], figure: str | Path | None, stack: MicrographStack | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Measure the strongest ripple; return a record and lines."""
+    r, spectrum, along = height_ripple(rec, regions)
+    lines = [
+        f"ripple: wavelength {r.wavelength_um:.1f} +- {r.wavelength_std_um:.1f} um, amplitude {r.amplitude:.3f} +- "
+        f"{r.amplitude_std:.3f} um, wave vector at {r.direction_deg:+.1f} +- {r.direction_std_deg:.1f} deg from x",
+        f"  peak {r.peak_over_floor:.1f} x floor, mean of {r.averages} spectra; noise alone anywhere in the range: "
+        f"{r.false_alarm:.1e}",
+        f"  {r.axis_angle_deg:.0f} deg from the raster's axes, where nothing was looked for: scan lines are there",
+    ]
+    record = r.as_dict()
+    if stack is not None:
+        a = compare_with_images(stack, r, regions)
+        record["micrographs"] = vars(a) | {"verdict": a.verdict}
+        for name, share in a.shares.items():
+            lines.append(
+                f"  {name}: {share:.2%} +- {a.shares_std[name]:.2%} of the signal, a wave of the surface: "
+                f"{a.expected[name]:.2%}"
+            )
+        lines.append(f"  {a.verdict} ({a.amplitude_um:.3f} um high; noise {a.false_alarm:.1e}, misfit {a.misfit:.1e})")
+    if figure:
+        images = image_spectra(stack, regions) if stack is not None else {}
+        save_figure(ripple_panel(rec, along, regions, r, {"heights": spectrum, **images}), figure)
+    return record, lines
 
 
 def reconstructed_area(rec: Reconstruction, max_std_um: float = 20.0) -> dict[str, Any]:

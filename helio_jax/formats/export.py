@@ -20,13 +20,16 @@ from helio_jax.micrograph import MicrographSet, MicrographStack
 _SOURCES = {"uniform": "Uniform", "gaussian": "Gaussian", "pencil": "Infinite"}
 
 
-def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> None:
+def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> list[str]:
     """Write an object to a foreign file.
 
     Args:
         obj: what `read` gave.
         path: its suffix says which kind.
         view: which stack of a set, from 0; needed where there are several.
+
+    Returns:
+        What the object holds and that kind of file has no place for, each with a reason.
 
     Raises:
         SceneError: nothing of this kind can be written, or not from this object; the message says what can.
@@ -48,6 +51,20 @@ def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> None:
 
     with atomic_path(path) as part:
         savemat(part, tree, do_compression=True)
+    return _left_out(obj)
+
+
+def _left_out(stack: MicrographStack) -> list[str]:
+    """Return what of a stack the reference simulator's layout does not hold."""
+    out = []
+    if stack.effuse is not None:
+        share = float(stack.effuse.sum() / stack.counts.sum()) if stack.counts.sum() > 0 else 0.0
+        out.append(f"effuse, counts of the effusive beam ({share:.1%} of the others): no place in this layout")
+    if stack.plate is not None:
+        out.append("plate, which counts met the plate: they are in single and multiple, no longer told apart")
+    if stack.by_order is not None and len(stack.by_order) > 2:
+        out.append(f"orders 2 to {len(stack.by_order)} one by one: multiple is their sum")
+    return out
 
 
 def reference_tree(stack: MicrographStack, path: str = "") -> dict[str, dict[str, Any]]:

@@ -21,13 +21,15 @@ import numpy as np
 
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
-from helio_jax.micrograph import Micrographs
+from helio_jax.micrograph import Micrographs, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from helio_jax.formats.nexus import Node, Noun
 
 FORMAT = "1.0"
+HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
+"""What files of HDF5 may be called."""
 MAX_BYTES = 4 * safe.GIB
 _MAX_OBJECTS = 20_000
 _MAX_DEPTH = 8
@@ -128,6 +130,19 @@ def read_micrographs(path: str | os.PathLike) -> Micrographs:
     if isinstance(found, Reconstruction):
         raise InputFileError(f"{path}: holds a height map, needed are micrographs: helio simulate or import makes them")
     return found
+
+
+def read_stack(path: str | os.PathLike) -> MicrographStack:
+    """Read a helio file that must hold one stack: a set of several scans has no common raster.
+
+    Raises:
+        InputFileError: as `read_micrographs`, or the file holds several scans.
+    """
+    found = read_micrographs(path)
+    try:
+        return found.only()
+    except InputFileError as e:
+        raise InputFileError(f"{path}: {e}") from None
 
 
 def read_height(path: str | os.PathLike) -> Reconstruction:

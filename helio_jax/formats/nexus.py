@@ -156,8 +156,10 @@ def _field_nodes(entry: str, obj: Any, fields: tuple[Field, ...], count_unit: st
             continue
         if isinstance(value, np.ndarray) and value.dtype == bool:
             value = value.astype(np.uint8)
-        unit = f.unit.replace("counts", count_unit) if count_unit else f.unit
-        nodes.append(Node(f"{entry}/{f.place}", value, {"units": unit, "long_name": f.long_name}))
+        unit, meaning = f.unit.replace("counts", count_unit) if count_unit else f.unit, f.long_name
+        if f.name in ("x", "y") and getattr(obj, "positions", None) is not None:
+            unit, meaning = "", "number of the beam position" if f.name == "x" else "0: a list has one row"
+        nodes.append(Node(f"{entry}/{f.place}", value, {"units": unit, "long_name": meaning}))
     return nodes
 
 

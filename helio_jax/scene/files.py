@@ -58,7 +58,7 @@ def read_height_map(path: Path, unit: float, pixel_size: float | None) -> Height
         raise InputFileError(f"{path}: a height map must be .npz, .csv, .tsv or .txt, got {kind or 'no suffix'!r}")
     data = read_bytes(path, MAX_HEIGHT_MAP_MB)
     if kind == ".npz":
-        x, y, height = (unit * a for a in _read_npz(path, data))
+        x, y, height = (unit * a for a in read_arrays(path, data, MAX_HEIGHT_MAP_MB, ("x", "y", "height")))
     else:
         if pixel_size is None:
             raise InputFileError(f"{path}: a text grid needs sample.pixel_size_um, its pitch in um")
@@ -70,38 +70,58 @@ def read_height_map(path: Path, unit: float, pixel_size: float | None) -> Height
         raise InputFileError(f"{path}: {e}") from None
 
 
-def check_unpacked(path: Path, data: bytes, max_mb: float) -> None:
-    """Refuse an .npz whose content is larger than `max_mb` megabytes."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        size = sum(entry.file_size for entry in archive.infolist())
-    if size > max_mb * 1e6:
-        raise InputFileError(f"{path}: unpacks to {size / 1e6:.0f} MB, the limit is {max_mb:g} MB")
+def read_arrays(
+    path: Path, data: bytes, max_mb: float, needed: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> list[np.ndarray]:
+    """Return named arrays of an .npz in float64: all that are needed, then those of the optional ones that are there.
 
-
-def _read_npz(path: Path, data: bytes) -> list[np.ndarray]:
-    """Return x, y and height as float64 arrays."""
+    Raises:
+        InputFileError: no readable .npz, larger than `max_mb` megabytes once unpacked, pickled, or an array is missing.
+    """
     try:
-        check_unpacked(path, data, MAX_HEIGHT_MAP_MB)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > max_mb * 1e6:
+            raise InputFileError(f"{path}: unpacks to {size / 1e6:.0f} MB, the limit is {max_mb:g} MB")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            missing = [name for name in ("x", "y", "height") if name not in arrays.files]
-            if missing:
+            if missing := [name for name in needed if name not in arrays.files]:
                 raise InputFileError(
                     f"{path}: lacks {', '.join(missing)}; it has {', '.join(arrays.files) or 'nothing'}: save it with "
-                    "numpy.savez(file, x=..., y=..., height=...)"
+                    f"numpy.savez(file, {', '.join(f'{name}=...' for name in needed)})"
                 )
-            return [np.asarray(arrays[name], np.float64) for name in ("x", "y", "height")]
+            names = [*needed, *(name for name in optional if name in arrays.files)]
+            return [np.asarray(arrays[name], np.float64) for name in names]
     except InputFileError:
         raise
     except Exception as e:  # zipfile, zlib and numpy raise many kinds on corrupt files
         raise InputFileError(f"{path}: is not a readable .npz file ({type(e).__name__}: {e})") from None
 
 
+def read_table(path: Path, data: bytes, what: str, *, separator: str | None = ",", titles: str = "") -> np.ndarray:
+    """Return the numbers of a text file [line, column]; # begins a comment.
+
+    Args:
+        path: for messages.
+        data: the file's bytes, UTF-8.
+        what: what it should be, for messages.
+        separator: between the numbers of a line; None: white space.
+        titles: a first line of titles that is skipped, if it says exactly this but for spaces.
+
+    Raises:
+        InputFileError: not UTF-8, not numbers, or lines of different lengths.
+    """
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+        has_titles = bool(titles and lines) and lines[0].replace(" ", "") == titles
+        return np.loadtxt(lines[has_titles:], delimiter=separator, ndmin=2)
+    except (UnicodeDecodeError, ValueError) as e:
+        remedy = "put a # before a line of titles"
+        raise InputFileError(f"{path}: is not {what} ({e}): {remedy}") from None
+
+
 def _read_grid(path: Path, data: bytes, kind: str) -> np.ndarray:
     """Return a text grid [y, x]; separators are commas (.csv) or white space."""
-    try:
-        grid = np.loadtxt(io.StringIO(data.decode("utf-8")), delimiter="," if kind == ".csv" else None, ndmin=2)
-    except (UnicodeDecodeError, ValueError) as e:
-        raise InputFileError(f"{path}: is not a grid of numbers: {e}") from None
+    grid = read_table(path, data, "a grid of numbers", separator="," if kind == ".csv" else None)
     if min(grid.shape) < 2:
         raise InputFileError(f"{path}: a grid needs at least 2 x 2 values, got {grid.shape}")
     return grid
@@ -118,12 +138,7 @@ def read_positions(path: Path) -> np.ndarray:
     if path.suffix.lower() != ".csv":
         raise InputFileError(f"{path}: a list of positions must be .csv, got {path.suffix or 'no suffix'!r}")
     data = read_bytes(path, MAX_POSITIONS_MB)
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-        has_names = bool(lines) and lines[0].replace(" ", "") == "x_um,y_um"
-        points = np.loadtxt(lines[has_names:], delimiter=",", ndmin=2)
-    except (UnicodeDecodeError, ValueError) as e:
-        raise InputFileError(f"{path}: is not a list of positions, x and y in um on each line: {e}") from None
+    points = read_table(path, data, "a list of positions, x and y in um on each line", titles="x_um,y_um")
     if points.ndim != 2 or not len(points) or points.shape[1] != 2 or not np.all(np.isfinite(points)):
         raise InputFileError(
             f"{path}: must hold two finite numbers (x, y in um) on each line, got {len(points)} lines of "

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from helio_jax.errors import InputFileError
-from helio_jax.scene.files import check_unpacked, read_bytes
+from helio_jax.scene.files import read_arrays, read_bytes, read_table
 
 MAX_RAYS_MB = 256.0
 """Largest file of rays, and largest content of an .npz after decompression."""
@@ -31,7 +31,8 @@ def read_rays(path: Path) -> np.ndarray:
     if kind not in (".csv", ".npy", ".npz"):
         raise InputFileError(f"{path}: rays must be .csv, .npy or .npz, got {kind or 'no suffix'!r}")
     data = read_bytes(path, MAX_RAYS_MB)
-    rows = _read_csv(path, data) if kind == ".csv" else _read_numpy(path, data, kind)
+    is_text, what = kind == ".csv", "a table of numbers separated by commas"
+    rows = read_table(path, data, what) if is_text else _read_numpy(path, data, kind)
     if rows.ndim != 2 or rows.shape[1] not in (6, 7) or not len(rows):
         raise InputFileError(f"{path}: rays need 6 or 7 columns ({_COLUMNS}), got the shape {rows.shape}")
     rows = rows if rows.shape[1] == 7 else np.column_stack([rows, np.ones(len(rows))])
@@ -52,30 +53,13 @@ def read_rays(path: Path) -> np.ndarray:
     return rows
 
 
-def _read_csv(path: Path, data: bytes) -> np.ndarray:
-    """Return the rows of a text file."""
-    try:
-        return np.loadtxt(io.StringIO(data.decode("utf-8-sig")), delimiter=",", ndmin=2)
-    except (UnicodeDecodeError, ValueError) as e:
-        remedy = "put a # before a line of titles"
-        raise InputFileError(f"{path}: is not a table of numbers separated by commas ({e}): {remedy}") from None
-
-
 def _read_numpy(path: Path, data: bytes, kind: str) -> np.ndarray:
     """Return the rows of a NumPy file."""
     try:
-        if kind == ".npy":
-            return np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float64)
-        check_unpacked(path, data, MAX_RAYS_MB)
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            missing = [name for name in ("position", "direction") if name not in arrays.files]
-            if missing:
-                raise InputFileError(
-                    f"{path}: lacks {', '.join(missing)}; it has {', '.join(arrays.files) or 'nothing'}"
-                )
-            names = [name for name in ("position", "direction", "weight") if name in arrays.files]
-            return np.column_stack([np.asarray(arrays[name], np.float64) for name in names])
+        if kind == ".npz":
+            return np.column_stack(read_arrays(path, data, MAX_RAYS_MB, ("position", "direction"), ("weight",)))
+        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float64)
     except InputFileError:
         raise
-    except Exception as e:  # zipfile, zlib and numpy raise many kinds on corrupt files
+    except Exception as e:  # numpy raises many kinds on corrupt files
         raise InputFileError(f"{path}: is not a readable {kind} file ({type(e).__name__}: {e})") from None

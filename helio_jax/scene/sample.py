@@ -182,19 +182,24 @@ Sample = Annotated[Single | SeveralSamples, Field(discriminator="kind")]
 """Any sample; `kind` tells which."""
 
 
-def check_body(body: Body) -> dict[str, Any]:
+def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
     An open sheet is fine: a flat with structure is open along its outer border. `is_watertight` is asked of closed
     meshes; `n_inner_open_edges` counts open edges away from the bounding box's sides, where rays would leak.
+
+    Args:
+        body: where it stands.
+        untilted: of a tilted sample: the same before it was turned, whose bounding box has the border on its sides.
     """
     import trimesh
 
     mesh = trimesh.Trimesh(body.vertices, body.faces, process=False)
     edges = np.sort(mesh.edges, axis=1)
     unique, n_uses = np.unique(edges, axis=0, return_counts=True)
-    open_edges = body.vertices[unique[n_uses == 1]]
-    low, high = body.triangles.reshape(-1, 3).min(0), body.triangles.reshape(-1, 3).max(0)
+    upright = body if untilted is None else untilted
+    open_edges = upright.vertices[unique[n_uses == 1]]
+    low, high = upright.triangles.reshape(-1, 3).min(0), upright.triangles.reshape(-1, 3).max(0)
     near = 1e-6 * float(np.ptp([low, high], axis=0).max())
     on_side = np.zeros(len(open_edges), bool)
     for axis in (0, 1):

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
+from helio_jax.errors import InputFileError
 from helio_jax.instrument import Beam
 from helio_jax.scene.files import read_positions
 from helio_jax.settings import Settings
@@ -197,7 +198,10 @@ class PositionList(Scan):
             return np.array(self.points_um)
         path = (base_dir / self.file).resolve()
         if self._found is None or self._found[0] != path:
-            self._found = path, read_positions(base_dir / self.file)
+            try:
+                self._found = path, read_positions(base_dir / self.file)
+            except InputFileError as e:
+                raise InputFileError(f"scan.file = {self.file!r}: {e}") from None
         return self._found[1]
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:

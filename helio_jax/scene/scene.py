@@ -31,7 +31,7 @@ class Scene(Instrument):
     """An instrument with a sample and a scan: `[beam] [plate] [[detector]] [sample] [material.NAME] [scan]`."""
 
     name: str = Field(default="scene", min_length=1, max_length=200)
-    """Short name, shown in figures and files."""
+    """Short name, shown in figures and files; default: of a scene file, its name without .toml."""
     description: str = Field(default="", max_length=10_000)
     """What the scene is and where its numbers come from."""
     sample: Sample

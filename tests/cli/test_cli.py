@@ -98,7 +98,7 @@ def test_wrong_scene_lists_all_errors(tmp_path, small_scene):
 
 def test_validate_schema_doctor_cite():
     """The small commands work on a fresh installation."""
-    for name in ("sphere_a", "sphere_b", "step", "trench", "pyramid", "measured_sphere_a"):
+    for name in ("sphere_a", "sphere_b", "step", "trench", "pyramid", "measured_sphere_a", "measured_salt"):
         done = helio("validate", ROOT / "scenes" / f"{name}.toml")
         assert done.returncode == 0, done.stderr
     assert "properties" in json.loads(helio("schema").stdout)

@@ -25,6 +25,18 @@ def stacks():
     return {e: simulate(scene, estimator=e, rays=2000 if e == "analog" else 64) for e in ("expected", "analog")}
 
 
+def test_says_what_is_left_out(tmp_path, stacks):
+    """Plate bounces, effusive counts and single orders have no place in that layout, which is told, not dropped.
+
+    Catches an export that is silent about it, and one that tells it of stacks which have none.
+    """
+    stack = stacks["expected"]
+    more = stack.replace(effuse=0.1 * stack.counts, plate=0.2 * stack.counts)
+    told = export(more, tmp_path / "a.mat")
+    assert [t.split(",")[0].split(" ")[0] for t in told] == ["effuse", "plate", "orders"] and "10.0%" in told[0]
+    assert len(export(stack, tmp_path / "b.mat")) == 1
+
+
 @pytest.mark.parametrize("estimator", ["expected", "analog"])
 def test_round_trip(tmp_path, stacks, bshem, estimator):
     """Written and imported again: every count to the bit, raster and instrument as they were.

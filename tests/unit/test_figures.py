@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sphere_case import CAP, TAN, make_case
 
-from helio_jax.errors import InputFileError
+from helio_jax.errors import SceneError
 from helio_jax.evaluate import figures
 from helio_jax.evaluate.metrics import evaluate_height
 from helio_jax.reconstruction import REASONS
@@ -154,7 +154,7 @@ def test_figures_are_written_by_suffix(case, tmp_path):
     fig = figures.micrograph_panel(stack)
     figures.save_figure(fig, tmp_path / "m.png", dpi=30)
     assert (tmp_path / "m.png").read_bytes().startswith(PNG)
-    with pytest.raises(InputFileError, match="suffix must be one of png, pdf, svg"):
+    with pytest.raises(SceneError, match="suffix must be one of png, pdf, svg"):
         figures.save_figure(fig, tmp_path / "m.exe")
     assert [p.name for p in tmp_path.iterdir()] == ["m.png"]
 

@@ -1,0 +1,165 @@
+"""Ripples against closed forms: known waves in noise, on tilted planes, in micrographs; noise alone; scan lines."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from stats import assert_likely
+from test_measure import PITCH, make_rec
+
+from helio_jax.errors import GuardError, SceneError
+from helio_jax.evaluate.measure import Wanted, measure_height_map
+from helio_jax.evaluate.regions import inside_polygon, parse_region
+from helio_jax.evaluate.ripple import (
+    compare_with_images,
+    height_ripple,
+    image_ripple,
+)
+from helio_jax.evaluate.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
+from helio_jax.instrument import Detector, Instrument, Plate
+from helio_jax.micrograph import MicrographStack
+
+AXIS = (np.arange(60) - 29.5) * PITCH
+TRIANGLE = inside_polygon(parse_region("-450,-450 430,-450 -450,430"), AXIS, AXIS)
+WAVELENGTH, ANGLE = 95.0, math.radians(-38.0)
+KX, KY = math.cos(ANGLE) / WAVELENGTH, math.sin(ANGLE) / WAVELENGTH
+
+
+def wave(x, y, phase=0.4):
+    return np.cos(2 * np.pi * (KX * x + KY * y) + phase)
+
+
+def make_stack(response=(0.0, 0.0, 0.0), noise=0.01, seed=1) -> MicrographStack:
+    """Three micrographs of signal 1 with a wave of the given factors; apertures at 0 and +-120 deg, 30 deg out."""
+    detectors = tuple(
+        Detector(name=n, center_um=(1732.0 * math.cos(a), 1732.0 * math.sin(a)), axes_um=(1000.0, 1000.0))
+        for n, a in (("forward", 0.0), ("left", 2 * math.pi / 3), ("right", -2 * math.pi / 3))
+    )
+    instrument = Instrument(plate=Plate(working_distance_um=3000.0), detector=detectors)
+    one = wave(*np.meshgrid(AXIS, AXIS))
+    image = 1.0 + np.array(response)[:, None, None] * one
+    image = image + noise * np.random.default_rng(seed).standard_normal(image.shape)
+    return MicrographStack(image, AXIS, AXIS, instrument, n_rays=1.0)
+
+
+def surface_response(slope: float) -> tuple[float, ...]:
+    """Factors of a wave of the surface: -slope u.d / d_z; d_xy / d_z is 1732 / 3000."""
+    return tuple(-slope * 1732.0 / 3000.0 * math.cos(ANGLE - a) for a in (0.0, 2 * math.pi / 3, -2 * math.pi / 3))
+
+
+def test_wavelength_amplitude_and_errors():
+    """A wave of 0.3 um in heights with white noise: 48 noises; squares of the pulls are chi-square.
+
+    Half of crest to trough, corrected for the central difference (0.75 of the slope at 4.75 pixels). Catches that
+    correction left out (6 deviations of each), crest to trough for amplitude, and errors wrong by a factor of 2.
+    """
+    pulls = []
+    for seed in range(48):
+        rec = make_rec(lambda x, y: 0.3 * wave(x, y) + 0.02 * x, n=(60, 60))
+        rec = rec.replace(height=rec.height + 0.15 * np.random.default_rng(seed).standard_normal(rec.height.shape))
+        found, _, _ = height_ripple(rec, [TRIANGLE])
+        assert found.peak_over_floor > 5.0 and found.false_alarm < 0.05
+        pulls.append(
+            [
+                (found.wavelength_um - WAVELENGTH) / found.wavelength_std_um,
+                (found.direction_deg - math.degrees(ANGLE)) / found.direction_std_deg,
+                (found.amplitude - 0.3) / found.amplitude_std,
+            ]
+        )
+    for name, z in zip(("wavelength", "direction", "amplitude"), np.array(pulls).T, strict=True):
+        tail = stats.chi2(48).sf(np.sum(z**2))
+        assert_likely(2 * min(tail, 1 - tail), f"pulls of the {name}: {np.sqrt(np.mean(z**2)):.2f} instead of 1")
+
+
+def test_noise_alone():
+    """White noise in an image, and in slopes of unequal noise: 60 each; a false alarm below 0.1 in few more than 6.
+
+    Fewer is allowed (the stated probability is an upper limit), but not none of 0.9. Catches a single point's
+    probability given for that of the whole range (0.1 is then passed in nearly all), and a floor too low by 1.5.
+    """
+    blocks, settings = make_blocks([TRIANGLE], RippleSettings().block_px), RippleSettings()
+    rng = np.random.default_rng(3)
+    for mix in (np.eye(1), np.array([[1.0, 0.5], [0.0, 0.6]])):
+        alarms = []
+        for _ in range(60):
+            noise = np.tensordot(mix, rng.standard_normal((len(mix), 60, 60)), 1)
+            fields = [without_trend(field, blocks, settings.degree) for field in noise]
+            spectrum = take_spectrum(fields, blocks, (PITCH, PITCH), settings)
+            alarms.append(spectrum.false_alarm(float(spectrum.ratio[spectrum.is_searched].max())))
+        assert_likely(float(stats.binom.sf(np.sum(np.array(alarms) < 0.1) - 1, 60, 0.1)), f"{sorted(alarms)[:8]}")
+        assert np.min(alarms) < 0.9
+
+
+def test_scan_lines_are_no_ripple():
+    """Offsets of whole rows, ten times the noise: passed over about the axes; with `along_axes` they are the peak.
+
+    Catches line noise taken for a ripple, and an exclusion that takes real ones along (asked for, they are found).
+    """
+    stack = make_stack(noise=0.01)
+    lines = stack.replace(counts=stack.counts + 0.1 * np.random.default_rng(9).standard_normal((3, 60, 1)))
+    assert image_ripple(lines, 0, [TRIANGLE]).false_alarm > 1e-3
+    along = image_ripple(lines, 0, [TRIANGLE], RippleSettings(along_axes=True))
+    assert along.false_alarm < 1e-3 and along.axis_angle_deg < 10.0 and abs(along.direction_deg) > 80.0
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_wave_on_a_tilted_plane_at_oblique_incidence(slope):
+    """z = slope x + 0.3 cos(k.x) at 30 deg: wavelength and amplitude of the sample, not of the raster.
+
+    Without noise, to 1 %. Catches the raster's wavelength (19 % too long along x on this slope), and the height along a
+    ray taken for that at a place.
+    """
+    rec = make_rec(lambda x, y: slope * x + 0.3 * wave(x, y), n=(60, 60), incidence=30.0)
+    inside = inside_polygon(parse_region("-320,-320 320,320"), AXIS, AXIS)
+    found, _, _ = height_ripple(rec, [inside])
+    assert found.wavelength_um == pytest.approx(WAVELENGTH, rel=0.01)
+    assert found.direction_deg == pytest.approx(math.degrees(ANGLE), abs=0.5)
+    assert found.amplitude == pytest.approx(0.3, rel=0.03)
+
+
+def test_micrographs_tell_a_wave_of_the_surface_from_others():
+    """In all three by the law of the flat: agrees, with its height; in one alone: disagrees; in none: not shown.
+
+    The wave that the heights have is the same in all cases. Catches a response without its sign, for
+    amplitudes alone do not tell an albedo (equal factors in all three) from a slope.
+    """
+    found, _, _ = height_ripple(make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01), [TRIANGLE])
+    slope = 0.3 * 2 * math.pi / WAVELENGTH
+    agrees = compare_with_images(make_stack(surface_response(slope)), found, [TRIANGLE])
+    assert "agree with" in agrees.verdict and agrees.misfit > 1e-3
+    assert agrees.amplitude_um == pytest.approx(0.3, rel=0.1)
+    for response in ((0.0, 0.02, 0.0), (0.02, 0.02, 0.02), tuple(map(abs, surface_response(slope)))):
+        assert compare_with_images(make_stack(response), found, [TRIANGLE]).verdict.startswith("NOT")
+    assert "do not show" in compare_with_images(make_stack(), found, [TRIANGLE]).verdict
+    with pytest.raises(SceneError, match="helio calibrate"):
+        compare_with_images(make_stack().replace(n_rays=None), found, [TRIANGLE])
+
+
+def test_regions():
+    """A triangle of 880 um legs has 22 x 44 pixels, two corners are a rectangle; other texts, empty ones are told."""
+    assert TRIANGLE.sum() == pytest.approx(44 * 44 / 2, abs=30) and TRIANGLE[10, 10] and not TRIANGLE[40, 40]
+    assert inside_polygon(parse_region("-100,0 100,50"), AXIS, AXIS).sum() == pytest.approx(10 * 2.5, abs=6)
+    for text in ("1,2", "1 2 3", "a,b c,d", "1,2 3,4,5", "nan,0 1,1"):
+        with pytest.raises(SceneError, match="region is"):
+            parse_region(text)
+    with pytest.raises(SceneError, match="holds no pixel"):
+        inside_polygon(parse_region("9000,0 9100,10"), AXIS, AXIS)
+    with pytest.raises(GuardError, match="64 or more known pixels"):
+        make_blocks([inside_polygon(parse_region("0,0 100,100"), AXIS, AXIS)], 40)
+
+
+def test_measure_answers_about_ripples(tmp_path):
+    """The command's record is JSON, its lines have the numbers, the picture is drawn; options out of place are told."""
+    rec = make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01)
+    wanted = Wanted(ripple=True, regions=("-450,-450 430,-450 -450,430",))
+    stack = make_stack(surface_response(0.02))
+    found, lines = measure_height_map(rec, wanted, tmp_path / "r.png", stack)
+    record = json.loads(json.dumps(found))["ripple"]
+    assert record["wavelength_um"] == pytest.approx(WAVELENGTH, rel=0.02) and record["peak_over_floor"] > 5
+    assert "agree" in record["micrographs"]["verdict"] and any("95." in line for line in lines)
+    assert (tmp_path / "r.png").stat().st_size > 10_000
+    for wrong, words in ((Wanted(facets=True, regions=("0,0 9,9",)), "--region"), (Wanted(roughness=True), "--stack")):
+        with pytest.raises(SceneError, match=words):
+            measure_height_map(rec, wrong, None, stack)
