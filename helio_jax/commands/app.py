@@ -61,6 +61,12 @@ H5File = Annotated[
 HtmlFile = Annotated[
     Path, typer.Option("--output", "-o", help="File to write (.html).", callback=_written_as("HTML", ".html", ".htm"))
 ]
+ObjFile = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", help="File to write (.obj).", callback=_written_as("OBJ, which names parts", ".obj")
+    ),
+]
 FIGURE = _written_as("a figure", ".png", ".pdf", ".svg")
 """Callback of options that name a picture to write."""
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]

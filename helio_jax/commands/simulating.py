@@ -16,7 +16,7 @@ from helio_jax.commands.app import (
     Bar,
     H5File,
     Method,
-    OutFile,
+    ObjFile,
     Processes,
     Rays,
     Restart,
@@ -191,7 +191,7 @@ def spot(
 @app.command()
 def plate(
     instrument: Annotated[Path, typer.Argument(help="Instrument or scene file with apertures.", metavar="SCENE.toml")],
-    output: OutFile,
+    output: ObjFile,
     thickness_um: Annotated[float, typer.Option(help="Thickness of the plate [um].")],
     radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: room for all).")] = None,
     channel_deg: Annotated[
@@ -200,12 +200,9 @@ def plate(
 ) -> None:
     """Make the watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
     from helio_jax.config import load_instrument
-    from helio_jax.errors import SceneError
     from helio_jax.formats.safe import atomic_path
     from helio_jax.scene.drill import drill_plate
 
-    if output.suffix.lower() != ".obj":
-        raise SceneError(f"{output}: plates are written as OBJ, which names their parts: give it the suffix .obj")
     angle = None if channel_deg is None else math.radians(channel_deg)
     found = drill_plate(load_instrument(instrument), thickness_um, radius_um, angle)
     with atomic_path(output) as part:
