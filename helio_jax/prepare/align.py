@@ -42,11 +42,11 @@ class AlignSettings(Settings):
     """Automatic: by how much of its height that correlation must stand above the next peak, 5 or more pixels away."""
     max_std_px: float = Field(default=0.5, gt=0.0, le=10.0)
     """Automatic: largest standard deviation of a pixel's place [pixels]."""
-    min_restoring: float = Field(default=0.05, ge=0.0, lt=1.0)
+    min_restoring: float = Field(default=0.08, ge=0.0, lt=1.0)
     """Automatic: least share of a common displacement of all fields that one fit of each takes back.
 
     The model's own error per view, some hundredths of a pixel, over this is the scans' joint error. Traced crystals,
-    pyramids and rough surfaces have 0.2 to 0.6, balls and soft hills, whose errors are 1 to 4 pixels, 0.03 or less."""
+    pyramids, rough surfaces have 0.2 to 0.65, balls and soft hills, whose errors are 1 to 5 pixels, 0.06 or less."""
     max_left_out_px: float = Field(default=3.0, gt=0.0, le=100.0)
     """Control points: largest root mean square of the leave-one-out errors [pixels]."""
 

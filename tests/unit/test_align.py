@@ -217,7 +217,7 @@ def test_aligned_stack_has_turned_apertures(found):
 
 
 def test_a_soft_hill_does_not_fix_a_common_displacement():
-    """Displaced along the detectors, a hill looks like another albedo: at the true motions next to none returns.
+    """Displaced along the detectors, a hill looks like another albedo: at the true motions little returns.
 
     The crystal brings back more. Catches a restoring taken in the common frame's axes (there displacements of turned
     scans are no common one, and the hill seems fixed), and one of the best direction instead of the worst.
@@ -229,7 +229,7 @@ def test_a_soft_hill_does_not_fix_a_common_displacement():
         aligner.motions = list(true)
         shares.append(aligner.restoring())
         assert aligner.motions == true
-    assert shares[0] < AlignSettings().min_restoring < 2 * AlignSettings().min_restoring < shares[1], shares
+    assert shares[0] < AlignSettings().min_restoring < 1.5 * AlignSettings().min_restoring < shares[1], shares
 
 
 def test_stage_errors_are_not_blamed_on_one_scan():
