@@ -35,13 +35,18 @@ class AlignSettings(Settings):
     max_shift_um: float | None = Field(default=None, gt=0.0, le=1e7)
     """Automatic: largest shift of the field's centre [um]; default: a quarter of the first scan's shorter side."""
     max_rotation_deg: float = Field(default=3.0, gt=0.0, le=20.0)
-    """Automatic: largest error of the stage's rotation [deg]."""
+    """Automatic: largest error of the stage's rotation [deg]; two scans may differ by twice as much."""
     min_correlation: float = Field(default=0.2, gt=0.0, lt=1.0)
     """Automatic: least correlation of a scan's fine structure with what the others predict."""
     min_margin: float = Field(default=0.15, ge=0.0, lt=1.0)
     """Automatic: by how much of its height that correlation must stand above the next peak, 5 or more pixels away."""
     max_std_px: float = Field(default=0.5, gt=0.0, le=10.0)
     """Automatic: largest standard deviation of a pixel's place [pixels]."""
+    min_restoring: float = Field(default=0.08, ge=0.0, lt=1.0)
+    """Automatic: least share of a common displacement of all fields that one fit of each takes back.
+
+    The model's own error per view, some hundredths of a pixel, over this is the scans' joint error. Traced crystals,
+    pyramids, rough surfaces have 0.2 to 0.65, balls and soft hills, whose errors are 1 to 5 pixels, 0.06 or less."""
     max_left_out_px: float = Field(default=3.0, gt=0.0, le=100.0)
     """Control points: largest root mean square of the leave-one-out errors [pixels]."""
 
@@ -55,6 +60,7 @@ class Alignment:
         motions: from the common frame, which is the first scan's, to each scan.
         std_um: standard deviation of a pixel's place per axis, for each scan [um].
         matches: automatic: of each scan.
+        restoring: automatic: share of a common displacement of all fields that is taken back (`Aligner.restoring`).
         points: control points: their fit.
         problems: why the result should not be trusted; empty when it may be.
     """
@@ -63,6 +69,7 @@ class Alignment:
     motions: tuple[Rigid, ...]
     std_um: tuple[float, ...]
     matches: tuple[Match, ...] | None = None
+    restoring: float | None = None
     points: PointFit | None = None
     problems: tuple[str, ...] = ()
 
@@ -80,6 +87,8 @@ class Alignment:
             ],
             "problems": list(self.problems),
         }
+        if self.restoring is not None:
+            out["restoring"] = self.restoring if math.isfinite(self.restoring) else None
         if self.matches is not None:
             for scan, match in zip(out["scans"], self.matches, strict=True):
                 scan["match"] = {k: v if math.isfinite(v) else None for k, v in asdict(match).items()}
@@ -175,9 +184,16 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
     )
     aligner.run()
     matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
+    restoring = aligner.restoring()
     problems = []
+    if not restoring >= settings.min_restoring:
+        problems.append(
+            "the scans together: share of a common displacement of their fields that the fit takes back must be >= "
+            f"{settings.min_restoring:g}, got {restoring:.3f} (smooth round relief does not fix it)"
+        )
+    errors = _stage_errors([m.rotation for m in aligner.motions], rotations)
     for k, (stack, match, motion) in enumerate(zip(scans.stacks, matches, aligner.motions, strict=True)):
-        turned = math.degrees(abs(math.remainder(motion.rotation - rotations[k], math.tau)))
+        turned = math.degrees(abs(errors[k]))
         moved = math.dist(motion.apply(aligner.frame.center), aligner.views[k].center)
         checks = (
             (match.correlation < settings.min_correlation, "correlation with the prediction from the other scans",
@@ -187,7 +203,7 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
             (match.offset > 1.5, "distance of that peak from the fit", f"{match.offset:.1f} px", "<= 1.5 px"),
             (not match.std_um <= settings.max_std_px * aligner.frame.step, "standard deviation of its place",
              f"{match.std_um / aligner.frame.step:.2f} px", f"<= {settings.max_std_px:g} px"),
-            (turned > settings.max_rotation_deg, "turn away from the stage's rotation",
+            (turned > settings.max_rotation_deg, "error of the stage's rotation",
              f"{turned:.2f} deg", f"<= {settings.max_rotation_deg:g} deg"),
             (moved > reach, "shift of its centre", f"{moved:.0f} um", f"<= {reach:g} um"),
         )  # fmt: skip
@@ -196,7 +212,19 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
         ]
     stds = (0.0, *(m.std_um for m in matches[1:]))
     names = tuple(s.name for s in scans.stacks)
-    return Alignment(names, tuple(aligner.motions), stds, matches=matches, problems=tuple(problems))
+    return Alignment(
+        names, tuple(aligner.motions), stds, matches=matches, restoring=restoring, problems=tuple(problems)
+    )
+
+
+def _stage_errors(found: list[float], nominal: list[float]) -> np.ndarray:
+    """Return the errors of the stage's rotations [rad], the least ones that explain what was found.
+
+    Only differences between scans are seen: the first scan's stage may be as wrong as any other's, so what all have in
+    common is chosen such that the largest error is smallest.
+    """
+    apart = np.array([math.remainder(a - b, math.tau) for a, b in zip(found, nominal, strict=True)])
+    return apart - 0.5 * (apart.max() + apart.min())
 
 
 def _from_points(scans: MicrographSet, picks: Picks, settings: AlignSettings, source: str) -> Alignment:

@@ -27,6 +27,7 @@ _LEVELS_PX = (3.0, 1.5, 1.0)
 _SWEEPS, _SEARCHES = 12, 2
 _STEADY_PX = 0.01
 _RIVAL_PX = 5.0
+_SMALL_PX = 0.3
 _BLOCK_PX = 10
 _LEAST_COMMON = 0.3
 _LEAST_PIXELS = 100
@@ -224,6 +225,27 @@ class Aligner:
         limit = 2.0 * level_px * self.frame.step  # beyond it the picture is not linear in the step
         size = math.sqrt(self._field_rms(np.outer(step, step)) ** 2 + 1e-30)
         return step * min(1.0, limit / size), inverse @ spread @ inverse
+
+    def restoring(self) -> float:
+        """Return which share of a common displacement of all fields one fit of every view takes back, 0 to 1.
+
+        Every scan's field is displaced alike, along its own axes; the worst direction counts. While what is
+        displaced looks like another albedo, as on balls and soft hills, next to nothing comes back: then errors of
+        the model of a few hundredths of a pixel per view become whole pixels, each view's own deviation not telling.
+        """
+        found = list(self.motions)
+        turns = [Rigid(m.rotation, (0.0, 0.0)).matrix for m in found]
+
+        def own_steps(moved: np.ndarray) -> np.ndarray:
+            self.motions = [Rigid(0.0, (float(moved[0]), float(moved[1]))).after(m) for m in found]
+            steps = [self._step(k, _LEVELS_PX[-1])[0][:2] for k in range(len(found))]
+            return np.mean([turn @ step for turn, step in zip(turns, steps, strict=True)], axis=0)
+
+        at_rest = own_steps(np.zeros(2))
+        size = _SMALL_PX * self.frame.step  # larger ones make edges outliers, which then hold nothing
+        back = np.stack([(at_rest - own_steps(v)) / size for v in np.eye(2) * size], -1)
+        self.motions = found
+        return float(np.min(np.linalg.eigvals(back).real))
 
     def _field_rms(self, second_moment: np.ndarray) -> float:
         """Return the root mean square displacement over the first field of steps with this second moment [um]."""
