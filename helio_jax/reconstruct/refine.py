@@ -185,17 +185,18 @@ def fit_heights(
         changes: list[float] = []
         is_interrupted = False
         said = "start"
+        n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
         for number in range(s.max_rounds):
             before = refiner.surface
             try:
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
-                if number == s.fixed_rounds:
+                if number == n_fixed:
                     refiner.tear()
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
-                    found = refiner.step(limit, cut, number >= s.fixed_rounds)
+                    found = refiner.step(limit, cut, number >= n_fixed)
             except KeyboardInterrupt:
                 if not changes:
                     raise

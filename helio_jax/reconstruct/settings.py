@@ -43,7 +43,8 @@ class RefineSettings(Settings):
     jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)
     """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
     fixed_rounds: int = Field(default=1, ge=0, le=50)
-    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude."""
+    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude; none where drift
+    or geometry are unknown, for heights fitted to a wrong geometry close the surface behind rims for good."""
     reweightings: int = Field(default=2, ge=1, le=100)
     """Re-weightings in every later round, with the last limits."""
     photometric_rounds: int = Field(default=4, ge=1, le=20)
