@@ -45,7 +45,7 @@ class CalibrateSettings(Settings):
     """Prior deviation of what drift is left, relative to the flat's signal, handed on to the fit."""
 
     fit_rounds: int = Field(default=6, ge=1, le=50)
-    """Rounds of the fit, handed on to it: with an unknown instrument heights settle more slowly than with a known one."""
+    """Rounds of the fit, handed on to it: with an unknown instrument heights settle more slowly."""
 
 
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:

@@ -19,6 +19,9 @@ from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 
+GEOMETRY = "distance", "tilt", "aim"
+"""Unknowns that tell of a model that lacks something where they come out farther off than stated: error bars widen."""
+
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
 
@@ -119,7 +122,7 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
-    return found.on_raster(refiner.signal.shape[1:], stride)
+    return found.widened(refiner.values, GEOMETRY).on_raster(refiner.signal.shape[1:], stride)
 
 
 def misfit_on(
