@@ -30,8 +30,8 @@ SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 
 GEOMETRY_DOUBT = (
-    "the geometry was fitted, too: heights hold for the cosine law, and 0.3 of roughness in a rough-diffuse one lowers "
-    "them by 8 per cent (benchmarks/calibration.py); compare with nearfield"
+    "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
+    "their stated deviations; compare with nearfield"
 )
 """What the status says of a fit whose aims or distance are unknown."""
 
