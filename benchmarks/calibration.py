@@ -1,6 +1,6 @@
 """How well heights survive an instrument that is not what it says: simulated scans with a real instrument's faults.
 
-python benchmarks/calibration.py [--output benchmarks/out] [--size N] [--cases sphere,two_spheres,pyramid] [--tiny]
+python benchmarks/calibration.py [--output benchmarks/out] [--size N] [--cases sphere_a,sphere_b,...] [--tiny]
 
 Each scan: background 65 % of the reading, gains that differ by more than 2, drift along the lines and in time, offsets
 of scan lines, Poisson noise; apertures aimed up to one prior deviation elsewhere than stated. The stack that is
@@ -65,7 +65,7 @@ def recorded(scene: SceneFile, seed: int) -> tuple[MicrographStack, np.ndarray]:
 
 def study(case: str, size: int, seed: int, settings: dict) -> rows.Row:
     """Fit one faulty scan and score it."""
-    field = {"sphere_a": 3630.0}.get(case)
+    field = {"sphere_a": 3630.0, "sphere_b": 3630.0}.get(case)
     scene = load_scene(ROOT / "scenes" / f"{case}.toml")
     pixel = (field or scene.scan.nx * scene.scan.pixel_size_um) / size
     scene = load_scene(
@@ -91,7 +91,7 @@ def main() -> None:
     """Run the cases and write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
-    parser.add_argument("--cases", default="sphere_a,two_spheres,pyramid")
+    parser.add_argument("--cases", default="sphere_a,sphere_b,two_spheres,pyramid")
     parser.add_argument("--size", type=int, default=81)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--tiny", action="store_true")

@@ -126,6 +126,10 @@ def _print_instrument(found: dict[str, Any]) -> None:
     for name, (value, std, prior, unit) in found.get("values", {}).items():
         if unit in ("um", "deg"):
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
+    if found.get("widening", 1.0) > 1.0:
+        print(
+            f"  geometry and instrument file disagree: all error bars are {found['widening']:.1f} times as wide for it"
+        )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())
         print(f"  weakly determined, {weak['left']:.0%} of the prior is left: {terms}")

@@ -44,6 +44,9 @@ class CalibrateSettings(Settings):
     drift_std: float = Field(default=0.2, gt=0.0, le=1.0)
     """Prior deviation of what drift is left, relative to the flat's signal, handed on to the fit."""
 
+    fit_rounds: int = Field(default=6, ge=1, le=50)
+    """Rounds of the fit, handed on to it: with an unknown instrument heights settle more slowly."""
+
 
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
     """Return the drift of an image whose rows are scanned one after another, mean zero [y, x].
@@ -120,7 +123,7 @@ def calibrate_on_border(
     of_lines = line_noise(stack, steady, frame)
     lines = float(np.sqrt(np.mean((of_lines / (flat - background)) ** 2)))
     record["line_noise"] = of_lines.tolist()
-    priors = {"gain_std": settings.gain_std, "offset_std": settings.offset_std}
+    priors = {"gain_std": settings.gain_std, "offset_std": settings.offset_std, "max_rounds": settings.fit_rounds}
     priors |= {"drift_std": settings.drift_std} if settings.drift else {}
     priors |= {"line_std": lines} if settings.lines and lines > 0 else {}
     record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": flat.tolist(), "priors": priors}

@@ -28,6 +28,7 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
         "offset": (settings.offset_std, "of the signal"),
         "log_multiple": (settings.multiple_error, "relative"),
         "drift": (settings.drift_std, "of the signal"),
+        "law": (settings.law_std, "of the exponent"),
         "distance": (sure.sample_distance_um, "um"),
         "tilt": (sure.tilt_deg, "deg"),
         "polar": (sure.polar_deg, "deg"),
@@ -46,7 +47,7 @@ def _plain(name: str, detectors: tuple[str, ...]) -> str:
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = _kind(name)
-    if kind in ("distance", "unseen"):
+    if kind in ("distance", "unseen", "law"):
         return kind
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"
@@ -62,6 +63,7 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
     `values`: name -> (value, standard deviation, prior deviation, unit), gain, offset, drift and angles as changes from
     what the stack and the instrument say. `weak`: the combinations of which the data leave more than `WEAK` of their
     prior deviation: `left` is that share, `of` the largest terms of the (unit) combination, in prior deviations.
+    `widening`: factor by which all deviations are enlarged, for the geometry disagrees with what the file says.
     """
     posterior = fit.posterior
     if posterior is None:
@@ -85,4 +87,4 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         terms = np.argsort(-np.abs(vector[:, i]))[:_TERMS]
         of = {_plain(posterior.names[told[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
         weak.append({"left": float(np.sqrt(size[i])), "of": of})
-    return {"values": values, "weak": weak}
+    return {"values": values, "weak": weak, "widening": posterior.widening}

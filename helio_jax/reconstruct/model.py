@@ -138,12 +138,25 @@ class Lagged(NamedTuple):
     multiple_std: Any
     drift_std: Any
     lines_std: Any
+    law_std: Any
     distance_std: Any
     tilt_std: Any
     aim_std: Any
 
 
-INSTRUMENT = "log_gain", "offset", "log_multiple", "unseen", "albedo", "drift", "lines", "distance", "tilt", "aim"
+INSTRUMENT = (
+    "log_gain",
+    "offset",
+    "log_multiple",
+    "unseen",
+    "albedo",
+    "drift",
+    "lines",
+    "law",
+    "distance",
+    "tilt",
+    "aim",
+)
 """Names of the unknowns that are not the surface, as the last fields of `Unknowns`."""
 
 
@@ -165,6 +178,7 @@ class Unknowns(NamedTuple):
     albedo: Any
     drift: Any
     lines: Any
+    law: Any
     distance: Any
     tilt: Any
     aim: Any
@@ -224,7 +238,8 @@ class Model(eqx.Module):
         moves = self.moves(unknowns, lagged)
         if moves is not None:
             hidden = hidden + jnp.einsum("mk,mkiyx->kiyx", moves - lagged.predicted_moves, lagged.hidden_moves)
-        single = self.single(surface, self.normal(surface), hidden, moves)
+        power = jnp.sum(lagged.law_std * unknowns.law) if unknowns.law.size else None
+        single = self.single(surface, self.normal(surface), hidden, moves, power)
         albedo = smooth_albedo(unknowns.albedo, surface.height.shape, self.albedo_std)
         gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
         multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
@@ -250,11 +265,17 @@ class Model(eqx.Module):
         aim = (lagged.aim_std * unknowns.aim).T if unknowns.aim.size else jnp.zeros((2, k))
         return jnp.concatenate([distance, aim])
 
-    def single(self, surface: Surface, normal: jax.Array, hidden: jax.Array, moves: jax.Array | None) -> jax.Array:
+    def single(
+        self,
+        surface: Surface,
+        normal: jax.Array,
+        hidden: jax.Array,
+        moves: jax.Array | None,
+        power: jax.Array | None = None,
+    ) -> jax.Array:
         """Return the single-scattering probabilities [detector, y, x]; the geometry as stated, or moved."""
-        if moves is None:
-            return render_single(surface.height, normal, hidden, self.geometry)
-        return render_single(surface.height - moves[0, 0], normal, hidden, self.geometry, moves[1:].T)
+        lower, aim = (0.0, None) if moves is None else (moves[0, 0], moves[1:].T)
+        return render_single(surface.height - lower, normal, hidden, self.geometry, aim, power)
 
     def noise_change(
         self,

@@ -19,6 +19,9 @@ from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 
+GEOMETRY = "distance", "tilt", "aim"
+"""Unknowns that tell of a model that lacks something where they come out farther off than stated: error bars widen."""
+
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
 
@@ -119,7 +122,7 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
-    return found.on_raster(refiner.signal.shape[1:], stride)
+    return found.widened(refiner.values, GEOMETRY).on_raster(refiner.signal.shape[1:], stride)
 
 
 def misfit_on(
@@ -185,17 +188,18 @@ def fit_heights(
         changes: list[float] = []
         is_interrupted = False
         said = "start"
+        n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
         for number in range(s.max_rounds):
             before = refiner.surface
             try:
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
-                if number == s.fixed_rounds:
+                if number == n_fixed:
                     refiner.tear()
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
                 for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
-                    found = refiner.step(limit, cut, number >= s.fixed_rounds)
+                    found = refiner.step(limit, cut, number >= n_fixed)
             except KeyboardInterrupt:
                 if not changes:
                     raise

@@ -13,6 +13,9 @@ from helio_jax.reconstruct.aiming import aimed_form_factor
 from helio_jax.reconstruct.beamframe import normal_of_slopes
 from helio_jax.reconstruct.formfactor import SpotGeometry, form_factor_of_height
 
+LEAST_COS = 0.05
+"""Facets seen under a smaller cosine take the law's power of this one: it has no slope at the horizon."""
+
 
 def unit_normal(slope_x: jax.Array, slope_y: jax.Array, shift: tuple[float, float]) -> jax.Array:
     """Return the unit normals [3, y, x] of beam-frame slopes [y, x]."""
@@ -26,6 +29,7 @@ def render_single(
     hidden: jax.Array,
     geometry: SpotGeometry,
     aim: jax.Array | None = None,
+    power: jax.Array | None = None,
 ) -> jax.Array:
     """Return the single-scattering detection probability of every pixel [detector, y, x].
 
@@ -35,6 +39,12 @@ def render_single(
         hidden: hidden part of the form factor [detector, 3, y, x].
         geometry: where a point of a given height is, static.
         aim: changes of the apertures' polar angles and azimuths [detector, 2], rad, or None.
+        power: m of a law cos^(1 + m), not normalised, instead of the cosine law; the cosine is that of the angle
+            between the normal and the aperture's mean direction. None: 0.
     """
     at = form_factor_of_height(geometry, height) if aim is None else aimed_form_factor(geometry, height, aim)
-    return jnp.einsum("kiyx,iyx->kyx", at - hidden, normal)
+    single = jnp.einsum("kiyx,iyx->kyx", at - hidden, normal)
+    if power is None:
+        return single
+    cos = jnp.einsum("kiyx,iyx->kyx", at, normal) / jnp.sqrt(jnp.sum(at**2, axis=1))
+    return single * jnp.maximum(cos, LEAST_COS) ** power

@@ -24,6 +24,8 @@ class RefineSettings(Settings):
     """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
     """Prior deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
+    law_std: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Prior deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
     geometry: bool = True
     """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
@@ -43,7 +45,8 @@ class RefineSettings(Settings):
     jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)
     """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
     fixed_rounds: int = Field(default=1, ge=0, le=50)
-    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude."""
+    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude; none where
+    drift or geometry are unknown: heights fitted to a wrong geometry close the surface behind rims for good."""
     reweightings: int = Field(default=2, ge=1, le=100)
     """Re-weightings in every later round, with the last limits."""
     photometric_rounds: int = Field(default=4, ge=1, le=20)

@@ -30,8 +30,8 @@ SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 
 GEOMETRY_DOUBT = (
-    "the geometry was fitted, too: heights behind a shadowed rim may come out low by more than their stated "
-    "deviations (benchmarks/calibration.py); compare with nearfield"
+    "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
+    "their stated deviations; compare with nearfield"
 )
 """What the status says of a fit whose aims or distance are unknown."""
 

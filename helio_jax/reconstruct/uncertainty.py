@@ -87,6 +87,7 @@ class Posterior:
         instrument_covariance: in prior deviations [parameter, parameter].
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
+        widening: factor by which all deviations were enlarged, for the instrument disagrees with what it says.
     """
 
     samples: np.ndarray
@@ -95,6 +96,7 @@ class Posterior:
     instrument_covariance: np.ndarray
     names: tuple[str, ...]
     stride: int = 1
+    widening: float = 1.0
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -105,6 +107,22 @@ class Posterior:
     def height_std(self) -> np.ndarray:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
+
+    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...]) -> "Posterior":
+        """Return it with all deviations times the `disagreement` of the fitted instrument `values` called `names`."""
+        of = [name for name in self.fields if name in names]
+        if not of:
+            return self
+        mine = np.array([name.partition("[")[0] in of for name in self.names])
+        flat = np.concatenate([np.ravel(values[name]) for name in of])
+        factor = disagreement(flat, self.instrument_covariance[np.ix_(mine, mine)])
+        return replace(
+            self,
+            samples=factor * self.samples,
+            instrument_samples=factor * self.instrument_samples,
+            instrument_covariance=factor**2 * self.instrument_covariance,
+            widening=factor,
+        )
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
@@ -294,6 +312,26 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
     surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
     return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
+
+
+def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:
+    """Return by what factor an instrument is farther from what was stated than prior and data explain; at least 1.
+
+    Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
+    about the stated one. The factor is the Birge ratio of the combinations of which the data tell more than the prior.
+
+    Args:
+        values: fitted, in prior deviations [parameter].
+        covariance: posterior, in prior deviations [parameter, parameter].
+
+    Source: Birge, Phys. Rev. 40 (1932) 207; as scale factor: Particle Data Group, Introduction, sec. 5.2.2.
+    """
+    left, ways = np.linalg.eigh(covariance)
+    is_told = left < 0.5
+    if not is_told.any():
+        return 1.0
+    square = (ways.T @ values)[is_told] ** 2 / (1.0 - left[is_told])
+    return float(max(1.0, np.sqrt(square.mean())))
 
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:

@@ -1,11 +1,17 @@
-"""Where edges are cut while the instrument is first fitted, and how what was found is named."""
+"""How the instrument is fitted: edges cut at first, freed from the first round on, error bars, names of findings."""
 
 import numpy as np
 import pytest
 
+from helio_jax.instrument import Uncertainty
+from helio_jax.reconstruct import refine
 from helio_jax.reconstruct.findings import _plain
-from helio_jax.reconstruct.model import Surface
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.model import Prediction, Surface
+from helio_jax.reconstruct.render import LEAST_COS, render_single
+from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.shadows import shadow_edges
+from helio_jax.reconstruct.uncertainty import disagreement
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
@@ -38,5 +44,64 @@ def test_parameters_have_plain_names():
         "drift[1, 3]": "drift left 3",
         "log_gain[0]": "log_gain forward",
         "unseen[]": "unseen",
+        "law[0]": "law",
     }
     assert {name: _plain(name, names) for name in shown} == shown
+
+
+@pytest.mark.parametrize("polar_deg, is_free", [(0.0, False), (3.0, True)])
+def test_unknown_geometry_is_free_from_the_first_round_on(bshem, monkeypatch, polar_deg, is_free):
+    """Catches heights fitted to a stated geometry that is wrong: they close rims, and no later round opens them again.
+
+    Where the geometry is known, the first round keeps gains and offsets, for its prediction is still crude.
+    """
+    said = []
+
+    class Enough(Exception):
+        pass
+
+    def step(self, limit, cut, is_instrument_free):
+        said.append((is_instrument_free, self.torn is not None))
+        raise Enough
+
+    monkeypatch.setattr(refine.Refiner, "step", step)
+    instrument = bshem.model_copy(update={"uncertainty": Uncertainty(polar_deg=polar_deg)})
+    flat, signal = np.zeros((12, 12)), np.ones((3, 12, 12))
+    predict = lambda *surface: Prediction(0.0 * signal, np.zeros((3, 3, 12, 12)))  # noqa: E731
+    start, settings = Surface(flat, flat, flat), ReconstructSettings()
+    with pytest.raises(Enough):
+        refine.fit_heights(signal, 1e-4 * signal, SpotGeometry(instrument), 30.0, 30.0, start, settings, predict)
+    assert said == [(is_free, is_free)]
+
+
+def test_disagreement_is_the_birge_ratio():
+    """Values drawn as right priors have it give 1; three times as far off gives 3; what data do not tell is left out.
+
+    200 combinations: the ratio of right ones has a standard deviation of 0.05; the limit is three of them.
+    Catches the posterior's share of the variance forgotten, and untold combinations counted, which lower the ratio.
+    """
+    rng = np.random.default_rng(4)
+    left = np.full(200, 0.4)
+    values = np.sqrt(1.0 - left) * rng.normal(size=left.size)
+    assert disagreement(values, np.diag(left)) == pytest.approx(1.0, abs=0.15)
+    assert disagreement(3.0 * values, np.diag(left)) == pytest.approx(3.0, rel=0.15)
+    with_untold = np.concatenate([3.0 * values, np.zeros(50)]), np.concatenate([left, np.full(50, 0.99)])
+    assert disagreement(with_untold[0], np.diag(with_untold[1])) == pytest.approx(3.0, rel=0.15)
+    assert disagreement(np.zeros(2), np.eye(2)) == 1.0
+
+
+def test_power_of_the_law(bshem):
+    """cos^(1 + m) about the aperture's mean direction, finite below the horizon.
+
+    Catches the power taken of the whole form factor (a smaller aperture would count), and of the wrong direction.
+    """
+    geometry = SpotGeometry(bshem)
+    phi = geometry.form_factor(np.zeros((1, 2)))
+    away = -phi[0, :, 0, 0] / np.linalg.norm(phi[0, :, 0, 0])
+    normal = np.stack([np.array([0.0, 0.0, 1.0]), away], -1)[:, None]
+    plain, powered = (
+        np.asarray(render_single(np.zeros((1, 2)), normal, 0.0 * phi, geometry, None, m)) for m in (None, 0.3)
+    )
+    cos = phi[:, 2, 0, 0] / np.linalg.norm(phi[:, :, 0, 0], axis=1)
+    assert np.allclose(powered[:, 0, 0], plain[:, 0, 0] * cos**0.3, rtol=1e-5)
+    assert powered[0, 0, 1] == pytest.approx(plain[0, 0, 1] * LEAST_COS**0.3, rel=1e-5)
