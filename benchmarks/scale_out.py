@@ -1,6 +1,6 @@
 """What a large simulation needs: memory against the size of the raster, threads and processes against one thread.
 
-python benchmarks/scale_out.py [--output benchmarks/out] [--tiny] [--rows memory,speed,cost]
+python benchmarks/scale_out.py [--output benchmarks/out] [--tiny] [--rows memory,speed,cost] [--update]
 
 memory: peak memory of a process that traces rasters of growing size over a rough surface of 1.3 million triangles,
 with 4 detectors and 6 orders, into a file; what is beyond the output arrays must not grow with the raster.
@@ -24,7 +24,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.rows import Row, row, write  # noqa: E402
+from benchmarks.rows import Row, row, update, write  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
 from helio_jax.checkpoint import Keeper  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
@@ -137,6 +137,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
     parser.add_argument("--tiny", action="store_true")
     parser.add_argument("--rows", default="memory,speed,cost")
+    parser.add_argument("--update", action="store_true", help="also put the rows into benchmarks/results")
     parser.add_argument("--child", nargs=4)
     args = parser.parse_args()
     if args.child:
@@ -160,6 +161,8 @@ def main() -> None:
     rows = [row for name in args.rows.split(",") for row in makers[name]()]
     rows = [r | {"reached": None} for r in rows] if args.tiny else rows
     write(args.output / ("scale_out_tiny.json" if args.tiny else "scale_out.json"), rows, scene.trace.seed)
+    if args.update and not args.tiny:
+        update(ROOT / "benchmarks" / "results" / "scale_out.json", rows, scene.trace.seed)
 
 
 if __name__ == "__main__":

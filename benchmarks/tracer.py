@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.rows import Row, row, write  # noqa: E402
+from benchmarks.rows import Row, row, update, write  # noqa: E402
+from benchmarks.tracer_plot import draw  # noqa: E402
 from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.instrument import Beam, Detector, Instrument, Plate  # noqa: E402
 from helio_jax.scene.shapes import Sphere, SpheresSample, StepSample, TrenchSample  # noqa: E402
@@ -328,7 +330,8 @@ def bounce_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
         target = 1.6 if n_faces < 20_000 else 1.4
         text = f"{ours:.0f} / {bare:.0f} ns = {ratio:.2f}"
         what = f"bounce loop / bare embreex, {n_faces} triangles"
-        rows.append(row("8", what, text, f"<= {target}", ratio <= target, flights=flights))
+        more = {"flights": flights, "triangles": n_faces, "ratio": ratio}
+        rows.append(row("8", what, text, f"<= {target}", ratio <= target, **more))
     return rows
 
 
@@ -459,7 +462,15 @@ def size_rows(sizes: tuple[int, ...], n_rays: int) -> list[Row]:
         text, share = f"{rates[-1]:.3g} rays/s", rates[-1] / rates[0]
         is_last = n == sizes[-1]
         rows.append(
-            row("12", f"{len(faces)} triangles", text, ">= 1/5 of the first", share >= 0.2 if is_last else None)
+            row(
+                "12",
+                f"{len(faces)} triangles",
+                text,
+                ">= 1/5 of the first",
+                share >= 0.2 if is_last else None,
+                triangles=len(faces),
+                rays_per_second=rates[-1],
+            )
         )
     return rows
 
@@ -469,6 +480,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
     parser.add_argument("--rows", default="3,4,5,8,10,11,12,14")
     parser.add_argument("--tiny", action="store_true")
+    parser.add_argument("--update", action="store_true", help="also put the rows into benchmarks/results, with a plot")
     args = parser.parse_args()
     tiny = args.tiny
     work = {
@@ -483,6 +495,11 @@ def main() -> None:
     }
     rows = [r for name in args.rows.split(",") for r in work[name]()]
     write(args.output / ("tracer_tiny.json" if tiny else "tracer.json"), rows, seed=1)
+    if args.update and not tiny:
+        update(RESULTS / "tracer.json", rows, seed=1)
+        draw(RESULTS / "tracer.json", RESULTS / "tracer.png")
+    elif tiny:
+        draw(args.output / "tracer_tiny.json", args.output / "tracer_tiny.png")
 
 
 if __name__ == "__main__":
