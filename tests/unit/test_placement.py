@@ -168,5 +168,5 @@ def test_gaps_of_a_reconstruction(tmp_path):
     valid = scene_of(tmp_path, keys + 'gaps = "fill"\nuse = "valid"\n').build_body()
     np.testing.assert_allclose(valid.vertices[:, 2].reshape(is_gap.shape)[is_gap], 0.0, atol=1e-9)
     write(simulate(scene_of(tmp_path, CAP), rays=8), tmp_path / "gaps.h5")
-    with pytest.raises(InputFileError, match="holds a MicrographStack"):
+    with pytest.raises(InputFileError, match="holds micrographs, needed is a height map"):
         scene_of(tmp_path, keys).build_body()
