@@ -98,17 +98,24 @@ class Ranking:
         return self.entries[0].ties[0]
 
     @property
-    def margin(self) -> float:
-        """By what share the second entry's cost exceeds the first's; infinite where there is one only.
+    def rival(self) -> Entry | None:
+        """The entry that comes closest to the winner; None where there is one only."""
+        return min(self.entries[1:], key=self._margin_to, default=None)
 
-        The full costs; the quick ones where the second is no surface to trace from; 0 where the first is none.
+    @property
+    def margin(self) -> float:
+        """By what share the rival's cost exceeds the winner's; infinite without a rival.
+
+        The full costs; the quick ones where the rival was no finalist, or no surface that can be traced from: that
+        a fit went astray is no proof against it.
         """
-        if len(self.entries) < 2:
-            return math.inf
-        first, second = self.entries[:2]
+        return math.inf if self.rival is None else self._margin_to(self.rival)
+
+    def _margin_to(self, other: Entry) -> float:
+        first = self.entries[0]
         if not math.isfinite(first.full):
             return 0.0
-        a, b = (first.full, second.full) if math.isfinite(second.full) else (first.quick, second.quick)
+        a, b = (first.full, other.full) if math.isfinite(other.full) else (first.quick, other.quick)
         return b / a - 1.0 if a > 0 else math.inf
 
     @property
@@ -122,16 +129,18 @@ class Ranking:
                 f"'{self._label(mirrored)}' fit alike and give heights that are mirror images of one another: give the "
                 "file's handedness by --mirror or --no-mirror"
             )
-        if self.margin >= self.limit:
+        rival = self.rival
+        if rival is None or self.margin >= self.limit:
             return tuple(out)
-        rival = self.entries[1]
-        why = "the relief is too low or the images are too noisy"
+        why = "the relief is too low or too regular, or the images are too noisy"
+        if not math.isfinite(self.entries[0].full):
+            why = "all surfaces came out too rough or steep to predict masks and multiple scattering from"
         if self.winner.reversed in rival.ties:
             why = "the rival has all slopes reversed, hollows for hills, which low relief or a far plate leave open"
         out.append(
-            f"the best, '{self._label(self.winner)}', explains the images only by {self.margin:.1%} better than "
-            f"'{self._label(rival.ties[0])}', the limit is {self.limit:.0%}; {why}: give what is known by --turn, "
-            "--mirror or --no-mirror, --detectors, or take a scan of a known sample with more relief"
+            f"the best, '{self._label(self.winner)}', is not told from '{self._label(rival.ties[0])}', whose cost "
+            f"exceeds its own by {self.margin:.1%}, the limit is {self.limit:.0%} (min_margin, chance); {why}: give "
+            "what is known by --turn, --mirror or --no-mirror, --detectors"
         )
         return tuple(out)
 
