@@ -14,7 +14,7 @@ The images must have one common gain, or a flat border from which `calibrate` ge
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -61,7 +61,7 @@ class OrientSettings(Settings):
 
 @dataclass(frozen=True)
 class Entry:
-    """Candidates that are one by the instrument's symmetry, and how badly they fit.
+    """Candidates that are one by the instrument's symmetry, and how badly they fit (pure noise: 1 to 1.5).
 
     Attributes:
         ties: the candidates, the one that changes least first.
@@ -163,7 +163,7 @@ class Ranking:
         if len(self.entries) == 1 and math.isnan(self.entries[0].quick):
             return [f"given by hand: {self._label(self.winner)}"]
         ties = len(self.entries[0].ties) - 1
-        told = f"; {ties} tie(s) by the instrument's symmetry" if ties else ""
+        told = f"; {ties} tie(s) by the instrument's symmetry: the sample turned or mirrored as a whole" if ties else ""
         best = f"best: {self._label(self.winner)}; margin {self.margin:.1%}, limit {self.limit:.0%}{told}"
         return [*self.table(), best, *self.notes]
 
@@ -218,14 +218,19 @@ def find_orientation(
 
     Raises:
         GuardError: too few images for a fit; a measured detector has no signal.
-        InputFileError: no raster, or scans that are aligned already.
+        InputFileError: no raster, or calibrated or aligned already.
         SceneError: `detectors` does not name each detector once.
     """
     turn_stack(stack, ALL_TURNS[0], tuple(range(stack.shape[0])))  # refuses what is no raster
+    _check_unfinished(stack)
     candidates, notes = _candidates(stack.instrument, settings)
     if len(candidates) == 1:
         return Ranking(stack, (Entry(tuple(candidates), math.nan),), settings.min_margin, settings)
-    _check_fits(stack)
+    if stack.shape[0] < MIN_IMAGES:
+        raise GuardError(
+            f"{stack.name}: an orientation is found from {MIN_IMAGES} or more images of one scan, got "
+            f"{stack.shape[0]}: give --turn, --mirror or --no-mirror, and --detectors"
+        )
     scaled, flat = _calibrated(stack)
     binned = bin_stack(scaled, settings.max_pixels)
     groups = group_ties(candidates, stack.instrument)
@@ -314,22 +319,15 @@ def _note(n: int, tried: int) -> str:
     )
 
 
-def _check_fits(stack: MicrographStack) -> None:
-    """Refuse what no fit can orient."""
-    if stack.shape[0] < MIN_IMAGES:
-        raise GuardError(
-            f"{stack.name}: an orientation is found from {MIN_IMAGES} or more images of one scan, got "
-            f"{stack.shape[0]}: give --turn, --mirror or --no-mirror, and --detectors"
-        )
-    if "align" in stack.provenance:
-        raise InputFileError(f"{stack.name}: these are aligned scans: orient the single scans before helio align")
+def _check_unfinished(stack: MicrographStack) -> None:
+    """Refuse what is scaled or turned by an orientation already: its images cannot go to other detectors any more."""
+    for done, what in (("calibrate", "calibrated"), ("align", "aligned")):
+        if done in stack.provenance:
+            raise InputFileError(f"{stack.name}: this scan is {what}: orient the imported one, before helio {done}")
 
 
 def _calibrated(stack: MicrographStack) -> tuple[MicrographStack, np.ndarray | None]:
     """Return a measured stack in units of the beam, and the flat's signal per detector that it was scaled to."""
-    record: Mapping[str, Any] = stack.provenance.get("calibrate", {})
-    if stack.noise == "measured" and stack.n_rays is None:
-        stack = pipeline.calibrate(stack)
-    elif not record:
+    if stack.noise != "measured":
         return stack, None
-    return stack, SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return pipeline.calibrate(stack), SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]

@@ -20,6 +20,7 @@ from helio_jax.prepare.turn import ALL_TURNS, Turn, bin_stack, instrument_symmet
 from helio_jax.reconstruct.consistency import misfit
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.scene.scan import Raster
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 QUICK = ReconstructSettings(method="nearfield", integrator="dct_poisson", rounds=3)
@@ -38,8 +39,9 @@ def ring(*azimuths, incidence=0.0, polar=35.0, **other) -> Instrument:
 
 def simulated(n_x=42, n_y=34, scene="two_spheres", **overrides) -> MicrographStack:
     """Return traced micrographs with counting noise on a raster of unlike sides."""
-    whole = load_scene(SCENES / f"{scene}.toml")
-    step = whole.scan.pixel_size_um * whole.scan.nx / n_x
+    whole = load_scene(SCENES / f"{scene}.toml").scan
+    assert isinstance(whole, Raster)
+    step = whole.pixel_size_um * whole.nx / n_x
     changed = {"scan.nx": n_x, "scan.ny": n_y, "scan.pixel_size_um": step, **overrides}
     loaded = load_scene(SCENES / f"{scene}.toml", changed)
     stack = pipeline.record(loaded, pipeline.simulate(loaded, rays=64))
@@ -187,8 +189,8 @@ def test_winner_without_ties():
 
     Catches ties that are none.
     """
-    cones = {"detector": [d.model_dump(exclude_none=True) for d in ring(20, 120, 250, d1=42.0).detector]}
-    stack, truth = shuffled(simulated(**cones), Turn(90, True), (1, 2, 0))
+    cones = [d.model_dump(exclude_none=True) for d in ring(20, 120, 250, d1=42.0).detector]
+    stack, truth = shuffled(simulated(detector=cones), Turn(90, True), (1, 2, 0))
     found = find_orientation(stack, OrientSettings(finalists=2))
     assert found.entries[0].ties == (truth,) and found.problems == ()
     assert turn_stack(stack, truth.turn, truth.order).counts.tolist() == found.applied().counts.tolist()
@@ -299,7 +301,7 @@ def test_given_by_hand_needs_no_fit(spheres, tmp_path, capsys):
 
 
 def test_what_cannot_be_oriented_is_refused(spheres):
-    """Two images, a list of positions, aligned scans, wrong settings: each with its reason."""
+    """Two images, a list of positions, aligned or calibrated scans, wrong settings: each with its reason."""
     pair = spheres.instrument.model_copy(update={"detector": spheres.instrument.detector[:2]})
     with pytest.raises(GuardError, match="3 or more images"):
         find_orientation(plain(pair, np.ones((2, 14, 14))))
@@ -309,6 +311,8 @@ def test_what_cannot_be_oriented_is_refused(spheres):
         find_orientation(line)
     with pytest.raises(InputFileError, match="before helio align"):
         find_orientation(spheres.replace(provenance={"align": {}}))
+    with pytest.raises(InputFileError, match="before helio calibrate"):  # scaled to the flat of a wrong detector
+        find_orientation(spheres.replace(provenance={"calibrate": {}}))
     with pytest.raises(SceneError, match="turn_deg"):
         make_settings(turn_deg=45)
     with pytest.raises(SceneError, match="min_margins"):
@@ -318,7 +322,8 @@ def test_what_cannot_be_oriented_is_refused(spheres):
 def test_measured_sphere_a_lies_as_imported(shared):
     """The real scan: `helio import`'s orientation and channels win, and hollows are rejected by the default margin.
 
-    Its handedness stays open (the arrangement is its own mirror image). Catches an import that lies otherwise.
+    Its handedness stays open (the arrangement is its own mirror image). Catches an import that lies otherwise, and a
+    fit that real background, gain and drift lead astray.
     """
     instrument = load_instrument(SCENES / "measured_sphere_a.toml")
     stack = import_micrographs(shared / "data" / "sc100351.mat", instrument)
