@@ -1,4 +1,4 @@
-"""Commands for files of other programs and measured scans: import, export, calibrate, align, pick, compare.
+"""Commands for files of other programs and measured scans: import, export, compare, align, pick, calibrate, orient.
 
 Each parses, calls, prints; no logic of its own.
 """
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import FIGURE, AsJson, H5File, Rays, SceneArg, app, given_options, print_table, say
+from helio_jax.commands.app import FIGURE, AsJson, Bar, H5File, Rays, SceneArg, app, given_options, print_table, say
 
 
 @app.command("import")
@@ -165,3 +165,35 @@ def calibrate(
         )
     print(f"flat: signal above the background, whose prior deviation is {record['priors']['offset_std']:.0%} of it")
     print(f"{output}\n{output.with_suffix('.png')}")
+
+
+@app.command()
+def orient(
+    stack: Annotated[Path, typer.Argument(help="Micrographs of one scan with 3 or more detectors (.h5).")],
+    output: H5File,
+    turn: Annotated[int | None, typer.Option(help="Counter-clockwise turn: 0, 90, 180, 270 (default: tried).")] = None,
+    mirror: Annotated[
+        bool | None, typer.Option("--mirror/--no-mirror", help="Whether x is reversed, before the turn.")
+    ] = None,
+    detectors: Annotated[
+        str | None, typer.Option(help="NAME,NAME,...: detector of each image of the file (default: tried).")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: min_margin, max_pixels, ... (repeat).")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find by quick fits how a file's arrays lie and which image is which detector's, and put them right."""
+    from helio_jax import write
+    from helio_jax.formats.hdf5 import read_stack
+    from helio_jax.orient import find_orientation, make_settings
+
+    chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
+    names = None if detectors is None else tuple(name.strip() for name in detectors.split(","))
+    asked = make_settings(**chosen, **given_options(turn_deg=turn, mirror=mirror, detectors=names))
+    with Bar("fitting orientations") as bar:
+        found = find_orientation(read_stack(stack), asked, bar)
+    print(json.dumps(found.as_dict()) if as_json else "\n".join(found.summary()))
+    write(found.applied(), output)
+    if not as_json:
+        print(f"written to {output}")

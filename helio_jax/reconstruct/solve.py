@@ -76,14 +76,14 @@ def solve_nearfield(
     signal, variance = signal_of(stack)
     height = np.zeros(stack.shape[1:])
     for number in range(rounds):
-        phi = geometry.form_factor(_limited(height, stack))
+        phi = geometry.form_factor(limited(height, stack))
         solution = solve_linear(signal, variance, phi)
         new = _integrate(solution, stack, settings)
         height = new if number == 0 else height + settings.damping * (new - height)
     return height, solution
 
 
-def _limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
+def limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
     """Return heights kept between one and a half plate distances below and 90 % of it above the plane.
 
     Only the directions are taken there, so that a wild intermediate height cannot pass through the plate.
@@ -157,7 +157,7 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     (a, b), _ = solve_known_albedo(signal - near.multiple, variance + doubt**2, visible, normals, shift)
     weight = np.ones(stack.shape[1:])
     height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), "weighted", weight)
-    return Surface(_limited(_level(height, settings, weight), stack), a, b)
+    return Surface(limited(_level(height, settings, weight), stack), a, b)
 
 
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
@@ -225,7 +225,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         )
     predict, shift = make_predict(settings.refine.rays), stack.instrument.beam_shift
     height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
-    start = _corrected(stack, settings, geometry, _limited(height, stack), solution.normals, predict)
+    start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, predict)
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
     fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
