@@ -5,7 +5,7 @@ pipeline supplies, so this stage knows no tracer), decide which edges are smooth
 robust weights, then a few Levenberg-Marquardt steps (`refiner`). All of that is lagged: constant during a step.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -215,20 +215,31 @@ def fit_heights(
         return _finish(refiner, changes, is_interrupted, posterior)
 
 
+def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
+    """Return how a fit ended, in a sentence.
+
+    A last change that is larger than the one before is a jitter about the result unless it is also more than half of
+    the largest one: then the fit diverges.
+
+    Args:
+        changes: of the heights in every round, um.
+        tolerance: below which a change counts as none, um.
+        is_interrupted: whether the user stopped it.
+    """
+    last = f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
+    if is_interrupted:
+        return f"interrupted: best so far; {last}"
+    if changes[-1] < tolerance:
+        return f"converged: {last}"
+    if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):
+        growth = f"{changes[-1] / changes[-2]:.2f} times the round before" if changes[-2] > 0 else "after none before"
+        return f"diverging: {last}, {growth}; raise mask_error or use nearfield"
+    return f"stopped: {last}; raise max_rounds for more"
+
+
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s = refiner.settings
     contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
-    last = (
-        f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {s.tolerance_um:g} um)"
-    )
-    if is_interrupted:
-        status = f"interrupted: best so far; {last}"
-    elif changes[-1] < s.tolerance_um:
-        status = f"converged: {last}"
-    elif contraction is not None and contraction > 1.0:
-        status = f"diverging: {last}, {contraction:.2f} times the round before; raise mask_error or use nearfield"
-    else:
-        status = f"stopped: {last}; raise max_rounds for more"
     _, lagged = refiner.lag(s.robust_limits[-1], s.jump_limits[-1])
     values = Unknowns(*(None,) * 3, **{name: jnp.asarray(value) for name, value in refiner.values.items()})
     background = np.broadcast_to(refiner.model.background(values, lagged), refiner.signal.shape)
@@ -251,6 +262,6 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         posterior=posterior,
         changes=tuple(changes),
         contraction=contraction,
-        status=status,
+        status=status_of(changes, s.tolerance_um, is_interrupted),
         is_interrupted=is_interrupted,
     )

@@ -14,6 +14,7 @@ from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.refine import status_of
 from helio_jax.truth import true_height
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -156,6 +157,24 @@ def test_prediction_about_a_normal_changes_nothing_there():
     level = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
     is_steep = normals[..., 2] < 0.9
     assert np.all((value(near, level) - value(was, level))[:, is_steep] < 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ([100.0, 20.0, 1.5], "converged"),
+        ([100.0, 20.0, 5.0], "stopped"),
+        ([100.0, 20.0, 5.0, 2.1, 3.0], "stopped"),
+        ([100.0, 20.0, 60.0], "diverging"),
+        ([20.0, 40.0], "diverging"),
+        ([0.0, 40.0], "diverging"),
+        ([40.0], "stopped"),
+    ],
+)
+def test_status_names_how_a_fit_ended(changes, named):
+    """Tolerance 2 um. Catches a jitter of 2 and 3 um called divergence, growth called "stopped", a division by zero."""
+    assert status_of(changes, 2.0).startswith(named)
+    assert status_of(changes, 2.0, is_interrupted=True).startswith("interrupted")
 
 
 def test_interrupted_fit_keeps_the_best_so_far(bshem):
