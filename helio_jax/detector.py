@@ -49,6 +49,14 @@ class Cone:
         return 4.0 * math.pi * math.sin(0.5 * self.half_angle) ** 2
 
 
+def axis_frame(axis: np.ndarray) -> np.ndarray:
+    """Return an orthonormal frame [3, 3] whose last row is the unit vector `axis`."""
+    side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    first = np.cross(side, axis)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis])
+
+
 def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: float) -> Aperture:
     """Cut a circular cone with the plate: the exact ellipse seen under `half_angle` from the nominal spot.
 

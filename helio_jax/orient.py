@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from helio_jax import pipeline
 from helio_jax.errors import GuardError, InputFileError, SceneError
@@ -191,19 +191,6 @@ class Ranking:
         return turned.replace(provenance={**self.stack.provenance, "orient": self.as_dict()})
 
 
-def make_settings(**given: Any) -> OrientSettings:
-    """Return settings from options.
-
-    Raises:
-        SceneError: an unknown or impossible one.
-    """
-    try:
-        return OrientSettings.model_validate(given)
-    except ValidationError as e:
-        told = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}, got {p['input']!r}" for p in e.errors())
-        raise SceneError(f"setting not accepted: {told}") from None
-
-
 def find_orientation(
     stack: MicrographStack,
     settings: OrientSettings = OrientSettings(),
@@ -330,4 +317,4 @@ def _calibrated(stack: MicrographStack) -> tuple[MicrographStack, np.ndarray | N
     """Return a measured stack in units of the beam, and the flat's signal per detector that it was scaled to."""
     if stack.noise != "measured":
         return stack, None
-    return pipeline.calibrate(stack), SpotGeometry(stack.instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return pipeline.calibrate(stack), pipeline.flat_signal(stack.instrument)

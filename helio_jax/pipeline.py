@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from helio_jax.checkpoint import Keeper, Shard, is_finished
 from helio_jax.config import SceneFile, load_scene
@@ -62,7 +61,7 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
         SceneError: an unknown or impossible setting.
         GuardError: ray book-keeping failed.
     """
-    return trace_scene(scene, _changed(scene.trace, trace), progress)
+    return trace_scene(scene, scene.trace.changed(**trace), progress)
 
 
 @dataclass(frozen=True)
@@ -164,15 +163,6 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     return [output]
 
 
-def _changed(settings, changes: dict[str, Any]):
-    """Return settings with some values replaced, checked again."""
-    try:
-        return type(settings).model_validate(settings.model_dump() | changes)
-    except ValidationError as e:
-        problems = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in e.errors())
-        raise SceneError(f"setting not accepted: {problems}") from None
-
-
 def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
     """Return micrographs as the scene's experiment would record them: with counting noise, if the scene asks for it.
 
@@ -204,11 +194,11 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
             "calibrated already; calibrate the imported file itself"
         )
     return calibrate_on_border(
-        stack, _flat_signal(stack.instrument), _changed(settings or CalibrateSettings(), changes)
+        stack, flat_signal(stack.instrument), (settings or CalibrateSettings()).changed(**changes)
     )
 
 
-def _flat_signal(instrument: Instrument) -> np.ndarray:
+def flat_signal(instrument: Instrument) -> np.ndarray:
     """Return the detection probability of the flat reference plane [detector]."""
     return SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
 
@@ -236,7 +226,7 @@ def calibrate_turned(stack: MicrographStack) -> MicrographStack:
     """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`)."""
     found = self_calibrate(stack)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
-    return apply_calibration(stack, found, _flat_signal(instrument), instrument)
+    return apply_calibration(stack, found, flat_signal(instrument), instrument)
 
 
 def align(
@@ -248,7 +238,7 @@ def align(
         One stack, and where the control points are in its frame [um] (empty without them).
     """
     picks = read_points(points) if points is not None else None
-    stack, found = align_scans(scans, picks, _changed(AlignSettings(), changes), str(points or ""))
+    stack, found = align_scans(scans, picks, AlignSettings().changed(**changes), str(points or ""))
     return stack, {} if found.points is None else found.points.places
 
 
@@ -282,7 +272,7 @@ def reconstruct(
         one = calibrate_turned(one) if "align" in one.provenance else calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()
-    chosen = _changed(settings, _with_priors(settings, one, wanted))
+    chosen = settings.changed(**_with_priors(settings, one, wanted))
     refine = chosen.refine
 
     def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:

@@ -186,11 +186,11 @@ def orient(
     """Find by quick fits how a file's arrays lie and which image is which detector's, and put them right."""
     from helio_jax import write
     from helio_jax.formats.hdf5 import read_stack
-    from helio_jax.orient import find_orientation, make_settings
+    from helio_jax.orient import OrientSettings, find_orientation
 
     chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
     names = None if detectors is None else tuple(name.strip() for name in detectors.split(","))
-    asked = make_settings(**chosen, **given_options(turn_deg=turn, mirror=mirror, detectors=names))
+    asked = OrientSettings().changed(**chosen, **given_options(turn_deg=turn, mirror=mirror, detectors=names))
     with Bar("fitting orientations") as bar:
         found = find_orientation(read_stack(stack), asked, bar)
     print(json.dumps(found.as_dict()) if as_json else "\n".join(found.summary()))

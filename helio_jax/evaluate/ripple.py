@@ -114,13 +114,17 @@ def image_spectra(
     stack: MicrographStack, regions: Sequence[np.ndarray], settings: RippleSettings | None = None
 ) -> dict[str, Spectrum]:
     """Return the spectrum of every micrograph of a stack over some regions, by the detector's name."""
-    settings = settings or RippleSettings()
-    steps, out = (pitch(stack.x), pitch(stack.y)), {}
-    for name, image, seen in zip(stack.instrument.detector_names, stack.counts, stack.is_observed, strict=True):
-        blocks = make_blocks([seen & region for region in regions], settings.block_px)
-        field = without_trend(np.where(seen, image, 0.0), blocks, settings.degree)
-        out[name] = take_spectrum([field], blocks, steps, settings)
-    return out
+    settings, names = settings or RippleSettings(), stack.instrument.detector_names
+    return {n: _image_spectrum(stack, k, stack.is_observed[k], regions, settings)[0] for k, n in enumerate(names)}
+
+
+def _image_spectrum(
+    stack: MicrographStack, detector: int, seen: np.ndarray, regions: Sequence[np.ndarray], settings: RippleSettings
+) -> tuple[Spectrum, np.ndarray]:
+    """Return the spectrum of the micrograph of a detector where it is `seen` [y, x], and its field without trend."""
+    blocks = make_blocks([seen & region for region in regions], settings.block_px)
+    field = without_trend(np.where(seen, stack.counts[detector], 0.0), blocks, settings.degree)
+    return take_spectrum([field], blocks, (pitch(stack.x), pitch(stack.y)), settings), field
 
 
 def image_ripple(
@@ -131,11 +135,8 @@ def image_ripple(
     Raises:
         GuardError: as `height_ripple`.
     """
-    settings = settings or RippleSettings()
-    steps, seen = (pitch(stack.x), pitch(stack.y)), stack.is_observed[detector]
-    blocks = make_blocks([seen & region for region in regions], settings.block_px)
-    field = without_trend(np.where(seen, stack.counts[detector], 0.0), blocks, settings.degree)
-    spectrum = take_spectrum([field], blocks, steps, settings)
+    settings, steps = settings or RippleSettings(), (pitch(stack.x), pitch(stack.y))
+    spectrum, field = _image_spectrum(stack, detector, stack.is_observed[detector], regions, settings)
     start, ratio = _peak(spectrum)
     fit = _fit_wave(field, spectrum, start, steps, settings.degree)
     return _ripple(spectrum, fit, ratio, 1.0, stack.unit, np.eye(2), steps)
@@ -199,23 +200,18 @@ def compare_with_images(
             f"{regions[0].shape[0]}: give the micrographs that it was made of"
         )
     every = np.all(stack.is_observed, axis=0)
-    blocks = make_blocks([every & region for region in regions], settings.block_px)
     unit = np.array(ripple.raster_k) / math.hypot(*ripple.raster_k)
     waves, noises, response = [], [], []
-    for image, aperture in zip(stack.counts, stack.instrument.apertures(), strict=True):
-        field = without_trend(np.where(every, image, 0.0), blocks, settings.degree)
-        spectrum = take_spectrum([field], blocks, steps, settings)
-        at = tuple(
-            int(np.argmin(np.abs(a - k)))
-            for a, k in zip((spectrum.ky, spectrum.kx), ripple.raster_k[::-1], strict=True)
-        )
-        mean = np.array([image[b.rows, b.columns].mean() for b in blocks.blocks])
+    for k, aperture in enumerate(stack.instrument.apertures()):
+        spectrum, field = _image_spectrum(stack, k, every, regions, settings)
+        blocks = spectrum.blocks
+        n = np.array([b.rows.size for b in blocks.blocks])
+        mean = np.array([stack.counts[k][b.rows, b.columns].mean() for b in blocks.blocks])
         waves.append(_complex_amplitudes(field, blocks, ripple.raster_k, steps, settings.degree) / mean)
-        noises.append(2.0 * spectrum.floor[at] / np.array([b.rows.size for b in blocks.blocks]) / mean**2)
+        noises.append(2.0 * spectrum.floor_at(*ripple.raster_k) / n / mean**2)
         response.append(-float(unit @ aperture.center) / stack.instrument.sample_distance)
     z, variance, r = np.array(waves), np.array(noises), np.array(response)[:, None]
     slope = np.sum(r * z / variance, 0) / np.sum(r**2 / variance, 0)
-    n = np.array([b.rows.size for b in blocks.blocks])
     rms = lambda a: np.sqrt(np.sum(np.abs(a) ** 2 * n, -1) / n.sum())  # noqa: E731
     names = stack.instrument.detector_names
     return Agreement(
@@ -298,8 +294,7 @@ def _fit_wave(field: np.ndarray, spectrum: Spectrum, start: Pair, steps: Pair, d
         ]
     ) / (4 * h * h)  # fmt: skip
     k = np.array(start) + best * width
-    at = int(np.argmin(np.abs(spectrum.ky - k[1]))), int(np.argmin(np.abs(spectrum.kx - k[0])))
-    noise, n = float(spectrum.floor[at]), blocks.n_pixels
+    noise, n = spectrum.floor_at(k[0], k[1]), blocks.n_pixels
     covariance = 2.0 * noise * np.linalg.pinv(bend) * np.outer(width, width)
     square = 2.0 * (-total(best) - 2.0 * noise * len(blocks.blocks)) / n
     return _Wave((float(k[0]), float(k[1])), covariance, math.sqrt(max(square, 0.0)), math.sqrt(2.0 * noise / n))

@@ -174,18 +174,16 @@ class Spectrum:
         """Power over floor [ky, kx]."""
         return self.power / self.floor
 
-    def false_alarm(self, ratio: float, n_independent: float | None = None) -> float:
-        """Return how likely noise alone exceeds a ratio at one of some independent wave vectors (default: all)."""
-        n = self.is_searched.sum() * self.blocks.cells / self.power.size if n_independent is None else n_independent
+    def false_alarm(self, ratio: float) -> float:
+        """Return how likely noise alone exceeds a ratio at one of the wave vectors searched."""
+        n = self.is_searched.sum() * self.blocks.cells / self.power.size
         averages = self.blocks.averages
         single = float(stats.f.sf(ratio, 2 * averages, 2 * averages * self.ring))
         return float(-np.expm1(max(_MAXIMA * n, 1.0) * np.log1p(-min(single, 1.0 - 1e-15))))
 
-    def ratio_near(self, kx: float, ky: float) -> tuple[float, float]:
-        """Return the ratio at a wave vector, and how likely noise alone exceeds it there."""
-        at = int(np.argmin(np.abs(self.ky - ky))), int(np.argmin(np.abs(self.kx - kx)))
-        ratio, averages = float(self.ratio[at]), self.blocks.averages
-        return ratio, float(stats.f.sf(ratio, 2 * averages, 2 * averages * self.ring))
+    def floor_at(self, kx: float, ky: float) -> float:
+        """Return the floor at the wave vector of the grid nearest to one [cycles per um]."""
+        return float(self.floor[np.argmin(np.abs(self.ky - ky)), np.argmin(np.abs(self.kx - kx))])
 
 
 def take_spectrum(

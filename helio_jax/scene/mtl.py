@@ -21,7 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 from helio_jax.errors import InputFileError
 from helio_jax.scene.body import COSINE
 from helio_jax.scene.files import read_bytes
-from helio_jax.scene.scattering import Law, Term
+from helio_jax.scene.scattering import Law
 
 MAX_MTL_MB = 16.0
 """Largest .mtl file."""
@@ -42,14 +42,6 @@ class FileLaw:
     name: str
     law: Any
     folder: Path
-
-    def terms(self) -> tuple[Term, ...]:
-        """Return what the law is made of.
-
-        Raises:
-            InputFileError: the table of a law is missing or wrong.
-        """
-        return self.law.terms(self.folder)
 
 
 def mtl_files(obj: Path, data: bytes) -> tuple[list[Path], list[str]]:

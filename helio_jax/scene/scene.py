@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
-from helio_jax.detector import Aperture, Cone
+from helio_jax.detector import Aperture, Cone, axis_frame
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.scene.body import COSINE, Body
@@ -164,10 +164,7 @@ class Scene(Instrument):
         Raises:
             InputFileError: a file of the sample that brings laws along (.mtl) is missing or wrong.
         """
-        names = {*self.sample.material_names, self.plate.material}
-        own = {name: law for name, law in self.material.items() if name in names}
-        from_files = self.sample.file_laws(self.base_dir)
-        return own | {n: self.material.get(f.name) or f.law for n, f in from_files.items()}
+        return {name: law for name, (law, _) in self._used_laws().items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
         """Return the scattering laws of the materials that sample and plate use, and read their files.
@@ -175,13 +172,16 @@ class Scene(Instrument):
         Raises:
             InputFileError: the table of a law, or a file of the sample that brings laws along, is missing or wrong.
         """
-        from_files = self.sample.file_laws(self.base_dir)
-        return {
-            name: from_files[name].terms()
-            if name in from_files and from_files[name].name not in self.material
-            else law.terms(self.base_dir)
-            for name, law in self.used_materials.items()
-        }
+        return {name: law.terms(folder) for name, (law, folder) in self._used_laws().items()}
+
+    def _used_laws(self) -> dict[str, tuple[Law, Path]]:
+        """Return the laws in use and the folders at which their file names start, by the materials' names."""
+        names = {*self.sample.material_names, self.plate.material}
+        out = {name: (law, self.base_dir) for name, law in self.material.items() if name in names}
+        for name, found in self.sample.file_laws(self.base_dir).items():
+            own = self.material.get(found.name)
+            out[name] = (found.law, found.folder) if own is None else (own, self.base_dir)
+        return out
 
     def read_rays(self) -> np.ndarray | None:
         """Return position [um], unit direction and weight of the beam's rays [n, 7], where it is made of such.
@@ -294,11 +294,9 @@ def _sights(opening: Aperture | Cone, distance: float) -> np.ndarray:
         plane = np.concatenate([opening.rim(256)[0], np.array([opening.center])])
         sights = np.column_stack([plane, np.full(len(plane), distance)])
         return sights / np.linalg.norm(sights, axis=1, keepdims=True)
-    axis = np.asarray(opening.axis)
-    first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
-    first /= np.linalg.norm(first)
+    first, second, axis = axis_frame(np.asarray(opening.axis))
     turn = 2.0 * np.pi * np.arange(256)[:, None] / 256
-    side = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
+    side = np.cos(turn) * first + np.sin(turn) * second
     return np.concatenate([math.cos(opening.half_angle) * axis + math.sin(opening.half_angle) * side, axis[None]])
 
 

@@ -144,7 +144,7 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
         if not goes_on.any():
             break
         hits, incoming, atoms = hits.take(goes_on), direction[goes_on], atoms[goes_on]
-        u = bounce_numbers(ids[pixel[atoms]], path[atoms], 1, s.bounces, event, s.seed, False)
+        u = bounce_numbers(ids[pixel[atoms]], path[atoms], 0, s.bounces, event, s.seed)
         material = e.intersector.material_of(hits.surface)
         key = (ids[pixel[atoms]], path[atoms], event, s.seed, False)
         direction, _, leaves = scatter_atoms(laws, material, incoming, hits.normal, u, *key)

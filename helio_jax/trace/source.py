@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from helio_jax.detector import axis_frame
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
@@ -41,8 +42,8 @@ class Sampling:
 
     @property
     def per_replicate(self) -> int:
-        """Paths of a replicate; 1 for independent random rays, which do not need it."""
-        return self.n_rays * self.n_branches // self.n_replicates if self.n_replicates else 1
+        """Paths of a replicate; 0: the rays are independent."""
+        return self.n_rays * self.n_branches // self.n_replicates if self.n_replicates else 0
 
     @classmethod
     def make(cls, n_rays: int, n_branches: int, n_replicates: int, seed: int) -> "Sampling":
@@ -143,17 +144,18 @@ def shifted(a, b, points, i):
 
 
 @kernel
-def bounce_numbers(pixel_ids, path, paths_per_replicate, bounces, event, seed, is_low_discrepancy):
+def bounce_numbers(pixel_ids, path, per_replicate, bounces, event, seed):
     """Return two random numbers per path for the bounce after `event`, and two for the next aperture point [n, 4].
 
-    `path` counts the paths of a pixel (beam ray times branch); the first bounce (event 0) is low-discrepancy.
+    `path` counts the paths of a pixel (beam ray times branch); the first bounce (event 0) is low-discrepancy where
+    replicates of `per_replicate` > 0 paths are drawn (`Sampling.per_replicate`).
     """
     out = np.empty((path.size, 4))
     for i in range(path.size):
         a, b, c, d = bounce_number(seed, pixel_ids[i], path[i], event)
-        if event == 0 and is_low_discrepancy:
-            a, b = first_bounce_shift(seed, pixel_ids[i], path[i] // paths_per_replicate)
-            a, b = shifted(a, b, bounces, path[i] % paths_per_replicate)
+        if event == 0 and per_replicate > 0:
+            a, b = first_bounce_shift(seed, pixel_ids[i], path[i] // per_replicate)
+            a, b = shifted(a, b, bounces, path[i] % per_replicate)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = a, b, c, d
     return out
 
@@ -209,14 +211,6 @@ def footprint(
     h = np.asarray(heights, float)[:, None, None]
     flown = origin[:, :2] + (h - origin[:, 2:]) / d[:, 2:] * d[:, :2] + h * axis
     return flown @ np.array([[c, -s], [s, c]])
-
-
-def axis_frame(axis: np.ndarray) -> np.ndarray:
-    """Return an orthonormal frame [3, 3] whose last row is the unit vector `axis`."""
-    side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    first = np.cross(side, axis)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first), axis])
 
 
 def launch_rays(

@@ -9,7 +9,7 @@ straight to each detector (`next_event`).
 import numpy as np
 
 from helio_jax.kernel import kernel
-from helio_jax.trace.analog import fly_to_the_end, land, leave
+from helio_jax.trace.analog import fly_to_the_end, land
 from helio_jax.trace.experiment import Experiment, Paths, lift_off
 from helio_jax.trace.intersect import Hits
 from helio_jax.trace.laws import scatter_atoms
@@ -99,7 +99,7 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Path
         hits, paths = hits.take(index), paths.take(index)
         paths.path = paths.path * s.n_branches + np.tile(np.arange(s.n_branches), index.size // s.n_branches)
     path, pixel = paths.path, paths.pixel
-    u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed, s.n_replicates > 0)
+    u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
     history = _history(hits.surface, hits.normal, paths.order, paths.met_plate)
     if e.laws is None:
@@ -110,24 +110,6 @@ def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Path
         stopped += np.bincount(pixel[~leaves], minlength=stopped.size)
     out = Paths(origin, direction, pixel, path, u[:, 2:].copy(), skip, density, *history)
     return out if leaves is None or leaves.all() else out.take(leaves)
-
-
-def _fly_plainly(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, offset, tally: Tally) -> None:
-    """Do all that follows the scattering with `event` events before it (`Experiment.is_plain`)."""
-
-    def score(event: int, hits: Hits, pixel: np.ndarray, path: np.ndarray, target: np.ndarray) -> None:
-        n = len(pixel)
-        order, met_plate = np.full(n, event, np.int32), np.zeros(n, bool)
-        none, vectors = np.zeros(n), np.zeros((n, 3))  # what plain atoms need not remember
-        paths = Paths(vectors, vectors, pixel, path, target, pixel, none, vectors, order, met_plate)
-        add_next_event(e, event, ids, tally, hits, paths, offset)
-
-    flying = leave(event, hits, e.intersector.restart, paths.pixel, paths.path, ids, e.sampling)
-    plate = e.apertures, e.instrument.sample_distance
-    fly_to_the_end(
-        event + 1, e.intersector, *plate, e.max_events, e.sampling.seed, ids, offset, flying, tally,
-        score if e.is_expected else None,
-    )  # fmt: skip
 
 
 def trace_block(
@@ -171,7 +153,7 @@ def trace_block(
         if e.is_expected:
             add_next_event(e, event, ids, tally, hits, paths, offset)
         if e.is_plain(event):
-            _fly_plainly(e, event, ids, hits, paths, offset, tally)
+            fly_to_the_end(e, event, ids, hits, paths, offset, tally)
             break
         paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
     return tally

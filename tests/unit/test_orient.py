@@ -14,7 +14,7 @@ from helio_jax.config import load_instrument, load_scene
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
-from helio_jax.orient import Entry, OrientSettings, Ranking, find_orientation, make_settings
+from helio_jax.orient import Entry, OrientSettings, Ranking, find_orientation
 from helio_jax.prepare.arrangement import Candidate, group_ties, orders_tried
 from helio_jax.prepare.turn import ALL_TURNS, Turn, bin_stack, instrument_symmetries, turn_stack
 from helio_jax.reconstruct.consistency import misfit
@@ -314,9 +314,9 @@ def test_what_cannot_be_oriented_is_refused(spheres):
     with pytest.raises(InputFileError, match="before helio calibrate"):  # scaled to the flat of a wrong detector
         find_orientation(spheres.replace(provenance={"calibrate": {}}))
     with pytest.raises(SceneError, match="turn_deg"):
-        make_settings(turn_deg=45)
+        OrientSettings().changed(turn_deg=45)
     with pytest.raises(SceneError, match="min_margins"):
-        make_settings(min_margins="1")
+        OrientSettings().changed(min_margins="1")
 
 
 def test_measured_sphere_a_lies_as_imported(shared):
