@@ -5,11 +5,13 @@ import traceback
 
 from helio_jax.commands import about, heights, measured, simulating  # noqa: F401 (they register their commands)
 from helio_jax.commands.app import app, say
+from helio_jax.compiled import keep_compiled
 from helio_jax.errors import HelioError
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line; ends the process with a documented exit code (errors.py)."""
+    keep_compiled()
     try:
         app(args=args, standalone_mode=True)
     except HelioError as e:

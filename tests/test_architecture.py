@@ -27,7 +27,7 @@ LEVELS = [
     {"predict", "checkpoint", "provenance", "spot", "effects", "truth"},
     {"pipeline", "doctor"},
     {"study", "comparison", "orient"},
-    {"commands"},
+    {"commands", "compiled"},
     {"__main__", "__init__"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
@@ -48,6 +48,7 @@ DOORS = {
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
     "manifold3d": {"scene/drill.py"},
+    "platformdirs": {"compiled.py"},
     "numba": {"kernel.py", "trace/random.py"},
 }
 FOLDERS = {

@@ -19,6 +19,13 @@ def normal_of_slopes(a: Any, b: Any, shift: tuple[float, float]) -> tuple[Any, A
     return -a, -b, 1.0 - a * shift[0] - b * shift[1]
 
 
+def unit_normal(a: Any, b: Any, shift: tuple[float, float]) -> Any:
+    """Return the unit normals [3, ...] of slopes per um of raster [...]."""
+    xp = a.__array_namespace__()
+    n = xp.stack(normal_of_slopes(a, b, shift))
+    return n / xp.sqrt(xp.sum(n * n, axis=0))
+
+
 def slopes_of_normal(normal: np.ndarray, shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the beam-frame slopes (a, b) of normals [..., 3], and where they are usable.
 

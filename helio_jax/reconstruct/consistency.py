@@ -13,7 +13,7 @@ import numpy as np
 
 from helio_jax.arrays import pitch
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.beamframe import normal_of_slopes
+from helio_jax.reconstruct.beamframe import unit_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of
 from helio_jax.reconstruct.model import Prediction
@@ -50,8 +50,7 @@ def misfit(
     """
     height = limited(solve_nearfield(stack, settings, geometry, settings.rounds)[0], stack)
     down, along = np.gradient(height, pitch(stack.y), pitch(stack.x))
-    normal = np.stack(normal_of_slopes(along, down, stack.instrument.beam_shift))
-    normal /= np.linalg.norm(normal, axis=0)
+    normal = unit_normal(along, down, stack.instrument.beam_shift)
     phi, multiple = geometry.form_factor(height), 0.0
     if predict is not None:
         found = predict(height, np.moveaxis(normal, 0, -1))

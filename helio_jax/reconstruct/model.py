@@ -16,9 +16,10 @@ import numpy as np
 from jax.scipy.fft import idctn
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from helio_jax.reconstruct.beamframe import unit_normal
 from helio_jax.reconstruct.edges import one_sided, trapezoid_gap
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.render import render_single, unit_normal
+from helio_jax.reconstruct.render import render_single
 
 SLOPE_STD = 30.0
 """Prior deviation of the slopes: holds those that neither datum nor edge fixes."""
@@ -97,7 +98,7 @@ class Surface(NamedTuple):
 
     def normals(self, shift: tuple[float, float]) -> np.ndarray:
         """Return the unit normals [y, x, 3]."""
-        return np.moveaxis(np.asarray(unit_normal(self.slope_x, self.slope_y, shift)), 0, -1)
+        return np.moveaxis(unit_normal(np.asarray(self.slope_x), np.asarray(self.slope_y), shift), 0, -1)
 
 
 class Lagged(NamedTuple):

@@ -207,7 +207,7 @@ def fit_heights(
                 break
             refiner.torn = None
             changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
-            cost = float(sum(found.cost.values()))
+            cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um:
                 break

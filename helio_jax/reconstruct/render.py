@@ -10,17 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from helio_jax.reconstruct.aiming import aimed_form_factor
-from helio_jax.reconstruct.beamframe import normal_of_slopes
 from helio_jax.reconstruct.formfactor import SpotGeometry, form_factor_of_height
 
 LEAST_COS = 0.05
 """Facets seen under a smaller cosine take the law's power of this one: it has no slope at the horizon."""
-
-
-def unit_normal(slope_x: jax.Array, slope_y: jax.Array, shift: tuple[float, float]) -> jax.Array:
-    """Return the unit normals [3, y, x] of beam-frame slopes [y, x]."""
-    n = jnp.stack(normal_of_slopes(slope_x, slope_y, shift))
-    return n / jnp.sqrt(jnp.sum(n * n, axis=0))
 
 
 def render_single(

@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
-from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Surface, Unknowns
+from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Unknowns
 
 MAX_PIXELS = 30_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -214,11 +214,12 @@ class _Rows:
 
 
 @eqx.filter_jit
-def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
+def _derivatives(model: Model, unknowns: Unknowns, lagged: Lagged):
     """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
 
     In this order: data by surface field, data by instrument, edges and border by instrument, data by level.
     """
+    surface = model.surface(unknowns, lagged)
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
 
@@ -243,10 +244,9 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
 
     tests/gradients/test_model.py compares it with the automatic Jacobian of the residuals.
     """
-    surface = model.surface(unknowns, lagged)
-    shape = surface.height.shape
-    pixel = np.arange(surface.height.size).reshape(shape)
-    data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    shape = lagged.border.shape
+    pixel = np.arange(lagged.border.size).reshape(shape)
+    data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, unknowns, lagged))
     by_parameter = {name: found[name] for name in model.instrument_fields(unknowns)}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):

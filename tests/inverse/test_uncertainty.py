@@ -1,6 +1,7 @@
 """Error bars: against dense algebra, against repeated noise, and where nothing fixes a height."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import sparse
@@ -109,7 +110,7 @@ def test_a_pixel_that_nothing_fixes_has_a_large_deviation(bshem):
     surface, settings = Surface(*np.zeros((3, *shape))), ReconstructSettings()
     refiner = Refiner(signal, (0.03 * signal) ** 2, geometry, 30.0, 30.0, surface, settings)
     with jax.enable_x64(True):
-        unknowns, lagged = refiner.lag(8.0, 4.0)
+        unknowns, lagged = jax.tree.map(jnp.asarray, refiner.lag(8.0, 4.0))
         cut = {
             "edge_x": lagged.edge_x.at[2, 2:4].set(0.0),
             "edge_y": lagged.edge_y.at[1:3, 3].set(0.0),
