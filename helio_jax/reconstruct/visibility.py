@@ -141,11 +141,14 @@ def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, wi
     bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(height).astype(jnp.float64), jnp.uint32)
     chosen = jax.pure_callback(choose, jax.ShapeDtypeStruct((*slices.far.shape, *shape), jnp.int32), bits)
 
-    def add_slice(total, item):
-        piece, march, found = item
+    @jax.checkpoint  # a gradient evaluates slices anew: kept, they would take twenty times the memory of the value
+    def of_slice(piece, march, found):
         tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
         horizon = jnp.maximum(_slope_up(padded, height, march, found), tangent)
-        return total + _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width), None
+        return _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width)
+
+    def add_slice(total, item):
+        return total + of_slice(*item), None
 
     def of_aperture(items):
         return jax.lax.scan(add_slice, jnp.zeros((3, *shape), height.dtype), items)[0]
