@@ -57,6 +57,26 @@ def trapezoid_gap(height: Any, slope: Any, pitch: float, axis: int) -> Any:
     return (after - before) / pitch - 0.5 * sum(along(slope, axis))
 
 
+def bent(slope: Any, bend: Any, axis: int) -> Any:
+    """Return the slopes [y, x] whose means over the two ends of an edge are the edges' slopes on curved surfaces, too.
+
+    A twelfth of the second difference is taken away: the mean is then that of the cubic through four slopes,
+    (-p0 + 13 p1 + 13 p2 - p3) / 24. Source: Gregory's end correction of the trapezoid rule; Hildebrand, Introduction
+    to Numerical Analysis, sec. 5.9.
+
+    Args:
+        slope: at the pixels [y, x].
+        bend: share of it that counts, from `bend_of`; 0 at the border [y, x].
+        axis: 0 (y) or 1 (x).
+    """
+    before, after = along(slope, axis)
+    change = after - before
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    to_previous, to_next = along(slope.__array_namespace__().pad(change, pad), axis)
+    return slope - bend / 12.0 * (to_next - to_previous)
+
+
 def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
     """Return by how much the slope changes in every edge beyond what it does in the edges before and after it.
 
@@ -111,3 +131,21 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
     doubt = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
     misfit = trapezoid_gap(height, slope, pitch, axis) / doubt
     return Edges(doubt, geman_mcclure(misfit, cut) ** 2)
+
+
+def bend_of(intact: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
+    """Return the share of `bent` that counts in every pixel [y, x]: how smooth the surface is in both of its edges.
+
+    Beside a kink the correction errs by a 24th of it; it fades where that is more than the doubt of all edges.
+
+    Args:
+        intact: weight left of the edges.
+        slope: slopes along `axis` [y, x].
+        noise: slope noise of one pixel.
+        axis: 0 (y) or 1 (x).
+    """
+    smooth = intact * geman_mcclure(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    previous, following = along(np.pad(smooth, pad), axis)
+    return previous * following

@@ -16,7 +16,7 @@ import numpy as np
 from jax.scipy.fft import idctn
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from helio_jax.reconstruct.edges import one_sided, trapezoid_gap
+from helio_jax.reconstruct.edges import bent, one_sided, trapezoid_gap
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.render import render_single, unit_normal
 
@@ -129,6 +129,8 @@ class Lagged(NamedTuple):
     intact_y: Any
     edge_x: Any
     edge_y: Any
+    bend_x: Any
+    bend_y: Any
     border: Any
     whitening: Any
     slope_scale_x: Any
@@ -331,8 +333,8 @@ class Model(eqx.Module):
     def edge_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> tuple[jax.Array, jax.Array]:
         """Return the edges' residuals [y, x - 1], [y - 1, x]."""
         scale = self.edge_scale(unknowns, lagged)
-        gap_x = trapezoid_gap(surface.height, surface.slope_x, self.dx, 1)
-        gap_y = trapezoid_gap(surface.height, surface.slope_y, self.dy, 0)
+        gap_x = trapezoid_gap(surface.height, bent(surface.slope_x, lagged.bend_x, 1), self.dx, 1)
+        gap_y = trapezoid_gap(surface.height, bent(surface.slope_y, lagged.bend_y, 0), self.dy, 0)
         return gap_x * lagged.edge_x * scale, gap_y * lagged.edge_y * scale
 
     def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:

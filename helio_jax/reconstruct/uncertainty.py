@@ -253,10 +253,18 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
     scale = np.asarray(model.edge_scale(unknowns, lagged))
-    for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
-        before, after = along(pixel, axis)
+    for axis, part, pitch, weight, bend in (
+        (1, 1, model.dx, lagged.edge_x, lagged.bend_x),
+        (0, 2, model.dy, lagged.edge_y, lagged.bend_y),
+    ):
         w = scale * np.asarray(weight)
-        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
+        of_slopes = []
+        for end, share in zip(along(pixel, axis), along(np.asarray(bend) / 24.0, axis), strict=True):
+            step = pixel.shape[1] if axis == 0 else 1
+            around = (np.clip(end + way, 0, pixel.size - 1) for way in (-step, step))  # at the border, the share is 0
+            of_slopes += [(end, part, -w * (0.5 + 2.0 * share)), *((p, part, w * share) for p in around)]
+        before, after = along(pixel, axis)
+        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), *of_slopes)
     rows.add((pixel, 0, np.asarray(lagged.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
