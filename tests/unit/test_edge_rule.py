@@ -1,4 +1,4 @@
-"""How slopes at the pixels say by how much heights change between them: exact on curved surfaces, never across jumps."""
+"""How slopes at the pixels say by how much heights change between them: exact on curves, never across jumps."""
 
 import numpy as np
 import pytest
