@@ -1,9 +1,10 @@
 """The edges of the raster: whether two neighbouring pixels are joined smoothly, by a kink, or parted by a jump.
 
 The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the
-mean of the two slopes (trapezoid rule), but for a kink somewhere between the two positions, which makes that
-rule uncertain, and for a depth jump, across which it means nothing. All of it is decided on the current surface and
-then held fixed: the weights of the next least-squares solve. Works in NumPy; what takes `Any` also on JAX arrays.
+mean of the two slopes (trapezoid rule; `bent` where the surface is smooth further on), but for a kink somewhere between
+the two positions, which makes that rule uncertain, and for a depth jump, across which it means nothing. All of it is
+decided on the current surface and then held fixed: the weights of the next least-squares solve. Works in NumPy; what
+takes `Any` also on JAX arrays.
 """
 
 from dataclasses import dataclass
@@ -61,8 +62,9 @@ def bent(slope: Any, bend: Any, axis: int) -> Any:
     """Return the slopes [y, x] whose means over the two ends of an edge are the edges' slopes on curved surfaces, too.
 
     A twelfth of the second difference is taken away: the mean is then that of the cubic through four slopes,
-    (-p0 + 13 p1 + 13 p2 - p3) / 24. Source: Gregory's end correction of the trapezoid rule; Hildebrand, Introduction
-    to Numerical Analysis, sec. 5.9.
+    (-p0 + 13 p1 + 13 p2 - p3) / 24. The trapezoid rule alone makes a wave of k radians per pixel too low by
+    (k / 2) / tan(k / 2): 3 % at 10 pixels, 21 % at 4; so it is by 0.2 and 8 %. Source: own derivation; the term is that
+    of Euler and Maclaurin.
 
     Args:
         slope: at the pixels [y, x].

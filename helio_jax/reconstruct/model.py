@@ -23,8 +23,8 @@ from helio_jax.reconstruct.render import render_single, unit_normal
 SLOPE_STD = 30.0
 """Prior deviation of the slopes: holds those that neither datum nor edge fixes."""
 GRADIENT = 0.6
-"""Share of white slope noise that is left when heights must explain it: a half, and what the trapezoid rule does not
-see of changes from pixel to pixel (measured on a flat: 0.57 to 0.61)."""
+"""Share of white slope noise that is left when heights must explain it: a half, and what the edges do not see of
+changes from pixel to pixel (measured on a flat: 0.57 to 0.61)."""
 _LEVEL = 0.9
 """Facets whose unit normal has a larger vertical part count as level."""
 
