@@ -37,9 +37,9 @@ class Linearised:
     Attributes:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
-        far: derivative with respect to the levels of the plateaus through what they hide [residual, plateau], per um;
-            it adds far @ plateau.T to `surface`.
-        plateau: derivative of the levels with respect to the surface [3 * pixel, plateau].
+        far: derivative with respect to the levels of the plateaus through what they hide and, as the last, to the mean
+            height through what the edges count [residual, plateau + 1], per um; it adds far @ plateau.T to `surface`.
+        plateau: derivative of the levels and of the mean height with respect to the surface [3 * pixel, plateau + 1].
         names: of the instrument parameters.
         shape: of the raster (y, x).
     """
@@ -217,7 +217,8 @@ class _Rows:
 def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lagged):
     """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
 
-    In this order: data by surface field, data by instrument, edges and border by instrument, data by level.
+    In this order: data by surface field, data by instrument, edges and border by instrument, data by level, edges by
+    mean height.
     """
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
     directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
@@ -235,7 +236,8 @@ def _derivatives(model: Model, surface: Surface, unknowns: Unknowns, lagged: Lag
     levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
         rise
     )
-    return data, instrument, (*edges, border), levels
+    raised = jax.jvp(lambda s: model.edge_residuals(s, unknowns, lagged), (surface,), (directions[0],))[1]
+    return data, instrument, (*edges, border), levels, raised
 
 
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
@@ -246,13 +248,13 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     surface = model.surface(unknowns, lagged)
     shape = surface.height.shape
     pixel = np.arange(surface.height.size).reshape(shape)
-    data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
+    data, found, of_edges, levels, raised = jax.tree.map(np.asarray, _derivatives(model, surface, unknowns, lagged))
     by_parameter = {name: found[name] for name in model.instrument_fields(unknowns)}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
-    scale = np.asarray(model.edge_scale(unknowns, lagged))
+    scale = np.asarray(model.edge_scale(surface, unknowns, lagged))
     for axis, part, pitch, weight, bend in (
         (1, 1, model.dx, lagged.edge_x, lagged.bend_x),
         (0, 2, model.dy, lagged.edge_y, lagged.bend_y),
@@ -281,9 +283,12 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     instrument[: len(columns)] = columns
     instrument[-len(names) :] = np.eye(len(names))
     plateau = np.asarray(lagged.plateau)
-    far, of_surface = np.zeros((len(instrument), len(plateau))), np.zeros((3 * pixel.size, len(plateau)))
-    far[:n_data] = levels.reshape(n_data, len(plateau))
-    of_surface[::3] = plateau.reshape(len(plateau), pixel.size).T
+    n_far = len(plateau) + 1
+    far, of_surface = np.zeros((len(instrument), n_far)), np.zeros((3 * pixel.size, n_far))
+    far[:n_data, :-1] = levels.reshape(n_data, len(plateau))
+    of_surface[::3, :-1] = plateau.reshape(len(plateau), pixel.size).T
+    edges = np.concatenate([part.ravel() for part in raised])
+    far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
     return Linearised(matrix, instrument, far, of_surface, tuple(names), shape)
 
 
