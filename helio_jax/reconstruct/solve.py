@@ -20,7 +20,7 @@ from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, search_levels, unexplained
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
 from helio_jax.reconstruction import Reconstruction
 
@@ -29,7 +29,7 @@ MAX_WIDTH = 0.125
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 START_THRIFT = 4
-"""The same for the photometric solutions that the fit starts from."""
+"""The same for the photometric solutions that the fit starts from, unless the image is small: it would save little."""
 
 GEOMETRY_DOUBT = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
@@ -226,7 +226,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
     n_paths, shift = settings.refine.paths(stack.counts[0].size), stack.instrument.beam_shift
-    predict, roughly = make_predict(n_paths), make_predict(max(n_paths // START_THRIFT, 1000))
+    predict, roughly = make_predict(n_paths), make_predict(min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS)))
     height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
     start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
     for _ in range(settings.refine.photometric_rounds - 1):

@@ -19,18 +19,19 @@ def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():
 
 def test_only_the_start_is_predicted_with_fewer_paths(bshem):
     """Four photometric solutions with a quarter of the paths, the round of the fit with all of them."""
+    n_paths = 4 * LEAST_PATHS
     axis = 40.0 * np.arange(8.0)
     counts = 35e3 * SpotGeometry(bshem).form_factor(np.zeros((8, 8)))[:, 2]
     stack = MicrographStack(counts, axis, axis, bshem, variance=counts, n_rays=35e3)
     used = []
 
-    def make_predict(n_paths):
+    def make_predict(asked):
         def predict(height, normals):
-            used.append(n_paths)
+            used.append(asked)
             return Prediction(np.zeros(counts.shape), np.zeros((3, 3, 8, 8)))
 
         return predict
 
-    refine = {"rays": 8000, "samples": 0, "max_rounds": 1, "lm_steps": 1, "cg_steps": 2}
+    refine = {"rays": n_paths, "samples": 0, "max_rounds": 1, "lm_steps": 1, "cg_steps": 2}
     reconstruct_stack(stack, ReconstructSettings.model_validate({"refine": refine}), make_predict)
-    assert used == [8000 // START_THRIFT] * RefineSettings().photometric_rounds + [8000]
+    assert used == [n_paths // START_THRIFT] * RefineSettings().photometric_rounds + [n_paths]
