@@ -367,7 +367,7 @@ def main() -> None:
     shared = args.shared if (args.shared / "data").is_dir() else None
     height_rows(record, shared, args.seed, 121, wanted)
     if "3" in wanted:
-        efficiency_row(record, instrument, 50, 48)
+        efficiency_row(record, instrument, 100, 48)
     if "4" in wanted:
         coverage_row(record, instrument, args.fits, 40)
     if "5" in wanted:

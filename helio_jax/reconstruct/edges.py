@@ -1,9 +1,10 @@
 """The edges of the raster: whether two neighbouring pixels are joined smoothly, by a kink, or parted by a jump.
 
 The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the
-mean of the two slopes (trapezoid rule), but for a kink somewhere between the two positions, which makes that
-rule uncertain, and for a depth jump, across which it means nothing. All of it is decided on the current surface and
-then held fixed: the weights of the next least-squares solve. Works in NumPy; what takes `Any` also on JAX arrays.
+mean of the two slopes (trapezoid rule; `bent` where the surface is smooth further on), but for a kink somewhere between
+the two positions, which makes that rule uncertain, and for a depth jump, across which it means nothing. All of it is
+decided on the current surface and then held fixed: the weights of the next least-squares solve. Works in NumPy; what
+takes `Any` also on JAX arrays.
 """
 
 from dataclasses import dataclass
@@ -55,6 +56,27 @@ def trapezoid_gap(height: Any, slope: Any, pitch: float, axis: int) -> Any:
     """Return by how much every edge's slope, (height change) / pitch, exceeds the mean slope of its two ends."""
     before, after = along(height, axis)
     return (after - before) / pitch - 0.5 * sum(along(slope, axis))
+
+
+def bent(slope: Any, bend: Any, axis: int) -> Any:
+    """Return the slopes [y, x] whose means over the two ends of an edge are the edges' slopes on curved surfaces, too.
+
+    A twelfth of the second difference is taken away: the mean is then that of the cubic through four slopes,
+    (-p0 + 13 p1 + 13 p2 - p3) / 24. The trapezoid rule alone makes a wave of k radians per pixel too low by
+    (k / 2) / tan(k / 2): 3 % at 10 pixels, 21 % at 4; so it is by 0.2 and 8 %. Source: own derivation; the term is that
+    of Euler and Maclaurin.
+
+    Args:
+        slope: at the pixels [y, x].
+        bend: share of it that counts, from `bend_of`; 0 at the border [y, x].
+        axis: 0 (y) or 1 (x).
+    """
+    before, after = along(slope, axis)
+    change = after - before
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    to_previous, to_next = along(slope.__array_namespace__().pad(change, pad), axis)
+    return slope - bend / 12.0 * (to_next - to_previous)
 
 
 def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
@@ -111,3 +133,21 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
     doubt = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
     misfit = trapezoid_gap(height, slope, pitch, axis) / doubt
     return Edges(doubt, geman_mcclure(misfit, cut) ** 2)
+
+
+def bend_of(intact: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
+    """Return the share of `bent` that counts in every pixel [y, x]: how smooth the surface is in both of its edges.
+
+    Beside a kink the correction errs by a 24th of it; it fades where that is more than the doubt of all edges.
+
+    Args:
+        intact: weight left of the edges.
+        slope: slopes along `axis` [y, x].
+        noise: slope noise of one pixel.
+        axis: 0 (y) or 1 (x).
+    """
+    smooth = intact * geman_mcclure(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    previous, following = along(np.pad(smooth, pad), axis)
+    return previous * following

@@ -17,15 +17,15 @@ from jax.scipy.fft import idctn
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.reconstruct.beamframe import unit_normal
-from helio_jax.reconstruct.edges import one_sided, trapezoid_gap
+from helio_jax.reconstruct.edges import bent, one_sided, trapezoid_gap
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.render import render_single
 
 SLOPE_STD = 30.0
 """Prior deviation of the slopes: holds those that neither datum nor edge fixes."""
 GRADIENT = 0.6
-"""Share of white slope noise that is left when heights must explain it: a half, and what the trapezoid rule does not
-see of changes from pixel to pixel (measured on a flat: 0.57 to 0.61)."""
+"""Share of white slope noise that is left when heights must explain it: a half, and what the edges do not see of
+changes from pixel to pixel (measured on a flat: 0.57 to 0.61)."""
 _LEVEL = 0.9
 """Facets whose unit normal has a larger vertical part count as level."""
 
@@ -130,6 +130,8 @@ class Lagged(NamedTuple):
     intact_y: Any
     edge_x: Any
     edge_y: Any
+    bend_x: Any
+    bend_y: Any
     border: Any
     whitening: Any
     slope_scale_x: Any
@@ -321,19 +323,38 @@ class Model(eqx.Module):
         """Return (model - data) / standard deviation, robustly weighted [detector, y, x]."""
         return (self.counts(surface, unknowns, lagged) - lagged.data) * lagged.inverse_sigma
 
-    def edge_scale(self, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
-        """Return the factor of the edges' weights: the mean gain.
+    def edge_scale(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+        """Return the factor of the edges' weights: how sensitive the data are to slopes, relative to what is stated.
 
-        Edges count in units of the slope noise that the data's noise makes, which falls with the gain: else a larger
-        gain would explain the noise by smaller slopes, which the edges would prefer, however many pixels there are.
+        Edges count in units of the slope noise that the data's noise makes, which falls with the gain and, near the
+        plate, with the height: else a larger gain or level would explain the noise by smaller slopes, which the edges
+        would prefer, however many pixels there are. For a level facet at the mean height.
         """
-        return jnp.exp(jnp.mean(lagged.gain_std * unknowns.log_gain))
+        weight = jnp.sqrt(jnp.mean(lagged.inverse_sigma**2, (1, 2)))
+        gain = jnp.exp(lagged.gain_std * unknowns.log_gain)
+        moves = self.moves(unknowns, lagged)
+        here = self.sensitivity(jnp.mean(surface.height), moves)
+        stated = self.sensitivity(jnp.zeros(()), None)
+        return jnp.sqrt(jnp.sum((weight * gain * here) ** 2) / jnp.sum((weight * stated) ** 2))
+
+    def sensitivity(self, height: jax.Array, moves: jax.Array | None) -> jax.Array:
+        """Return by how much the signal of a level facet changes with its slopes [2, detector]."""
+        height = jnp.reshape(height, (1, 1))
+        hidden = jnp.zeros((len(self.geometry.rims), 3, 1, 1))
+        level = Surface(height, jnp.zeros_like(height), jnp.zeros_like(height))
+
+        def signal(x, y):
+            normal = self.normal(level._replace(slope_x=x, slope_y=y))
+            return self.single(level, normal, hidden, moves)[:, 0, 0]
+
+        at, one = (level.slope_x, level.slope_y), jnp.ones_like(height)
+        return jnp.stack([jax.jvp(signal, at, way)[1] for way in ((one, 0.0 * one), (0.0 * one, one))])
 
     def edge_residuals(self, surface: Surface, unknowns: Unknowns, lagged: Lagged) -> tuple[jax.Array, jax.Array]:
         """Return the edges' residuals [y, x - 1], [y - 1, x]."""
-        scale = self.edge_scale(unknowns, lagged)
-        gap_x = trapezoid_gap(surface.height, surface.slope_x, self.dx, 1)
-        gap_y = trapezoid_gap(surface.height, surface.slope_y, self.dy, 0)
+        scale = self.edge_scale(surface, unknowns, lagged)
+        gap_x = trapezoid_gap(surface.height, bent(surface.slope_x, lagged.bend_x, 1), self.dx, 1)
+        gap_y = trapezoid_gap(surface.height, bent(surface.slope_y, lagged.bend_y, 0), self.dy, 0)
         return gap_x * lagged.edge_x * scale, gap_y * lagged.edge_y * scale
 
     def residuals(self, unknowns: Unknowns, lagged: Lagged) -> dict[str, jax.Array]:

@@ -22,7 +22,7 @@ from helio_jax.arrays import border_mask
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.aiming import aimed_slopes
 from helio_jax.reconstruct.background import drift_modes
-from helio_jax.reconstruct.edges import Edges, find_edges, geman_mcclure, one_sided, to_pixels
+from helio_jax.reconstruct.edges import Edges, bend_of, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.settings import ReconstructSettings
@@ -371,6 +371,8 @@ class Refiner:
             intact_y=edges_y.intact,
             edge_x=edges_x.weight,
             edge_y=edges_y.weight,
+            bend_x=bend_of(edges_x.intact, slope_x, self.slope_noise, 1),
+            bend_y=bend_of(edges_y.intact, slope_y, self.slope_noise, 0),
             border=self.border,
             whitening=self.whitening,
             slope_scale_x=scale_x,

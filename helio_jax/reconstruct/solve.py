@@ -20,7 +20,7 @@ from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, search_levels, unexplained
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
 from helio_jax.reconstruction import Reconstruction
 
@@ -28,6 +28,8 @@ MAX_WIDTH = 0.125
 """Plateaus are searched up to twice this share of the sample distance above and below the ground ..."""
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
+START_THRIFT = 4
+"""The same for the photometric solutions that the fit starts from, unless the image is small: it would save little."""
 
 GEOMETRY_DOUBT = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
@@ -191,7 +193,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
     slow_axis = 0 if stack.fast_axis == "x" else 1
     fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
-    roughly = make_predict(max(settings.refine.rays // SEARCH_THRIFT, 1000))
+    roughly = make_predict(max(settings.refine.paths(region.size) // SEARCH_THRIFT, 1000))
     for is_last in (False, True):
         single = unexplained(region, fit.residuals)
         left = single if is_last else joined(single)
@@ -223,11 +225,12 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    predict, shift = make_predict(settings.refine.rays), stack.instrument.beam_shift
+    n_paths, shift = settings.refine.paths(stack.counts[0].size), stack.instrument.beam_shift
+    predict, roughly = make_predict(n_paths), make_predict(min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS)))
     height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
-    start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, predict)
+    start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
     for _ in range(settings.refine.photometric_rounds - 1):
-        start = _corrected(stack, settings, geometry, start.height, start.normals(shift), predict)
+        start = _corrected(stack, settings, geometry, start.height, start.normals(shift), roughly)
     fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
     from helio_jax.reconstruct.findings import describe_instrument
 

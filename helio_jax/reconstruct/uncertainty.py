@@ -37,9 +37,9 @@ class Linearised:
     Attributes:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
-        far: derivative with respect to the levels of the plateaus through what they hide [residual, plateau], per um;
-            it adds far @ plateau.T to `surface`.
-        plateau: derivative of the levels with respect to the surface [3 * pixel, plateau].
+        far: derivative with respect to the levels of the plateaus through what they hide and, as the last, to the mean
+            height through what the edges count [residual, plateau + 1], per um; it adds far @ plateau.T to `surface`.
+        plateau: derivative of the levels and of the mean height with respect to the surface [3 * pixel, plateau + 1].
         names: of the instrument parameters.
         shape: of the raster (y, x).
     """
@@ -217,7 +217,8 @@ class _Rows:
 def _derivatives(model: Model, unknowns: Unknowns, lagged: Lagged):
     """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
 
-    In this order: data by surface field, data by instrument, edges and border by instrument, data by level.
+    In this order: data by surface field, data by instrument, edges and border by instrument, data by level, edges by
+    mean height; and the factor of the edges' weights.
     """
     surface = model.surface(unknowns, lagged)
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
@@ -236,7 +237,8 @@ def _derivatives(model: Model, unknowns: Unknowns, lagged: Lagged):
     levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
         rise
     )
-    return data, instrument, (*edges, border), levels
+    raised = jax.jvp(lambda s: model.edge_residuals(s, unknowns, lagged), (surface,), (directions[0],))[1]
+    return data, instrument, (*edges, border), levels, raised, model.edge_scale(surface, unknowns, lagged)
 
 
 def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
@@ -246,17 +248,25 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     """
     shape = lagged.border.shape
     pixel = np.arange(lagged.border.size).reshape(shape)
-    data, found, of_edges, levels = jax.tree.map(np.asarray, _derivatives(model, unknowns, lagged))
-    by_parameter = {name: found[name] for name in model.instrument_fields(unknowns)}
+    found = jax.tree.map(np.asarray, _derivatives(model, unknowns, lagged))
+    data, instrument, of_edges, levels, raised, scale = found
+    by_parameter = {name: instrument[name] for name in model.instrument_fields(unknowns)}
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
-    scale = np.asarray(model.edge_scale(unknowns, lagged))
-    for axis, part, pitch, weight in ((1, 1, model.dx, lagged.edge_x), (0, 2, model.dy, lagged.edge_y)):
-        before, after = along(pixel, axis)
+    for axis, part, pitch, weight, bend in (
+        (1, 1, model.dx, lagged.edge_x, lagged.bend_x),
+        (0, 2, model.dy, lagged.edge_y, lagged.bend_y),
+    ):
         w = scale * np.asarray(weight)
-        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), (before, part, -0.5 * w), (after, part, -0.5 * w))
+        of_slopes = []
+        for end, share in zip(along(pixel, axis), along(np.asarray(bend) / 24.0, axis), strict=True):
+            step = pixel.shape[1] if axis == 0 else 1
+            around = (np.clip(end + way, 0, pixel.size - 1) for way in (-step, step))  # at the border, the share is 0
+            of_slopes += [(end, part, -w * (0.5 + 2.0 * share)), *((p, part, w * share) for p in around)]
+        before, after = along(pixel, axis)
+        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), *of_slopes)
     rows.add((pixel, 0, np.asarray(lagged.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
@@ -266,17 +276,20 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
         return np.concatenate([blocks[name].reshape(n, -1) for name in by_parameter], 1)
 
     of_x, of_y, of_border = of_edges
-    parts = (found, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size), (of_border, pixel.size)
+    parts = (instrument, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size), (of_border, pixel.size)
     columns = np.concatenate([of_instrument(blocks, n) for blocks, n in parts])
     matrix = rows.stack(n_more=len(names))
-    instrument = np.zeros((rows.n_rows + len(names), len(names)))
-    instrument[: len(columns)] = columns
-    instrument[-len(names) :] = np.eye(len(names))
+    by_instrument = np.zeros((rows.n_rows + len(names), len(names)))
+    by_instrument[: len(columns)] = columns
+    by_instrument[-len(names) :] = np.eye(len(names))
     plateau = np.asarray(lagged.plateau)
-    far, of_surface = np.zeros((len(instrument), len(plateau))), np.zeros((3 * pixel.size, len(plateau)))
-    far[:n_data] = levels.reshape(n_data, len(plateau))
-    of_surface[::3] = plateau.reshape(len(plateau), pixel.size).T
-    return Linearised(matrix, instrument, far, of_surface, tuple(names), shape)
+    n_far = len(plateau) + 1
+    far, of_surface = np.zeros((len(by_instrument), n_far)), np.zeros((3 * pixel.size, n_far))
+    far[:n_data, :-1] = levels.reshape(n_data, len(plateau))
+    of_surface[::3, :-1] = plateau.reshape(len(plateau), pixel.size).T
+    edges = np.concatenate([part.ravel() for part in raised])
+    far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
+    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape)
 
 
 def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:

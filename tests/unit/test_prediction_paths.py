@@ -1,0 +1,37 @@
+"""How many paths the fit asks for: enough for every pixel, fewer for what it only starts from."""
+
+import numpy as np
+
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
+from helio_jax.reconstruct.solve import START_THRIFT, reconstruct_stack
+
+
+def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():
+    """A large image gets as many paths per pixel as any other: a fixed number drowned sphere A's ring in noise."""
+    large = 351 * 304
+    assert RefineSettings().paths(large) == PATHS_PER_PIXEL * large > 10_000_000
+    assert RefineSettings().paths(100) == LEAST_PATHS
+    assert RefineSettings(rays=20_000).paths(large) == 20_000
+
+
+def test_only_the_start_is_predicted_with_fewer_paths(bshem):
+    """Four photometric solutions with a quarter of the paths, the round of the fit with all of them."""
+    n_paths = 4 * LEAST_PATHS
+    axis = 40.0 * np.arange(8.0)
+    counts = 35e3 * SpotGeometry(bshem).form_factor(np.zeros((8, 8)))[:, 2]
+    stack = MicrographStack(counts, axis, axis, bshem, variance=counts, n_rays=35e3)
+    used = []
+
+    def make_predict(asked):
+        def predict(height, normals):
+            used.append(asked)
+            return Prediction(np.zeros(counts.shape), np.zeros((3, 3, 8, 8)))
+
+        return predict
+
+    refine = {"rays": n_paths, "samples": 0, "max_rounds": 1, "lm_steps": 1, "cg_steps": 2}
+    reconstruct_stack(stack, ReconstructSettings.model_validate({"refine": refine}), make_predict)
+    assert used == [n_paths // START_THRIFT] * RefineSettings().photometric_rounds + [n_paths]
