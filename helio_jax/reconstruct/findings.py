@@ -28,7 +28,8 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
         "offset": (settings.offset_std, "of the signal"),
         "log_multiple": (settings.multiple_error, "relative"),
         "drift": (settings.drift_std, "of the signal"),
-        "law": (settings.law_std, "of the exponent"),
+        "power": (settings.law_std, "of the exponent"),
+        "forward": (settings.forward_std, "of the specular bias"),
         "distance": (sure.sample_distance_um, "um"),
         "tilt": (sure.tilt_deg, "deg"),
         "polar": (sure.polar_deg, "deg"),
@@ -36,10 +37,16 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
     }
 
 
+_PARTS = {"aim": ("polar", "azimuth"), "law": ("power", "forward")}
+"""Kinds of the parameters that are kept together, by their last index."""
+
+
 def _kind(name: str) -> str:
     """Return the kind of a parameter like "aim[2, 0]"."""
     head, _, index = name.partition("[")
-    return head if head != "aim" else ("polar", "azimuth")[int(index.rstrip("]").split(",")[1])]
+    if head not in _PARTS:
+        return head
+    return _PARTS[head][int(index.rstrip("]").split(",")[-1])]
 
 
 def _plain(name: str, detectors: tuple[str, ...]) -> str:
@@ -47,7 +54,7 @@ def _plain(name: str, detectors: tuple[str, ...]) -> str:
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = _kind(name)
-    if kind in ("distance", "unseen", "law"):
+    if kind in ("distance", "unseen", "power", "forward"):
         return kind
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"
