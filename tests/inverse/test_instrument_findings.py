@@ -101,7 +101,8 @@ def test_power_of_the_law(bshem):
     away = -phi[0, :, 0, 0] / np.linalg.norm(phi[0, :, 0, 0])
     normal = np.stack([np.array([0.0, 0.0, 1.0]), away], -1)[:, None]
     plain, powered = (
-        np.asarray(render_single(np.zeros((1, 2)), normal, 0.0 * phi, geometry, None, law)) for law in (None, np.array([0.3, 0.0]))
+        np.asarray(render_single(np.zeros((1, 2)), normal, 0.0 * phi, geometry, None, law))
+        for law in (None, np.array([0.3, 0.0]))
     )
     cos = phi[:, 2, 0, 0] / np.linalg.norm(phi[:, :, 0, 0], axis=1)
     assert np.allclose(powered[:, 0, 0], plain[:, 0, 0] * cos**0.3, rtol=1e-5)
