@@ -6,9 +6,9 @@ Each scan: background 65 % of the reading, gains that differ by more than 2, dri
 of scan lines, Poisson noise; apertures aimed up to one prior deviation elsewhere than stated. The stack that is
 calibrated and fitted, both with default settings, knows the stated instrument only. Truth scores, and nothing else.
 
---transfer: the geometry fitted to sphere A is frozen in an instrument file; the micrographs of sphere B, recorded by the
-same faulty instrument with other drift and noise, are predicted with it, gain, offset and drift fitted: chi-square per
-pixel, beside that of the stated instrument and of the true one.
+--transfer: the geometry fitted to sphere A is frozen in an instrument file; the micrographs of sphere B, recorded by
+the same faulty instrument with other drift and noise, are predicted with it, gain, offset and drift fitted: chi-square
+per pixel, beside that of the stated instrument and of the true one.
 """
 
 import argparse

@@ -10,7 +10,7 @@ from helio_jax.reconstruction import Reconstruction
 
 _MOST = 30.0
 """Largest uncertainty of an angle that an instrument file may state [deg]."""
-_COMMENT = """# Instrument file, geometry as fitted to {name} by helio reconstruct: a starting point for other scans of this
+_COMMENT = """# Instrument file: the geometry that helio reconstruct fitted to {name}, for other scans of this
 # instrument. [uncertainty] is what that fit left open, the largest of all detectors. How far the sample stands below
 # the plate is a matter of the scene (plate.sample_distance_um); there it was {distance:.1f} um.
 
