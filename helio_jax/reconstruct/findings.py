@@ -28,8 +28,7 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
         "offset": (settings.offset_std, "of the signal"),
         "log_multiple": (settings.multiple_error, "relative"),
         "drift": (settings.drift_std, "of the signal"),
-        "power": (settings.law_std, "of the exponent"),
-        "forward": (settings.forward_std, "of the specular bias"),
+        "law": (settings.law_std, "of the exponent"),
         "distance": (sure.sample_distance_um, "um"),
         "tilt": (sure.tilt_deg, "deg"),
         "polar": (sure.polar_deg, "deg"),
@@ -37,16 +36,10 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
     }
 
 
-_PARTS = {"aim": ("polar", "azimuth"), "law": ("power", "forward")}
-"""Kinds of the parameters that are kept together, by their last index."""
-
-
 def _kind(name: str) -> str:
     """Return the kind of a parameter like "aim[2, 0]"."""
     head, _, index = name.partition("[")
-    if head not in _PARTS:
-        return head
-    return _PARTS[head][int(index.rstrip("]").split(",")[-1])]
+    return head if head != "aim" else ("polar", "azimuth")[int(index.rstrip("]").split(",")[1])]
 
 
 def _plain(name: str, detectors: tuple[str, ...]) -> str:
@@ -54,7 +47,7 @@ def _plain(name: str, detectors: tuple[str, ...]) -> str:
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = _kind(name)
-    if kind in ("distance", "unseen", "power", "forward"):
+    if kind in ("distance", "unseen", "law"):
         return kind
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"

@@ -238,8 +238,8 @@ class Model(eqx.Module):
         moves = self.moves(unknowns, lagged)
         if moves is not None:
             hidden = hidden + jnp.einsum("mk,mkiyx->kiyx", moves - lagged.predicted_moves, lagged.hidden_moves)
-        law = lagged.law_std * unknowns.law if unknowns.law.size else None
-        single = self.single(surface, self.normal(surface), hidden, moves, law)
+        power = jnp.sum(lagged.law_std * unknowns.law) if unknowns.law.size else None
+        single = self.single(surface, self.normal(surface), hidden, moves, power)
         albedo = smooth_albedo(unknowns.albedo, surface.height.shape, self.albedo_std)
         gain = jnp.exp(lagged.gain_std * unknowns.log_gain)[:, None, None]
         multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
@@ -271,11 +271,11 @@ class Model(eqx.Module):
         normal: jax.Array,
         hidden: jax.Array,
         moves: jax.Array | None,
-        law: jax.Array | None = None,
+        power: jax.Array | None = None,
     ) -> jax.Array:
         """Return the single-scattering probabilities [detector, y, x]; the geometry as stated, or moved."""
         lower, aim = (0.0, None) if moves is None else (moves[0, 0], moves[1:].T)
-        return render_single(surface.height - lower, normal, hidden, self.geometry, aim, law)
+        return render_single(surface.height - lower, normal, hidden, self.geometry, aim, power)
 
     def noise_change(
         self,

@@ -216,7 +216,7 @@ class Refiner:
         k, n = self.signal.shape[0], s.albedo_modes
         lines = self.signal.shape[1 + self.model.slow_axis] if s.line_std else 0
         shapes = {"log_gain": k, "offset": k, "log_multiple": k, "unseen": (), "albedo": (n, n)}
-        shapes |= {"drift": (k, len(self.drift)), "lines": (k, lines), "law": 2 if s.law_std or s.forward_std else 0}
+        shapes |= {"drift": (k, len(self.drift)), "lines": (k, lines), "law": 1 if s.law_std else 0}
         is_aimed = s.geometry and (sure.polar_deg or sure.azimuth_deg)
         shapes["distance"] = 1 if s.geometry and sure.sample_distance_um else 0
         shapes |= {"tilt": 2 if s.geometry and sure.tilt_deg else 0, "aim": (k, 2) if is_aimed else 0}
@@ -355,7 +355,7 @@ class Refiner:
             multiple_std=s.multiple_error * np.ones(len(self.signal)),
             drift_std=s.drift_std * self.mean_signal[:, None],
             lines_std=s.line_std * self.mean_signal,
-            law_std=np.array([s.law_std, s.forward_std]),
+            law_std=s.law_std,
             distance_std=sure.sample_distance_um,
             tilt_std=np.radians(sure.tilt_deg),
             aim_std=self.aim_std,

@@ -29,7 +29,7 @@ def render_single(
     hidden: jax.Array,
     geometry: SpotGeometry,
     aim: jax.Array | None = None,
-    law: jax.Array | None = None,
+    power: jax.Array | None = None,
 ) -> jax.Array:
     """Return the single-scattering detection probability of every pixel [detector, y, x].
 
@@ -39,19 +39,12 @@ def render_single(
         hidden: hidden part of the form factor [detector, 3, y, x].
         geometry: where a point of a given height is, static.
         aim: changes of the apertures' polar angles and azimuths [detector, 2], rad, or None.
-        law: (m, a) of a law cos^(1 + m) (1 + a cos(g)) instead of the cosine law, g being the angle to the direction of
-            specular reflection; None: 0. The power is not normalised, the bias towards the specular direction is, for
-            the cosine law's mean direction has 2/3 of the normal's length. Angles are those of the aperture's mean
-            direction.
+        power: m of a law cos^(1 + m), not normalised, instead of the cosine law; the cosine is that of the angle
+            between the normal and the aperture's mean direction. None: 0.
     """
     at = form_factor_of_height(geometry, height) if aim is None else aimed_form_factor(geometry, height, aim)
     single = jnp.einsum("kiyx,iyx->kyx", at - hidden, normal)
-    if law is None:
+    if power is None:
         return single
-    toward = at / jnp.sqrt(jnp.sum(at**2, axis=1, keepdims=True))
-    cos = jnp.einsum("kiyx,iyx->kyx", toward, normal)
-    beam = jnp.asarray(geometry.instrument.beam_direction)
-    incidence = -jnp.tensordot(beam, normal, 1)
-    specular = jnp.einsum("kiyx,i->kyx", toward, beam) + 2.0 * incidence * cos
-    bias = (1.0 + law[1] * specular) / (1.0 + 2.0 / 3.0 * law[1] * incidence)
-    return single * jnp.maximum(cos, LEAST_COS) ** law[0] * bias
+    cos = jnp.einsum("kiyx,iyx->kyx", at, normal) / jnp.sqrt(jnp.sum(at**2, axis=1))
+    return single * jnp.maximum(cos, LEAST_COS) ** power

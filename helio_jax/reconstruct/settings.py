@@ -26,8 +26,6 @@ class RefineSettings(Settings):
     """Prior deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
     law_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
-    forward_std: float = Field(default=0.0, ge=0.0, le=0.5)
-    """Prior deviation of a in a scattering law cos (1 + a cos(g)), g: angle to the specular direction; 0: none."""
     geometry: bool = True
     """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)

@@ -56,8 +56,7 @@ def stated(bshem):
 def unknown(bshem):
     """All of the instrument is unknown, as with measured data."""
     sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
-    free = {"drift_std": 0.2, "line_std": 0.02, "law_std": 0.1, "forward_std": 0.2}
-    return make_problem(bshem.model_copy(update={"uncertainty": sure}), **free)
+    return make_problem(bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law_std=0.1)
 
 
 @pytest.fixture(params=["stated", "unknown"])
