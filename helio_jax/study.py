@@ -30,6 +30,7 @@ from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError
 from helio_jax.evaluate.sweep import save_sweep
 from helio_jax.explain import explain_errors
 from helio_jax.formats.safe import atomic_path
+from helio_jax.formats.toml import to_toml
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.files import read_bytes
 from helio_jax.settings import Settings
@@ -329,30 +330,6 @@ def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: b
             first = f"the first, point {failed[0]['point']}: {failed[0]['problem']}"
             raise GuardError(f"{len(failed)} of {len(rows)} points failed ({folder / 'index.csv'}); {first}")
     return folder / "index.csv"
-
-
-def to_toml(tables: Mapping[str, Any]) -> str:
-    """Return a tree of JSON-compatible values as TOML: one line per value below each top table; None is left out."""
-    values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None}
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items()]
-    for name, table in tables.items():
-        if isinstance(table, Mapping):
-            lines += ["", f"[{_key(name)}]"]
-            lines += [f"{_key(k)} = {_value(v)}" for k, v in table.items() if v is not None]
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    # JSON's texts, numbers and truth values are TOML's
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _key(key: str) -> str:
-    return key if key.isascii() and key.replace("_", "").replace("-", "").isalnum() else json.dumps(key)
 
 
 def _short(values: dict[str, Any]) -> str:

@@ -69,6 +69,8 @@ ObjFile = Annotated[
 ]
 FIGURE = _written_as("a figure", ".png", ".pdf", ".svg")
 """Callback of options that name a picture to write."""
+TOML = _written_as("TOML", ".toml")
+"""Callback of options that name a scene or instrument file to write."""
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]

@@ -11,6 +11,7 @@ import typer
 
 from helio_jax.commands.app import (
     FIGURE,
+    TOML,
     AsJson,
     Bar,
     H5File,
@@ -30,6 +31,9 @@ def reconstruct(
     method: Method = None,
     settings: Annotated[Path | None, typer.Option(help="Scene file whose table [reconstruct] is used.")] = None,
     border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
+    write_instrument: Annotated[
+        Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml).", callback=TOML)
+    ] = None,
 ) -> None:
     """Turn three or more micrographs into a height map."""
     from helio_jax import pipeline, write
@@ -41,6 +45,10 @@ def reconstruct(
     with Bar("reconstructing") as bar:
         result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
     write(result, output)
+    if write_instrument:
+        from helio_jax.formats import toml
+
+        toml.write_instrument(result, write_instrument)
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
     for name, factor in result.provenance.get("sensitivity", {}).items():
         print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
@@ -128,7 +136,8 @@ def _print_instrument(found: dict[str, Any]) -> None:
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
     if found.get("widening", 1.0) > 1.0:
         print(
-            f"  geometry and instrument file disagree: all error bars are {found['widening']:.1f} times as wide for it"
+            f"  geometry and instrument file disagree: all error bars are {found['widening']:.1f} times as wide for it "
+            f"(and up to {found.get('bent_um', 0.0):.0f} um more, for what the fitted geometry did to the heights)"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())

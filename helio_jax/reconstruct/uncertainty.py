@@ -88,6 +88,7 @@ class Posterior:
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
         widening: factor by which all deviations were enlarged, for the instrument disagrees with what it says.
+        bent: error of all heights together that was added for the same reason, one standard deviation [y, x], um.
     """
 
     samples: np.ndarray
@@ -97,6 +98,7 @@ class Posterior:
     names: tuple[str, ...]
     stride: int = 1
     widening: float = 1.0
+    bent: np.ndarray | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -108,20 +110,32 @@ class Posterior:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
 
-    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...]) -> "Posterior":
-        """Return it with all deviations times the `disagreement` of the fitted instrument `values` called `names`."""
+    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...], seed: int = 1) -> "Posterior":
+        """Return it with error bars that allow for a model that lacks something.
+
+        Where the fitted `values` of the unknowns called `names` are farther from what was stated than prior and data
+        explain (`disagreement`), all deviations are multiplied by that factor f. And something else may have bent them:
+        then heights are wrong by what they, and all that followed them, did to the heights. The share 1 - 1 / f^2 of
+        that change's square is added to the heights' variance, one error for all of the surface.
+        """
         of = [name for name in self.fields if name in names]
         if not of:
             return self
         mine = np.array([name.partition("[")[0] in of for name in self.names])
         flat = np.concatenate([np.ravel(values[name]) for name in of])
-        factor = disagreement(flat, self.instrument_covariance[np.ix_(mine, mine)])
+        own = self.instrument_covariance[np.ix_(mine, mine)]
+        factor = disagreement(flat, own)
+        followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
+        bent = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
+        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
+        how_far /= np.sqrt(np.mean(how_far**2))
         return replace(
             self,
-            samples=factor * self.samples,
+            samples=factor * self.samples + how_far[:, None, None] * bent,
             instrument_samples=factor * self.instrument_samples,
             instrument_covariance=factor**2 * self.instrument_covariance,
             widening=factor,
+            bent=bent,
         )
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
@@ -133,7 +147,8 @@ class Posterior:
             for n, m in zip(shape, self.samples.shape[1:], strict=True)
         ]
         full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
-        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride)
+        bent = None if self.bent is None else full(self.bent[None])[0]
+        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
 
 
 @dataclass(frozen=True)

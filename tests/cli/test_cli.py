@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from helio_jax.config import load_instrument
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -52,7 +54,9 @@ def test_steps_one_by_one(small_scene, finished, tmp_path):
     """simulate, reconstruct, evaluate, report, info on files give exit code 0 and say what they did."""
     stack, height = tmp_path / "s.h5", tmp_path / "h.h5"
     assert helio("simulate", small_scene, "-o", stack, "--rays", 16, "--noise").returncode == 0
-    assert helio("reconstruct", stack, "-o", height, "--method", "refine").returncode == 0
+    found = tmp_path / "found.toml"
+    done = helio("reconstruct", stack, "-o", height, "--method", "refine", "--write-instrument", found)
+    assert done.returncode == 0 and len(load_instrument(found).detector_names) == 3
     scored = helio("evaluate", height, "--truth", small_scene, "--json")
     assert scored.returncode == 0 and json.loads(scored.stdout)["n_pixels"] > 50
     against = helio("evaluate", height, "--truth", finished / "height.h5", "--json")
@@ -72,6 +76,7 @@ def test_steps_one_by_one(small_scene, finished, tmp_path):
         (["import", "{junk}", "-o", "x.h5"], 3, "junk.mat"),
         (["info", "{junk}"], 3, "junk.mat"),
         (["reconstruct", "{stack}", "-o", "{out}", "--method", "magic"], 2, "method"),
+        (["reconstruct", "{stack}", "-o", "{out}", "--write-instrument", "found.json"], 2, ".toml"),
     ],
 )
 def test_exit_codes(args, code, words, finished, tmp_path):
