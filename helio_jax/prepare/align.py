@@ -38,7 +38,7 @@ class AlignSettings(Settings):
     max_rotation_deg: float = Field(default=3.0, gt=0.0, le=20.0)
     """Automatic: largest error of the stage's rotation [deg]; two scans may differ by twice as much."""
     min_correlation: float = Field(default=0.2, gt=0.0, lt=1.0)
-    """Automatic: least correlation of a scan's fine structure with what the others predict."""
+    """Automatic: least correlation of a scan's fine structure with what the others predict (linear photometry)."""
     min_margin: float = Field(default=0.15, ge=0.0, lt=1.0)
     """Automatic: by how much of its height that correlation must stand above the next peak, 5 or more pixels away."""
     max_std_px: float = Field(default=0.5, gt=0.0, le=10.0)
@@ -209,17 +209,18 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
     matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
     if one is not None:
         matches = tuple(replace(m, std_um=std) for m, std in zip(matches, one.std_um, strict=True))
-    is_peaked = one is None  # the linear prediction of what one albedo decided has its peak some pixels off
+    is_linear = one is None  # smooth samples have no fine structure to correlate; what one albedo decided is shaken
     errors = _stage_errors([m.rotation for m in aligner.motions], rotations)
     for k, (stack, match, motion) in enumerate(zip(scans.stacks, matches, aligner.motions, strict=True)):
         turned = math.degrees(abs(errors[k]))
         moved = math.dist(motion.apply(aligner.frame.center), aligner.views[k].center)
         checks = (
-            (match.correlation < settings.min_correlation, "correlation with the prediction from the other scans",
+            (is_linear and match.correlation < settings.min_correlation,
+             "correlation with the prediction from the other scans",
              f"{match.correlation:.2f}", f">= {settings.min_correlation:g}"),
-            (is_peaked and match.margin < settings.min_margin, "margin of its peak over the next one",
+            (is_linear and match.margin < settings.min_margin, "margin of its peak over the next one",
              f"{match.margin:.2f}", f">= {settings.min_margin:g}"),
-            (is_peaked and match.offset > 1.5, "distance of that peak from the fit",
+            (is_linear and match.offset > 1.5, "distance of that peak from the fit",
              f"{match.offset:.1f} px", "<= 1.5 px"),
             (not match.std_um <= settings.max_std_px * aligner.frame.step, "standard deviation of its place",
              f"{match.std_um / aligner.frame.step:.2f} px", f"<= {settings.max_std_px:g} px"),

@@ -6,7 +6,7 @@ constant (I = rho n . Phi + background, three unknowns per pixel). Its coefficie
 gains, backgrounds nor apertures need be known. Gauss-Newton on rotation and shift, coarse to fine, ends below a pixel.
 Error bars are sandwich estimates over blocks of the picture plus a jackknife over the predicting views, so they feel
 masks and other errors of the model; and what changes when slower shades are let in is added. On smooth round objects
-the latter matters: shifts of all views along their detectors look like a change of albedo there.
+the latter matters: shifts of all views along their detectors look like a change of albedo there (onealbedo.py).
 
 Source: linear combination: Shashua, Int. J. Comput. Vis. 21 (1997) 99; sandwich: White, Econometrica 48 (1980) 817;
 jackknife: Efron & Stein, Ann. Statist. 9 (1981) 586.

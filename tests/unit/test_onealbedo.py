@@ -65,8 +65,8 @@ def worst_px(found, true, scans) -> float:
 def test_a_common_displacement_comes_back(hills):
     """From 3 pixels off in common and up to 1 of each field alone: below 0.5 px; deviation stated above 0.05 px.
 
-    Catches a turn of a scan that leaves its detector's direction, slopes of the images not turned into the common
-    frame, and an albedo that is free (2 px then).
+    Catches slopes of the images that are not turned into the common frame. (Not an albedo that is free: hills without
+    shadows or multiple scattering are told by six images alone; traced balls are not.)
     """
     scans, true = hills
     rng = np.random.default_rng(0)
@@ -82,7 +82,7 @@ def test_a_common_displacement_comes_back(hills):
 def test_the_step_goes_down_the_misfit(hills):
     """Scores of all common unknowns are minus the slopes of the misfit with the normals solved anew (differences).
 
-    Catches any wrong sign or missing factor in a derivative: shifts, turns, gains, share, polar angle.
+    Catches any wrong sign or missing factor in a derivative, and a turn of a scan that leaves its detector's direction.
     """
     scans, true = hills
     fit = _Fit(scans.stacks, displaced(true, 0.7 * PITCH), 1.5, 0.05)
@@ -123,5 +123,5 @@ def test_hills_are_aligned_without_a_hand_and_spotty_ones_refused(hills):
     assert worst_px(found.motions, true, scans) < 0.7
     assert found.as_dict()["one_albedo"]["albedo_spread"] == found.one_albedo.albedo_spread
     spotted, _ = make_hills(spotty=0.8)
-    with pytest.raises(GuardError, match="refused"):
+    with pytest.raises(GuardError, match=r"its robust deviation must be <= 0\.1"):
         align_scans(spotted)
