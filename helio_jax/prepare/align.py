@@ -7,7 +7,7 @@ reason when the scans do not fix them. Rigid only: no stretching, no drift withi
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from helio_jax.arrays import pitch
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.prepare.autoalign import Aligner, Match
+from helio_jax.prepare.onealbedo import OneAlbedo, align_one_albedo
 from helio_jax.prepare.points import Picks, PointFit, fit_points, rms
 from helio_jax.prepare.resample import resample
 from helio_jax.prepare.rigid import Rigid
@@ -37,16 +38,19 @@ class AlignSettings(Settings):
     max_rotation_deg: float = Field(default=3.0, gt=0.0, le=20.0)
     """Automatic: largest error of the stage's rotation [deg]; two scans may differ by twice as much."""
     min_correlation: float = Field(default=0.2, gt=0.0, lt=1.0)
-    """Automatic: least correlation of a scan's fine structure with what the others predict."""
+    """Automatic: least correlation of a scan's fine structure with what the others predict (linear photometry)."""
     min_margin: float = Field(default=0.15, ge=0.0, lt=1.0)
     """Automatic: by how much of its height that correlation must stand above the next peak, 5 or more pixels away."""
     max_std_px: float = Field(default=0.5, gt=0.0, le=10.0)
     """Automatic: largest standard deviation of a pixel's place [pixels]."""
     min_restoring: float = Field(default=0.08, ge=0.0, lt=1.0)
-    """Automatic: least share of a common displacement of all fields that one fit of each takes back.
+    """Automatic: share of a common displacement of all fields that one fit of each must take back to be relied on.
 
     The model's own error per view, some hundredths of a pixel, over this is the scans' joint error. Traced crystals,
-    pyramids, rough surfaces have 0.2 to 0.65, balls and soft hills, whose errors are 1 to 5 pixels, 0.06 or less."""
+    pyramids, rough surfaces have 0.2 to 0.65, balls and soft hills, whose errors are 1 to 5 pixels, 0.06 or less: below
+    it the motions are fitted with one albedo instead (onealbedo.py)."""
+    max_albedo_spread: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Automatic: largest robust deviation of the albedo where only one albedo tells the motions."""
     max_left_out_px: float = Field(default=3.0, gt=0.0, le=100.0)
     """Control points: largest root mean square of the leave-one-out errors [pixels]."""
 
@@ -61,6 +65,7 @@ class Alignment:
         std_um: standard deviation of a pixel's place per axis, for each scan [um].
         matches: automatic: of each scan.
         restoring: automatic: share of a common displacement of all fields that is taken back (`Aligner.restoring`).
+        one_albedo: automatic: the fit with one albedo, where `restoring` was too little.
         points: control points: their fit.
         problems: why the result should not be trusted; empty when it may be.
     """
@@ -70,6 +75,7 @@ class Alignment:
     std_um: tuple[float, ...]
     matches: tuple[Match, ...] | None = None
     restoring: float | None = None
+    one_albedo: OneAlbedo | None = None
     points: PointFit | None = None
     problems: tuple[str, ...] = ()
 
@@ -89,6 +95,9 @@ class Alignment:
         }
         if self.restoring is not None:
             out["restoring"] = self.restoring if math.isfinite(self.restoring) else None
+        if self.one_albedo is not None:
+            names = ("albedo_spread", "share", "polar_deg")
+            out["one_albedo"] = {name: getattr(self.one_albedo, name) for name in names}
         if self.matches is not None:
             for scan, match in zip(out["scans"], self.matches, strict=True):
                 scan["match"] = {k: v if math.isfinite(v) else None for k, v in asdict(match).items()}
@@ -182,25 +191,37 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
     aligner = Aligner(
         [View.of(s) for s in scans.stacks], rotations, float(reach), math.radians(settings.max_rotation_deg)
     )
-    aligner.run()
-    matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
-    restoring = aligner.restoring()
-    problems = []
+    aligner.start_on_edges()
+    start, restoring = list(aligner.motions), aligner.restoring()
+    if restoring >= settings.min_restoring:
+        aligner.run()
+        restoring = aligner.restoring()
+    one, problems = None, []
     if not restoring >= settings.min_restoring:
-        problems.append(
-            "the scans together: share of a common displacement of their fields that the fit takes back must be >= "
-            f"{settings.min_restoring:g}, got {restoring:.3f} (smooth round relief does not fix it)"
-        )
+        one = align_one_albedo(scans.stacks, start)
+        aligner.motions = list(one.motions)
+        if not one.albedo_spread <= settings.max_albedo_spread:
+            problems.append(
+                f"the scans together: a common displacement of their fields shows only in the albedo (share taken back "
+                f"by the photometric fit {restoring:.3f}, limit {settings.min_restoring:g}), and its robust deviation "
+                f"must be <= {settings.max_albedo_spread:g}, got {one.albedo_spread:.3f}"
+            )
+    matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
+    if one is not None:
+        matches = tuple(replace(m, std_um=std) for m, std in zip(matches, one.std_um, strict=True))
+    is_linear = one is None  # smooth samples have no fine structure to correlate; what one albedo decided is shaken
     errors = _stage_errors([m.rotation for m in aligner.motions], rotations)
     for k, (stack, match, motion) in enumerate(zip(scans.stacks, matches, aligner.motions, strict=True)):
         turned = math.degrees(abs(errors[k]))
         moved = math.dist(motion.apply(aligner.frame.center), aligner.views[k].center)
         checks = (
-            (match.correlation < settings.min_correlation, "correlation with the prediction from the other scans",
+            (is_linear and match.correlation < settings.min_correlation,
+             "correlation with the prediction from the other scans",
              f"{match.correlation:.2f}", f">= {settings.min_correlation:g}"),
-            (match.margin < settings.min_margin, "margin of its peak over the next one",
+            (is_linear and match.margin < settings.min_margin, "margin of its peak over the next one",
              f"{match.margin:.2f}", f">= {settings.min_margin:g}"),
-            (match.offset > 1.5, "distance of that peak from the fit", f"{match.offset:.1f} px", "<= 1.5 px"),
+            (is_linear and match.offset > 1.5, "distance of that peak from the fit",
+             f"{match.offset:.1f} px", "<= 1.5 px"),
             (not match.std_um <= settings.max_std_px * aligner.frame.step, "standard deviation of its place",
              f"{match.std_um / aligner.frame.step:.2f} px", f"<= {settings.max_std_px:g} px"),
             (turned > settings.max_rotation_deg, "error of the stage's rotation",
@@ -213,7 +234,13 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
     stds = (0.0, *(m.std_um for m in matches[1:]))
     names = tuple(s.name for s in scans.stacks)
     return Alignment(
-        names, tuple(aligner.motions), stds, matches=matches, restoring=restoring, problems=tuple(problems)
+        names,
+        tuple(aligner.motions),
+        stds,
+        matches=matches,
+        restoring=restoring,
+        one_albedo=one,
+        problems=tuple(problems),
     )
 
 

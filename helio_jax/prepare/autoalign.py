@@ -6,7 +6,7 @@ constant (I = rho n . Phi + background, three unknowns per pixel). Its coefficie
 gains, backgrounds nor apertures need be known. Gauss-Newton on rotation and shift, coarse to fine, ends below a pixel.
 Error bars are sandwich estimates over blocks of the picture plus a jackknife over the predicting views, so they feel
 masks and other errors of the model; and what changes when slower shades are let in is added. On smooth round objects
-the latter matters: shifts of all views along their detectors look like a change of albedo there.
+the latter matters: shifts of all views along their detectors look like a change of albedo there (onealbedo.py).
 
 Source: linear combination: Shashua, Int. J. Comput. Vis. 21 (1997) 99; sandwich: White, Econometrica 48 (1980) 817;
 jackknife: Efron & Stein, Ann. Statist. 9 (1981) 586.
@@ -84,8 +84,7 @@ class Aligner:
         ]
 
     def run(self) -> None:
-        """Move the views until they stay."""
-        self._start_on_edges()
+        """Move the views, after `start_on_edges`, until they stay."""
         for search in range(_SEARCHES):
             for k in range(1, len(self.views)):
                 self._search(k, self.turns[len(self.turns) // 2 :: len(self.turns)] if search else self.turns)
@@ -105,7 +104,7 @@ class Aligner:
     def _turned(self, motion: Rigid, angle: float) -> Rigid:
         return motion.after(about(self.frame.center, angle, np.zeros(2)))
 
-    def _start_on_edges(self) -> None:
+    def start_on_edges(self) -> None:
         """Place view after view, the clearest first, by its edges against the mean of those placed."""
         edges = [view.edges() for view in self.views]
         total, known = read(edges[:1], self.motions[0], self.frame)

@@ -245,7 +245,7 @@ def test_stage_errors_are_not_blamed_on_one_scan():
 def test_refuses_what_does_not_fix_it():
     """Pure noise, too few scans, oblique incidence, no scans of one name, a limit not met: each with its reason."""
     noise, _ = make_scans(25, noise_only=True)
-    with pytest.raises(GuardError, match=r"refused: .*scan .* margin of its peak"):
+    with pytest.raises(GuardError, match=r"refused: .*scan .* standard deviation of its place"):
         align_scans(noise)
     scans, _ = make_scans(21)
     with pytest.raises(InputFileError, match="needs 4 or more scans, got 3"):
