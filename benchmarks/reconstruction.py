@@ -187,8 +187,8 @@ def gradient_row(record: Record, instrument: Instrument, shape: tuple[int, int])
         def cost(u, fixed):
             return sum(jnp.sum(r**2) for r in refiner.model.residuals(u, fixed).values())
 
-        def masked(surface):
-            return jnp.sum(hidden_form_factor(*surface, geometry, pitch, pitch) ** 2)
+        def masked(at: Surface):
+            return jnp.sum(hidden_form_factor(at.height, at.slope_x, at.slope_y, geometry, pitch, pitch) ** 2)
 
         for name, value, given in (
             ("residuals of the fit", cost, (unknowns, lagged)),
