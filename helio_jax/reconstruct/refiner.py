@@ -116,28 +116,24 @@ class Solution(NamedTuple):
 
 
 @eqx.filter_jit
-def _mixing(model: Model, start: Unknowns, lagged: Lagged, is_level_free: np.ndarray) -> jax.Array:
-    """Return the matrix whose columns are instruments and levels that the data tell apart, by one standard deviation.
+def _mixing(model: Model, start: Unknowns, lagged: Lagged) -> jax.Array:
+    """Return the matrix whose columns are instruments that the data tell apart, each by one standard deviation.
 
-    Gains, offsets, drift, angles and the level of all heights [um], the last row, have much the same effect on the
-    data, and by far more than one pixel's height: as they are, conjugate gradients would take many steps for them
-    alone. The level takes part 1 or 0 times; a flat border holds it.
+    Gains, offsets, drift and angles have much the same effect on the data, and by far more than one pixel's height:
+    as they are, conjugate gradients would take many steps for them alone.
     """
     names = model.instrument_fields(start)
     surface = model.surface(start, lagged)
-    flat, restore = ravel_pytree(({name: getattr(start, name) for name in names}, jnp.zeros(1)))
+    flat, restore = ravel_pytree({name: getattr(start, name) for name in names})
 
     def residuals(values):
-        instrument, level = restore(values)
-        unknowns, raised = start._replace(**instrument), surface._replace(height=surface.height + is_level_free * level)
-        parts = model.data_residuals(raised, unknowns, lagged), model.border_residuals(raised, unknowns, lagged)
+        unknowns = start._replace(**restore(values))
+        parts = model.data_residuals(surface, unknowns, lagged), model.border_residuals(surface, unknowns, lagged)
         return jnp.concatenate([part.ravel() for part in parts])
 
     jacobian = jax.jacfwd(residuals)(flat)
-    prior = jnp.ones(flat.size).at[-1].add(-is_level_free)
-    factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
-    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size), lower=True).T
-    return mixing.at[-1].multiply(is_level_free)
+    factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.eye(flat.size))
+    return jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size), lower=True).T
 
 
 @eqx.filter_jit
@@ -158,19 +154,17 @@ def _solve(
         lambda s: s.search, solver, _NearlyNewton(low_constant=_SHRINK), is_leaf=lambda n: n is solver.search
     )
     names = model.instrument_fields(start)
-    flat, restore = ravel_pytree(({name: getattr(start, name) for name in names}, jnp.zeros(1)))
+    flat, restore = ravel_pytree({name: getattr(start, name) for name in names})
     seen = jnp.sum(lagged.inverse_sigma**2, 2 - model.slow_axis) * lagged.lines_std[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
     mixing = is_instrument_free * mixing
 
     def decoded(variables: jax.Array) -> Unknowns:
         surface, mixed, lines = split(variables)
-        instrument, level = restore(flat + mixing @ mixed)
-        unknowns = start._replace(**surface, **instrument)
-        unknowns = unknowns._replace(height=unknowns.height.at[0, 0].add(level[0] * level_mode))
+        unknowns = start._replace(**surface)
+        unknowns = unknowns._replace(**restore(flat + mixing @ mixed))
         return unknowns._replace(lines=start.lines + line_scale * lines) if start.lines.size else unknowns
 
-    level_mode = jnp.sqrt(lagged.border.size) / lagged.whitening[0, 0]
     surface = {name: getattr(start, name) for name in Surface._fields}
     # one vector each, for every array of a tree is compiled by itself
     variables, split = ravel_pytree((surface, jnp.zeros_like(flat), jnp.zeros_like(start.lines)))
@@ -228,7 +222,6 @@ class Refiner:
         shape = start.height.shape
         self.whitening = _whitening(shape, dx, dy, self.slope_noise)
         self.border = _border_weight(shape, settings)
-        self.is_level_free = settings.border == "free"
         self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
         self.surface = Surface(*map(np.asarray, start))
         self.drift = drift_modes(shape, slow_axis, s.drift_degrees) if s.drift_std else np.zeros((0, *shape))
@@ -329,11 +322,10 @@ class Refiner:
         return self.moves is not None or len(self.drift) > 0
 
     def _mixing(self, model: Model, start: Unknowns, lagged: Lagged) -> jax.Array | np.ndarray:
-        """Return the instruments and levels that are fitted; instruments as they are where little is unknown."""
-        if self.is_unknown or self.is_level_free:
-            return _mixing(model, start, lagged, np.asarray(float(self.is_level_free)))
-        n = sum(getattr(start, name).size for name in model.instrument_fields(start))
-        return np.diag([1.0] * n + [0.0])
+        """Return the instruments that are fitted: as they are where hardly anything is unknown of it."""
+        if self.is_unknown:
+            return _mixing(model, start, lagged)
+        return np.eye(sum(getattr(start, name).size for name in model.instrument_fields(start)))
 
     def tear(self) -> None:
         """Cut all edges that may lie behind a rim, until `torn` is None again; only where the instrument is unknown."""
