@@ -146,7 +146,7 @@ def _solve(
     mixing: jax.Array | np.ndarray,
     is_instrument_free: np.ndarray,
 ) -> Solution:
-    """Solve from `start`; the instrument, 1 or 0 times free, moves along the columns of `mixing`."""
+    """Solve from `start`; the instrument, 1 or 0 times free, and the sample's albedo move along `mixing`'s columns."""
     solver = optx.LevenbergMarquardt(
         rtol=1e-4, atol=1e-6, linear_solver=lx.Normal(_TruncatedCG(rtol=1e-2, atol=0.0, max_steps=cg_steps))
     )
@@ -157,7 +157,8 @@ def _solve(
     flat, restore = ravel_pytree({name: getattr(start, name) for name in names})
     seen = jnp.sum(lagged.inverse_sigma**2, 2 - model.slow_axis) * lagged.lines_std[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
-    mixing = is_instrument_free * mixing
+    is_free = {n: jnp.full_like(getattr(start, n), 1.0 if n == "albedo" else is_instrument_free) for n in names}
+    mixing = ravel_pytree(is_free)[0][:, None] * mixing
 
     def decoded(variables: jax.Array) -> Unknowns:
         surface, mixed, lines = split(variables)
