@@ -109,9 +109,7 @@ def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case
 
 def settings_of(scene: SceneFile, refine: dict[str, object]) -> ReconstructSettings:
     """Return a scene's settings with some of the fit's replaced."""
-    settings = scene.reconstruct.model_dump()
-    settings["refine"] |= refine
-    return ReconstructSettings.model_validate(settings)
+    return scene.reconstruct.changed(refine=scene.reconstruct.refine.changed(**refine))
 
 
 def fit(scene: SceneFile, stack: MicrographStack, **refine: object) -> Case:

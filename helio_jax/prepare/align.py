@@ -209,25 +209,25 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
     matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
     if one is not None:
         matches = tuple(replace(m, std_um=std) for m, std in zip(matches, one.std_um, strict=True))
-    is_linear = one is None  # smooth samples have no fine structure to correlate; what one albedo decided is shaken
     errors = _stage_errors([m.rotation for m in aligner.motions], rotations)
     for k, (stack, match, motion) in enumerate(zip(scans.stacks, matches, aligner.motions, strict=True)):
         turned = math.degrees(abs(errors[k]))
         moved = math.dist(motion.apply(aligner.frame.center), aligner.views[k].center)
-        checks = (
-            (is_linear and match.correlation < settings.min_correlation,
-             "correlation with the prediction from the other scans",
-             f"{match.correlation:.2f}", f">= {settings.min_correlation:g}"),
-            (is_linear and match.margin < settings.min_margin, "margin of its peak over the next one",
-             f"{match.margin:.2f}", f">= {settings.min_margin:g}"),
-            (is_linear and match.offset > 1.5, "distance of that peak from the fit",
-             f"{match.offset:.1f} px", "<= 1.5 px"),
+        checks = [
             (not match.std_um <= settings.max_std_px * aligner.frame.step, "standard deviation of its place",
              f"{match.std_um / aligner.frame.step:.2f} px", f"<= {settings.max_std_px:g} px"),
             (turned > settings.max_rotation_deg, "error of the stage's rotation",
              f"{turned:.2f} deg", f"<= {settings.max_rotation_deg:g} deg"),
             (moved > reach, "shift of its centre", f"{moved:.0f} um", f"<= {reach:g} um"),
-        )  # fmt: skip
+        ]  # fmt: skip
+        if one is None:  # smooth samples have no fine structure to correlate
+            checks += [
+                (match.correlation < settings.min_correlation, "correlation with the prediction from the other scans",
+                 f"{match.correlation:.2f}", f">= {settings.min_correlation:g}"),
+                (match.margin < settings.min_margin, "margin of its peak over the next one",
+                 f"{match.margin:.2f}", f">= {settings.min_margin:g}"),
+                (match.offset > 1.5, "distance of that peak from the fit", f"{match.offset:.1f} px", "<= 1.5 px"),
+            ]  # fmt: skip
         problems += [
             f"scan {stack.name!r}: {what} must be {limit}, got {got}" for bad, what, got, limit in checks if bad
         ]

@@ -258,11 +258,11 @@ class _Fit:
         self.m = self.m + step * np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1), 1e-9))[:, None]
 
     def _reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return matrix and scores of the common unknowns, the normals eliminated ([n, n], [pixel, n]).
+        """Return matrix and right side of the step of the common unknowns, the normals eliminated ([n, n], [n]).
 
         Unknowns: x, y [um] and turn of every view but the first, log gain of every image, share, polar angle.
         """
-        matrix, right, weight, by_m = self._normal_system(_redescending)
+        matrix, of_normals, weight, by_m = self._normal_system(_redescending)
         lit, t, _ = self._misfit()
         n_motion, n_images = 3 * (len(self.stacks) - 1), len(self.view)
         _, by_polar, by_turn = self._directions()
@@ -281,17 +281,17 @@ class _Fit:
         solved = np.linalg.solve(matrix, across)
         root = np.sqrt(weight)[..., None] * model
         whole = np.tensordot(root, root, ((0, 1), (0, 1))) - np.tensordot(across, solved, ((0, 1), (0, 1)))
-        scores = np.einsum("kp,kpg,kp->pg", weight, model, t) - np.einsum("pig,pi->pg", solved, right)
-        return whole, scores
+        scores = np.einsum("kp,kpg,kp->pg", weight, model, t) - np.einsum("pig,pi->pg", solved, of_normals)
+        right = scores.sum(0)
+        whole[-1, -1] += self.alike / _POLAR_STD**2
+        right[-1] -= self.alike * self.more_polar / _POLAR_STD**2
+        return whole, right
 
     def _advance(self, move: bool = True) -> bool:
         """Do a Gauss-Newton step of everything, shorter if the misfit would grow; return whether it was done."""
         self._settle()
         before = self._cost()
-        whole, scores = self._reduced()
-        right = scores.sum(0)
-        whole[-1, -1] += self.alike / _POLAR_STD**2
-        right[-1] -= self.alike * self.more_polar / _POLAR_STD**2
+        whole, right = self._reduced()
         n_motion = 3 * (len(self.stacks) - 1)
         free = np.arange(0 if move else n_motion, right.size)
         step = _solve(whole, right, free)
@@ -340,7 +340,6 @@ class _Fit:
     def std_um(self) -> list[float]:
         """Return a pixel's standard deviation per axis for every scan: errors of the model alike over whole squares."""
         whole, _ = self._reduced()
-        whole[-1, -1] += self.alike / _POLAR_STD**2
         scale = np.sqrt(np.maximum(np.diag(whole), 1e-12))
         covariance = np.linalg.inv(whole / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)) / np.outer(scale, scale)
         scale2 = self.alike * self._birge()

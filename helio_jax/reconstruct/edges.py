@@ -39,11 +39,16 @@ def ranked(region: np.ndarray) -> np.ndarray:
     return rank[region]
 
 
-def to_pixels(edge: Any, axis: int) -> Any:
-    """Return for every pixel the sum over its two edges along `axis`; the adjoint of summing an edge's two ends."""
+def around(edge: Any, axis: int) -> tuple[Any, Any]:
+    """Return for every pixel [y, x] the values of the edges before and after it along `axis`; 0 outside the raster."""
     pad = [(0, 0), (0, 0)]
     pad[axis] = (1, 1)
-    before, after = along(edge.__array_namespace__().pad(edge, pad), axis)
+    return along(edge.__array_namespace__().pad(edge, pad), axis)
+
+
+def to_pixels(edge: Any, axis: int) -> Any:
+    """Return for every pixel the sum over its two edges along `axis`; the adjoint of summing an edge's two ends."""
+    before, after = around(edge, axis)
     return before + after
 
 
@@ -72,10 +77,7 @@ def bent(slope: Any, bend: Any, axis: int) -> Any:
         axis: 0 (y) or 1 (x).
     """
     before, after = along(slope, axis)
-    change = after - before
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (1, 1)
-    to_previous, to_next = along(slope.__array_namespace__().pad(change, pad), axis)
+    to_previous, to_next = around(after - before, axis)
     return slope - bend / 12.0 * (to_next - to_previous)
 
 
@@ -88,8 +90,8 @@ def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
     change = np.abs(after - before)
     pad = [(0, 0), (0, 0)]
     pad[axis] = (1, 1)
-    around = np.pad(change, pad, mode="edge")
-    neighbours = np.maximum(*(np.take(around, range(s, s + change.shape[axis]), axis) for s in (0, 2)))
+    padded = np.pad(change, pad, mode="edge")
+    neighbours = np.maximum(*(np.take(padded, range(s, s + change.shape[axis]), axis) for s in (0, 2)))
     return np.maximum(change - neighbours, 0.0)
 
 
@@ -147,7 +149,5 @@ def bend_of(intact: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> n
         axis: 0 (y) or 1 (x).
     """
     smooth = intact * geman_mcclure(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (1, 1)
-    previous, following = along(np.pad(smooth, pad), axis)
+    previous, following = around(smooth, axis)
     return previous * following

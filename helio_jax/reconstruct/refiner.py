@@ -322,10 +322,11 @@ class Refiner:
         """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""
         return self.moves is not None or len(self.drift) > 0
 
-    def _mixing(self, model: Model, start: Unknowns, lagged: Lagged) -> jax.Array | np.ndarray:
-        """Return the instruments that are fitted: as they are where hardly anything is unknown of it."""
-        if self.is_unknown:
-            return _mixing(model, start, lagged)
+    def _mixing(self, problem: tuple[Model, Unknowns, Lagged], is_instrument_free: bool) -> jax.Array | np.ndarray:
+        """Return the instruments that are fitted: as they are where it is held or hardly anything of it is unknown."""
+        if self.is_unknown and is_instrument_free:
+            return _mixing(*problem)
+        model, start, _ = problem
         return np.eye(sum(getattr(start, name).size for name in model.instrument_fields(start)))
 
     def tear(self) -> None:
@@ -403,8 +404,9 @@ class Refiner:
         """Solve one weighted least-squares problem from the current surface."""
         s = self.settings
         problem = self.model, *self.lag(limit, cut)
+        mixing = self._mixing(problem, is_instrument_free)
         # an array: one compilation serves both cases
-        found = _solve(*problem, s.lm_steps, s.cg_steps, self._mixing(*problem), np.asarray(float(is_instrument_free)))
+        found = _solve(*problem, s.lm_steps, s.cg_steps, mixing, np.asarray(float(is_instrument_free)))
         self.surface = Surface(*map(np.asarray, found.surface))
         self.values = {name: np.asarray(getattr(found.unknowns, name)) for name in INSTRUMENT}
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
