@@ -44,9 +44,24 @@ def recorded(scene: SceneFile, seed: int) -> tuple[MicrographStack, np.ndarray]:
     rng = np.random.default_rng([seed, 0xFA17])
     aim = np.array([SURE.polar_deg, SURE.azimuth_deg]) * rng.uniform(-1.0, 1.0, (len(scene.detector), 2))
     misaimed = scene.model_copy(update={"detector": scene.moved(np.radians(aim), 0.0).detector})
-    stack = pipeline.simulate(misaimed, rays=64, seed=seed)
+    stack = pipeline.simulate(misaimed, rays=64, seed=seed).only()
+    instrument = scene.moved(np.zeros((3, 2)), 0.0).model_copy(update={"uncertainty": SURE})
+    return read_by(stack.counts, stack, instrument, rng), aim
+
+
+def read_by(
+    counts: np.ndarray, stack: MicrographStack, instrument: Instrument, rng: np.random.Generator
+) -> MicrographStack:
+    """Return counts [detector, y, x] as unlike gains, background, drift, scan lines and noise leave them to be read.
+
+    Args:
+        counts: expected from the sample, in any unit.
+        stack: whose raster and name they have.
+        instrument: what is told of it.
+        rng: of drift, lines and noise.
+    """
     signal = np.array(SIGNALS)[:, None, None]
-    counts = stack.counts / np.median(stack.counts, axis=(1, 2), keepdims=True) * signal
+    counts = counts / np.median(counts, axis=(1, 2), keepdims=True) * signal
     lines, along = np.linspace(-1.0, 1.0, stack.shape[2]), np.linspace(-1.0, 1.0, stack.shape[1])[:, None]
     background = signal * BACKGROUND_SHARE / (1.0 - BACKGROUND_SHARE)
     waves = [np.cos(np.pi * (i * lines + rng.uniform(0, 2))) for i in (0.5, 1.0)]
@@ -55,8 +70,7 @@ def recorded(scene: SceneFile, seed: int) -> tuple[MicrographStack, np.ndarray]:
     )
     offsets = 0.02 * rng.normal(size=(3, 1, lines.size))
     mean = counts + background + signal * (drift + offsets)
-    instrument = scene.moved(np.zeros((3, 2)), 0.0).model_copy(update={"uncertainty": SURE})
-    read = MicrographStack(
+    return MicrographStack(
         rng.poisson(mean).astype(float),
         stack.x,
         stack.y,
@@ -64,9 +78,8 @@ def recorded(scene: SceneFile, seed: int) -> tuple[MicrographStack, np.ndarray]:
         variance=mean,
         fast_axis="y",
         noise="measured",
-        name=scene.name,
+        name=stack.name,
     )
-    return read, aim
 
 
 def sized(case: str, size: int) -> SceneFile:
