@@ -15,6 +15,7 @@ import numpy as np
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
+from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
@@ -211,6 +212,13 @@ def fit_heights(
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um:
                 break
+        if settings.border == "free" and s.bias_pairs and not is_interrupted:
+            try:
+                if report:
+                    report(len(changes) - 1, s.max_rounds, f"{said}; simulating the bias by noise")
+                refiner.move_back(*noise_bias(refiner, s.bias_pairs))
+            except KeyboardInterrupt:
+                is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         return _finish(refiner, changes, is_interrupted, posterior)
 
