@@ -22,6 +22,8 @@ from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior,
 
 GEOMETRY = "distance", "tilt", "aim"
 """Unknowns that tell of a model that lacks something where they come out farther off than stated: error bars widen."""
+GAINS, OFF_BY_FAR = ("log_gain", "offset"), 2.0
+"""The same, but only where they are off by more than this factor: it is they that usually differ by chance."""
 
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
@@ -123,7 +125,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
-    return found.widened(refiner.values, GEOMETRY).on_raster(refiner.signal.shape[1:], stride)
+    found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
+    return found.on_raster(refiner.signal.shape[1:], stride)
 
 
 def misfit_on(
@@ -210,7 +213,7 @@ def fit_heights(
             changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
-            if changes[-1] < s.tolerance_um:
+            if changes[-1] < s.tolerance_um and number >= n_fixed:
                 break
         if settings.border == "free" and s.bias_pairs and not is_interrupted:
             try:
