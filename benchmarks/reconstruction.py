@@ -295,7 +295,10 @@ def step_row(record: Record, seed: int) -> None:
         value, std = rec.spread(lambda h: float(np.median(h[up]) - np.median(h[~up])))
         return {"step_um": value, "std_um": std, "true_um": 100.0, "flagged": float(np.mean(rec.reason == 5))}
 
-    record.do("5", "step of 100 um facing away", step, "std > 20 % of it, floating", lambda c: bool(c["flagged"] > 0.1))
+    def is_honest(case: Case) -> bool:
+        return bool(case["std_um"] > 0.2 * abs(case["step_um"]) and case["flagged"] > 0.1)
+
+    record.do("5", "step of 100 um facing away", step, "std > 20 % of it, floating", is_honest)
 
 
 def trench_row(record: Record, seed: int) -> None:

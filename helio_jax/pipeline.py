@@ -276,7 +276,7 @@ def reconstruct(
     refine = chosen.refine
 
     def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
-        return make_predictor(one, n_rays, refine.substrate_um, multiple=refine.multiple)
+        return make_predictor(one, n_rays, refine.substrate_um, multiple=refine.multiple, border=chosen.border)
 
     rec = reconstruct_stack(one, chosen, make_predict, report)
     others = [f"{name} ({kind})" for name, kind in one.provenance.get("materials", {}).items() if kind != "cosine"]

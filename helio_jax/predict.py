@@ -52,14 +52,16 @@ def make_predictor(
     seed: int = 7,
     workers: int | None = None,
     multiple: Literal["traced", "radiosity"] = "traced",
+    border: Literal["flat", "free"] = "flat",
 ) -> Callable[..., Prediction]:
     """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
 
-    The surface is continued by a flat at z = 0 of side `substrate_um`, or as far beyond each border as the plate is
-    away: steep facets see most of what is near their horizon.
+    The surface is continued to a square of side `substrate_um`, or as far beyond each border as the plate is away, for
+    steep facets see most of what is near their horizon: with a `flat` border by the flat z = 0, with a `free` one by
+    the heights at the border, which go on outwards (in radiosity by the flat in either case).
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
     what is traced, by the cosine law.
 
@@ -72,13 +74,13 @@ def make_predictor(
             "set it to 'traced'"
         )
     dx, dy = pitch(stack.x), pitch(stack.y)
-    border = max(np.abs(stack.x).max(), np.abs(stack.y).max())
+    half = max(np.abs(stack.x).max(), np.abs(stack.y).max())
 
     @lru_cache(maxsize=1)
     def about_instrument(given: str) -> tuple[SpotGeometry, _Raster, Radiosity | None]:
         instrument = Instrument.model_validate_json(given).with_cosine_plate()
-        reach = border + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * border)
-        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach)
+        reach = half + instrument.sample_distance if substrate_um is None else max(0.5 * substrate_um, 1.001 * half)
+        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat")
         geometry = SpotGeometry(instrument)
         return geometry, raster, Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
 
@@ -158,22 +160,36 @@ class _Side:
 
 @dataclass(frozen=True)
 class _Raster:
-    """Beam positions [y, x], how far off the surface points are put, and half the side of the flat around [um]."""
+    """Beam positions [y, x], how far off the surface points are put, half the side of what is around [um], and whether
+    that is the flat z = 0; else the heights at the border go on."""
 
     instrument: Instrument
     x: np.ndarray
     y: np.ndarray
     lift: float
     reach: float
+    is_flat_around: bool
 
     def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> _Side:
         """Return the surface with its unseen side at a share of the way back."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
         at = *self.instrument.surface_position(self.x, self.y, height), height
         sheet = behind_rims(*at, normals, shift, share)
-        body = surface_body(*sheet, self.reach, level=0.0, beam_shift=shift)
+        if self.is_flat_around:
+            body = surface_body(*sheet, self.reach, level=0.0, beam_shift=shift)
+        else:
+            body = surface_body(*self._continued(*sheet))
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
         return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
+
+    def _continued(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return points of the grid with a ring more, as far out as the surface reaches, as high as the border."""
+        x, y, z = (np.pad(field, 1, mode="edge") for field in (x, y, z))
+        for field, at, axis in ((x, self.x, 1), (y, self.y, 0)):
+            first, last = ((0, slice(None)), (-1, slice(None))) if axis == 0 else ((slice(None), 0), (slice(None), -1))
+            field[first] -= self.reach + at.min()
+            field[last] += self.reach - at.max()
+        return x, y, z
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
         """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""

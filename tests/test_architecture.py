@@ -43,8 +43,8 @@ DOORS = {
         for name in ("figures", "agreement_figure", "before_after", "overlay", "pick", "ripple_figure", "spot", "sweep")
     },
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
-    "optimistix": {"reconstruct/refiner.py"},
-    "lineax": {"reconstruct/refiner.py"},
+    "optimistix": {"reconstruct/leastsquares.py"},
+    "lineax": {"reconstruct/leastsquares.py"},
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
     "manifold3d": {"scene/drill.py"},

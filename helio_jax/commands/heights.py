@@ -136,8 +136,8 @@ def _print_instrument(found: dict[str, Any]) -> None:
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
     if found.get("widening", 1.0) > 1.0:
         print(
-            f"  geometry and instrument file disagree: all error bars are {found['widening']:.1f} times as wide for it "
-            f"(and up to {found.get('bent_um', 0.0):.0f} um more, for what the fitted geometry did to the heights)"
+            f"  the instrument comes out farther off than stated: all error bars are {found['widening']:.1f} times as "
+            f"wide for it (and up to {found.get('bent_um', 0.0):.0f} um more, for what that did to the heights)"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())

@@ -15,12 +15,15 @@ import numpy as np
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
+from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 
 GEOMETRY = "distance", "tilt", "aim"
 """Unknowns that tell of a model that lacks something where they come out farther off than stated: error bars widen."""
+GAINS, OFF_BY_FAR = ("log_gain", "offset"), 2.0
+"""The same, but only where they are off by more than this factor: it is they that usually differ by chance."""
 
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
@@ -122,7 +125,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
-    return found.widened(refiner.values, GEOMETRY).on_raster(refiner.signal.shape[1:], stride)
+    found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
+    return found.on_raster(refiner.signal.shape[1:], stride)
 
 
 def misfit_on(
@@ -209,8 +213,15 @@ def fit_heights(
             changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
-            if changes[-1] < s.tolerance_um:
+            if changes[-1] < s.tolerance_um and number >= n_fixed:
                 break
+        if settings.border == "free" and s.bias_pairs and not is_interrupted:
+            try:
+                if report:
+                    report(len(changes) - 1, s.max_rounds, f"{said}; simulating the bias by noise")
+                refiner.move_back(*noise_bias(refiner, s.bias_pairs))
+            except KeyboardInterrupt:
+                is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         return _finish(refiner, changes, is_interrupted, posterior)
 

@@ -1,4 +1,4 @@
-"""One solve of the fit: the problem lagged at the current surface, and Levenberg-Marquardt; only door to optimistix.
+"""The state of one fit: surface, instrument, and the problem lagged there that `leastsquares` solves.
 
 Unknowns: height and two slopes of every pixel, gain and offset of every detector, scale of the multiple scattering, a
 smooth albedo. They are whitened so that plain conjugate gradients converge in a few steps: heights by the cosine
@@ -6,16 +6,13 @@ transform, h = DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as devi
 differences.
 """
 
+import copy
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from scipy.fft import dctn
 
 from helio_jax.arrays import border_mask
@@ -24,12 +21,10 @@ from helio_jax.reconstruct.aiming import aimed_slopes
 from helio_jax.reconstruct.background import drift_modes
 from helio_jax.reconstruct.edges import Edges, bend_of, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.leastsquares import Solution, solve, whitened_instrument
 from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.shadows import shadow_edges
-
-_FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
-"""Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
 
 _NOISY = 3.0
 """Deviation that slopes are credited with at most, in those of a pixel with median noise."""
@@ -38,42 +33,6 @@ _HELD = 1e-5
 
 Predict = Callable[..., Prediction]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Prediction; the instrument is given, too, where it is unknown."""
-
-
-class _TruncatedCG(lx.CG):
-    """Conjugate gradients from 0, until the norm of the residual has fallen by `rtol` or the steps are up.
-
-    An inexact Newton step. The operator is compiled once, where `lx.CG` has three copies of it.
-
-    Source: Hestenes and Stiefel, J. Res. NBS 49 (1952) 409; Dembo, Eisenstat and Steihaug, SINUM 19 (1982) 400.
-    """
-
-    def compute(self, state, vector, options):
-        operator, _ = state
-        square = jnp.vdot(vector, vector)
-
-        def is_unfinished(carry):
-            _, _, _, now, step = carry
-            return (now > self.rtol**2 * square) & (step < self.max_steps)
-
-        def body(carry):
-            x, r, p, now, step = carry
-            image = operator.mv(p)
-            size = now / jnp.vdot(p, image)
-            x, r = x + size * p, r - size * image
-            new = jnp.vdot(r, r)
-            return x, r, r + new / now * p, new, step + 1
-
-        x, _, _, _, steps = jax.lax.while_loop(is_unfinished, body, (jnp.zeros_like(vector), vector, vector, square, 0))
-        return x, lx.RESULTS.successful, {"num_steps": steps, "max_steps": self.max_steps}
-
-
-class _NearlyNewton(optx.ClassicalTrustRegion):
-    """Trust region that starts with little damping: the start is good, and damping would freeze weak modes."""
-
-    def init(self, y, f_info_struct):
-        state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.asarray(_FIRST_STEP_SIZE))
 
 
 def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float) -> np.ndarray:
@@ -106,82 +65,9 @@ def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.
     return weight
 
 
-class Solution(NamedTuple):
-    """One solve: unknowns, surface, expected data, and the cost of every kind of residual."""
-
-    unknowns: Unknowns
-    surface: Surface
-    counts: jax.Array
-    cost: dict[str, jax.Array]
-
-
 @eqx.filter_jit
-def _mixing(model: Model, start: Unknowns, lagged: Lagged) -> jax.Array:
-    """Return the matrix whose columns are instruments that the data tell apart, each by one standard deviation.
-
-    Gains, offsets, drift and angles have much the same effect on the data, and by far more than one pixel's height:
-    as they are, conjugate gradients would take many steps for them alone.
-    """
-    names = model.instrument_fields(start)
-    surface = model.surface(start, lagged)
-    flat, restore = ravel_pytree({name: getattr(start, name) for name in names})
-
-    def residuals(values):
-        unknowns = start._replace(**restore(values))
-        parts = model.data_residuals(surface, unknowns, lagged), model.border_residuals(surface, unknowns, lagged)
-        return jnp.concatenate([part.ravel() for part in parts])
-
-    jacobian = jax.jacfwd(residuals)(flat)
-    factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.eye(flat.size))
-    return jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size), lower=True).T
-
-
-@eqx.filter_jit
-def _solve(
-    model: Model,
-    start: Unknowns,
-    lagged: Lagged,
-    max_steps: int,
-    cg_steps: int,
-    mixing: jax.Array | np.ndarray,
-    is_instrument_free: np.ndarray,
-) -> Solution:
-    """Solve from `start`; the instrument, 1 or 0 times free, and the sample's albedo move along `mixing`'s columns."""
-    solver = optx.LevenbergMarquardt(
-        rtol=1e-4, atol=1e-6, linear_solver=lx.Normal(_TruncatedCG(rtol=1e-2, atol=0.0, max_steps=cg_steps))
-    )
-    solver = eqx.tree_at(
-        lambda s: s.search, solver, _NearlyNewton(low_constant=_SHRINK), is_leaf=lambda n: n is solver.search
-    )
-    names = model.instrument_fields(start)
-    flat, restore = ravel_pytree({name: getattr(start, name) for name in names})
-    seen = jnp.sum(lagged.inverse_sigma**2, 2 - model.slow_axis) * lagged.lines_std[:, None] ** 2
-    line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
-    is_free = {n: jnp.full_like(getattr(start, n), 1.0 if n == "albedo" else is_instrument_free) for n in names}
-    mixing = ravel_pytree(is_free)[0][:, None] * mixing
-
-    def decoded(variables: jax.Array) -> Unknowns:
-        surface, mixed, lines = split(variables)
-        unknowns = start._replace(**surface)
-        unknowns = unknowns._replace(**restore(flat + mixing @ mixed))
-        return unknowns._replace(lines=start.lines + line_scale * lines) if start.lines.size else unknowns
-
-    surface = {name: getattr(start, name) for name in Surface._fields}
-    # one vector each, for every array of a tree is compiled by itself
-    variables, split = ravel_pytree((surface, jnp.zeros_like(flat), jnp.zeros_like(start.lines)))
-    found = optx.least_squares(
-        lambda v, args: ravel_pytree(model.residuals(decoded(v), args))[0],
-        solver,
-        variables,
-        args=lagged,
-        max_steps=max_steps,
-        throw=False,
-    )
-    unknowns = decoded(found.value)
-    surface = model.surface(unknowns, lagged)
-    counts = model.counts(surface, unknowns, lagged)
-    cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(unknowns, lagged).items()}
-    return Solution(unknowns, surface, counts, cost)
+def _counts(model: Model, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
+    return model.counts(model.surface(unknowns, lagged), unknowns, lagged)
 
 
 @eqx.filter_jit
@@ -223,6 +109,7 @@ class Refiner:
         shape = start.height.shape
         self.whitening = _whitening(shape, dx, dy, self.slope_noise)
         self.border = _border_weight(shape, settings)
+        self.is_level_free = settings.border == "free"
         self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
         self.surface = Surface(*map(np.asarray, start))
         self.drift = drift_modes(shape, slow_axis, s.drift_degrees) if s.drift_std else np.zeros((0, *shape))
@@ -323,11 +210,12 @@ class Refiner:
         return self.moves is not None or len(self.drift) > 0
 
     def _mixing(self, problem: tuple[Model, Unknowns, Lagged], is_instrument_free: bool) -> jax.Array | np.ndarray:
-        """Return the instruments that are fitted: as they are where it is held or hardly anything of it is unknown."""
-        if self.is_unknown and is_instrument_free:
-            return _mixing(*problem)
+        """Return the instruments and levels that are fitted: as they are where they are held or little is unknown."""
+        if is_instrument_free and (self.is_unknown or self.is_level_free):
+            return whitened_instrument(*problem, np.asarray(float(self.is_level_free)))
         model, start, _ = problem
-        return np.eye(sum(getattr(start, name).size for name in model.instrument_fields(start)))
+        n = sum(getattr(start, name).size for name in model.instrument_fields(start))
+        return np.diag([1.0] * n + [0.0])
 
     def tear(self) -> None:
         """Cut all edges that may lie behind a rim, until `torn` is None again; only where the instrument is unknown."""
@@ -406,11 +294,31 @@ class Refiner:
         problem = self.model, *self.lag(limit, cut)
         mixing = self._mixing(problem, is_instrument_free)
         # an array: one compilation serves both cases
-        found = _solve(*problem, s.lm_steps, s.cg_steps, mixing, np.asarray(float(is_instrument_free)))
+        found = solve(*problem, s.lm_steps, s.cg_steps, mixing, np.asarray(float(is_instrument_free)))
         self.surface = Surface(*map(np.asarray, found.surface))
         self.values = {name: np.asarray(getattr(found.unknowns, name)) for name in INSTRUMENT}
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found
+
+    def simulated(self) -> "Refiner":
+        """Return a fit that starts from its own truth: this surface, the instrument at its prior means, no noise."""
+        twin = copy.copy(self)
+        twin.values = self._at_prior_means(self.model.geometry.instrument)
+        twin.data, twin.residuals = twin._expected(is_noisy=False), np.zeros(self.data.shape)
+        return twin
+
+    def move_back(self, surface: Surface, values: dict[str, np.ndarray]) -> None:
+        """Subtract a change of the surface and one of the instrument."""
+        self.surface = Surface(*(field - by for field, by in zip(self.surface, surface, strict=True)))
+        self.values = {name: value - values[name] for name, value in self.values.items()}
+        self.residuals = (self._expected(is_noisy=True) - self.data) / self.sigma
+
+    def _expected(self, is_noisy: bool) -> np.ndarray:
+        """Return the data expected at the current surface, whose slopes may be noisy ones; 0 where not observed."""
+        unknowns, lagged = self.lag(self.settings.robust_limits[-1], self.settings.jump_limits[-1])
+        if not is_noisy:
+            lagged = lagged._replace(noise_change=np.zeros(self.data.shape))
+        return np.where(self.observed, _counts(self.model, unknowns, lagged), 0.0)
 
     @property
     def tilt(self) -> np.ndarray:

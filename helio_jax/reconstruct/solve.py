@@ -237,7 +237,9 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     posterior = fit.posterior
     is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:
-        is_floating = floating(fit.surface.height, posterior.samples, regions(fit.intact_x, fit.intact_y))
+        is_floating = floating(
+            fit.surface.height, posterior.samples, regions(fit.intact_x, fit.intact_y), posterior.bent
+        )
     worst = fit.weight.min(0, where=stack.is_observed, initial=1.0)
     height, slope_x, slope_y = fit.surface
     jumps = (

@@ -110,13 +110,16 @@ class Posterior:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
 
-    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...], seed: int = 1) -> "Posterior":
+    def widened(
+        self, values: dict[str, np.ndarray], names: tuple[str, ...], least: float = 1.0, seed: int = 1
+    ) -> "Posterior":
         """Return it with error bars that allow for a model that lacks something.
 
         Where the fitted `values` of the unknowns called `names` are farther from what was stated than prior and data
         explain (`disagreement`), all deviations are multiplied by that factor f. And something else may have bent them:
         then heights are wrong by what they, and all that followed them, did to the heights. The share 1 - 1 / f^2 of
-        that change's square is added to the heights' variance, one error for all of the surface.
+        that change's square is added to the heights' variance, one error for all of the surface. Factors below `least`
+        are taken for chance.
         """
         of = [name for name in self.fields if name in names]
         if not of:
@@ -125,6 +128,8 @@ class Posterior:
         flat = np.concatenate([np.ravel(values[name]) for name in of])
         own = self.instrument_covariance[np.ix_(mine, mine)]
         factor = disagreement(flat, own)
+        if factor < least:
+            return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
         bent = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
         how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
@@ -134,8 +139,8 @@ class Posterior:
             samples=factor * self.samples + how_far[:, None, None] * bent,
             instrument_samples=factor * self.instrument_samples,
             instrument_covariance=factor**2 * self.instrument_covariance,
-            widening=factor,
-            bent=bent,
+            widening=factor * self.widening,
+            bent=bent if self.bent is None else np.hypot(bent, factor * self.bent),
         )
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":

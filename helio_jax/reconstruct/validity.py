@@ -55,15 +55,21 @@ def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
     return ranked(connected_components(graph, directed=False)[1]).reshape(shape)
 
 
-def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray) -> np.ndarray:
+def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
+
+    So are heights that an instrument far from what was stated has bent, relative to most others, by a large share of
+    all relief: another explanation of the data would have taken them elsewhere.
 
     Args:
         height: [y, x], um.
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
+        bent: as in `Posterior` [y, x], um.
     """
     flags = np.zeros(height.shape, bool)
+    if bent is not None:
+        flags |= np.abs(bent - np.median(bent)) > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
     ground = region == 0
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number

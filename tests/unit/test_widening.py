@@ -49,6 +49,25 @@ def test_geometry_within_what_is_stated_changes_nothing():
     assert before.widened({"log_gain": np.full(1, 9.0)}, ("distance",)) is before
 
 
+def test_gains_that_are_off_by_far_widen_too_and_add_to_geometry():
+    """Less than twice as far off as expected is chance; then both factors multiply, both bends add in squares.
+
+    Catches gains that widen every other fit, for they come out by 1.2 of what is expected as often as by 0.8.
+    """
+    values = {"log_gain": np.array([1.8]), "aim": np.array([[3.0], [4.0]])}
+    after = posterior(50).widened(values, ("aim",))
+    assert after.widened(values, ("log_gain",), 2.0) is after
+    further = after.widened(values | {"log_gain": np.array([5.0])}, ("log_gain",), 2.0)
+    alone = posterior(50).widened(values | {"log_gain": np.array([5.0])}, ("log_gain",), 2.0)
+    assert after.widening > 2.0 and alone.widening > 2.0
+    left = 0.01 * after.widening**2
+    factor = 5.0 / np.sqrt(1.0 - left)
+    assert further.widening == pytest.approx(after.widening * factor)
+    assert further.bent is not None and after.bent is not None
+    assert further.bent[2, 2] == pytest.approx(factor * abs(after.bent[2, 2]))  # its own aim does not follow the gain
+    assert further.bent[0, 0] > factor * abs(after.bent[0, 0]) + 1.0
+
+
 def test_the_bend_follows_the_raster():
     """Catches a bend left on the thinned raster, where findings and heights would no longer have one shape."""
     after = posterior(50).widened({"aim": np.array([[3.0], [4.0]])}, ("aim",)).on_raster((8, 10), 2)

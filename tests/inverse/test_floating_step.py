@@ -1,0 +1,28 @@
+"""A step across the whole field that faces away from the beam: nothing but the near field tells how high it is."""
+
+from pathlib import Path
+
+import numpy as np
+
+from helio_jax import pipeline
+from helio_jax.config import load_scene
+from helio_jax.micrograph import MicrographStack
+from helio_jax.truth import true_height
+
+STEP = Path(__file__).parents[2] / "scenes" / "step.toml"
+
+
+def test_a_step_that_faces_away_is_said_to_float():
+    """Its stated deviation is more than a fifth of it and covers the truth, and a tenth of the image is flagged.
+
+    Row 5 of benchmarks/reconstruction.py at a quarter of its pixels: here the fit finds gains of 1.2 instead of the
+    step, for which it is -160 um, and says so by +- 150. Catches error bars that take such gains for granted (+- 9).
+    """
+    scene = load_scene(STEP, {"scan.nx": 61, "scan.ny": 15, "scan.pixel_size_um": 20.0})
+    stack = pipeline.record(scene, pipeline.simulate(scene, seed=1))
+    assert isinstance(stack, MicrographStack)
+    rec = pipeline.reconstruct(stack, border="free", refine={"albedo_std": 0.05, "substrate_um": 6000.0})
+    up = true_height(scene, rec).height > 50.0
+    value, std = rec.spread(lambda h: float(np.median(h[up]) - np.median(h[~up])))
+    assert std > 0.2 * abs(value) and abs(value - 100.0) < 3.0 * std, (value, std)
+    assert np.mean(rec.reason == 5) > 0.1
