@@ -1,6 +1,6 @@
 """Rows 5 to 7 of issue 5 on a crystal whose faces are known, and on the measured one: which stage makes which error.
 
-python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--sample crystal|tall|hills] [--shared ../shared] [--tiny]
+python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--sample crystal|tall|hills|measured] [--tiny]
 
 A truncated crystal ({100} top of 438 x 250 um, tilted by 6 degrees, four {111} sides at 125.26 degrees to it) on level
 ground is traced anew for five rotations of one detector, with gains, background (75 % of level ground's reading) and
