@@ -37,7 +37,7 @@ from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
 from helio_jax.prepare.align import find_motions  # noqa: E402
 from helio_jax.prepare.resample import resample  # noqa: E402
 from helio_jax.prepare.rigid import Rigid  # noqa: E402
-from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrument, self_calibrate  # noqa: E402
+from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrument  # noqa: E402
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
 from helio_jax.scene.surfaces import surface_body  # noqa: E402
@@ -131,15 +131,14 @@ def record(sample: Sample, n: int, rays: int, seed: int) -> Recorded:
     return Recorded(MicrographSet(tuple(scans)), tuple(motions), MicrographSet(tuple(multiples)))
 
 
-def calibrated(known: Recorded, stage: str) -> MicrographStack:
+def calibrated(known: Recorded, stage: str, method: str) -> MicrographStack:
     """Return the aligned stack in units of the beam; what the stage names is given, the rest is found."""
     motions = find_motions(known.scans).motions if stage == "full" else known.motions
     stack = resample(known.scans, motions, "reference")
     if stage in ("full", "motions"):
-        found = self_calibrate(stack)
-    else:
-        polar = math.degrees(math.atan2(3120.0, 3000.0))
-        found = SelfCalibration(np.array(GAINS), SHARE, polar, 0.0, 0.0)
+        return pipeline.calibrate_turned(stack, keeps_multiple=method == "refine")
+    polar = math.degrees(math.atan2(3120.0, 3000.0))
+    found = SelfCalibration(np.array(GAINS), SHARE, polar, 0.0, 0.0)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
     done = apply_calibration(stack, found, pipeline.flat_signal(instrument), instrument)
     if stage == "multiple":
@@ -218,12 +217,12 @@ def summary(found: dict) -> tuple[str, bool]:
     return text, bool(good and all(within))
 
 
-def measured(shared: Path) -> MicrographStack:
+def measured(shared: Path, method: str) -> MicrographStack:
     """Return the measured crystal, aligned by the points picked by hand, calibrated by itself."""
     instrument = load_instrument(INSTRUMENT)
     scans = MicrographSet(tuple(import_micrographs(shared / "data" / f"{name}.mat", instrument) for name in SCANS))
     found = find_motions(scans, read_points(POINTS))
-    return pipeline.calibrate_turned(resample(scans, found.motions, "reference"))
+    return pipeline.calibrate_turned(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
 
 
 def main() -> None:
@@ -248,17 +247,15 @@ def main() -> None:
     sample = None if is_real else make_sample(args.sample)
     known: Recorded | None = None
     for stage in ("measured",) if is_real else args.stages.split(","):
-        stack: MicrographStack | None = None
         for method in args.methods.split(","):
             key = {"sample": args.sample, "stage": stage, "method": method} | asked
             if any(all(r.get(k) == v for k, v in key.items()) for r in done):
                 continue
-            if stack is None and sample is None:
-                stack = measured(args.shared)
-            elif stack is None and sample is not None:
+            if sample is None:
+                stack = measured(args.shared, method)
+            else:
                 known = known or record(sample, args.size, args.rays, args.seed)
-                stack = calibrated(known, stage)
-            assert stack is not None
+                stack = calibrated(known, stage, method)
             rec = reconstructed(stack, method, args.refine)
             found = facets_of(rec, max(15, round(60 * (args.size / 101) ** 2)))
             found["calibration"] = stack.provenance["self_calibrate"]

@@ -18,7 +18,7 @@ _ROBUST_ROUNDS = 8
 _DARK_LIMIT = 3.0
 _GRAZING = 0.3
 """Cosine between a facet's normal and an aperture's direction below which the facet's own horizon cuts the aperture
-(half-angles of 12 to 17 degrees), so that n . Phi is too small, and what it reads is multiple scattering for the most."""
+(half-angles of 12 to 17 degrees), so that n . Phi is too small, and much of what it reads is multiple scattering."""
 _LITTLE = 1e-3
 """Weight left to such data."""
 _SLOPE_STD = 4.0
@@ -81,8 +81,8 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     images, data darker than the model by several standard deviations are taken as masked and down-weighted
     (Cauchy weight, one-sided: a mask can only darken). Where an aperture is at or below the facet's own horizon and the
     datum brighter than n . Phi, which is then too small or negative, it tells only that the facet faces away: it is
-    left out, but for the 3 that the facet faces most (else steep facets come out too flat). With exactly 3 images
-    nothing is redundant, and masked data stay: they hold all the steep slope there is (DESIGN.md section 3).
+    left out where 3 others remain (else steep facets come out too flat). With exactly 3 images nothing is redundant,
+    and masked data stay: they hold all the steep slope there is (DESIGN.md section 3).
 
     Args:
         signal, variance: data [detector, y, x], NaN where not observed.
@@ -101,9 +101,8 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
         rho_n = _weighted_solve(phi, data, weight)
         model = np.einsum("kiyx,yxi->kyx", phi, rho_n)
         residuals = np.where(observed, (data - model) / sigma, 0.0)
-        facing = np.where(observed, model / np.linalg.norm(phi, axis=1), -np.inf)
-        is_away = observed & (residuals > 0.0) & (facing < _GRAZING * np.linalg.norm(rho_n, axis=-1))
-        is_away &= facing < -np.partition(-facing, MIN_IMAGES - 1, axis=0)[MIN_IMAGES - 1]
+        is_away = observed & (model < _GRAZING * np.linalg.norm(phi, axis=1) * np.linalg.norm(rho_n, axis=-1))
+        is_away &= (residuals > 0.0) & ((observed & ~is_away).sum(0) >= MIN_IMAGES)
         weight = base / (1.0 + (np.minimum(residuals, 0.0) / _DARK_LIMIT) ** 2) * np.where(is_away, _LITTLE, 1.0)
     rho = np.linalg.norm(rho_n, axis=-1)
     ok = is_solvable & (rho > 0)

@@ -8,7 +8,7 @@ from helio_jax.reconstruct.linear import solve_linear
 POLAR, LEAN = np.radians(46.0), np.radians(60.0)
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 20.0, 36.0, 157.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 10.0, 20.0, 157.0])
 @pytest.mark.parametrize("scattered", [0.0, 0.1])
 def test_steep_facet_keeps_its_slope(turn_deg, scattered):
     """A face of 60 deg by five turned apertures, one or two of them below its horizon, found within half a degree.
