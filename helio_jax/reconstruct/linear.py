@@ -94,7 +94,7 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     data = np.where(observed, signal, 0.0)
     base = np.where(observed, 1.0 / np.where(observed, variance, 1.0), 0.0)
     base = np.where(is_solvable, base, 0.0)
-    weight = base
+    weight, is_away = base, np.zeros_like(observed)
     sigma = np.sqrt(np.where(observed, variance, 1.0))
     n_rounds = _ROBUST_ROUNDS if signal.shape[0] > MIN_IMAGES else 1
     for _ in range(n_rounds):
