@@ -20,22 +20,19 @@ from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path
-from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.align import AlignSettings, align_scans
 from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
 from helio_jax.prepare.noise import add_noise
-from helio_jax.prepare.selfcalibrate import apply as apply_calibration
-from helio_jax.prepare.selfcalibrate import effective_instrument, self_calibrate
 from helio_jax.provenance import with_provenance
-from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.trace.scan import Crew, trace_scene
 from helio_jax.truth import true_height
+from helio_jax.turned import calibrate_turned, flat_signal
 
 DEFAULT_CREW = Crew()
 """Threads of this process, one per CPU."""
@@ -198,11 +195,6 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
     )
 
 
-def flat_signal(instrument: Instrument) -> np.ndarray:
-    """Return the detection probability of the flat reference plane [detector]."""
-    return SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
-
-
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
     before = read_stack(path)
@@ -220,13 +212,6 @@ def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes:
     if not asked and not given:
         return changes
     return changes | {"refine": settings.refine.model_dump() | asked | given}
-
-
-def calibrate_turned(stack: MicrographStack) -> MicrographStack:
-    """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`)."""
-    found = self_calibrate(stack)
-    instrument = effective_instrument(stack.instrument, found.polar_deg)
-    return apply_calibration(stack, found, flat_signal(instrument), instrument)
 
 
 def align(
@@ -268,10 +253,11 @@ def reconstruct(
         raise InputFileError(
             f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
         )
-    if one.noise == "measured" and one.n_rays is None:
-        one = calibrate_turned(one) if "align" in one.provenance else calibrate(one)
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()
+    if one.noise == "measured" and one.n_rays is None:
+        is_fit = wanted.get("method", settings.method) == "refine"
+        one = calibrate_turned(one, keeps_multiple=is_fit) if "align" in one.provenance else calibrate(one)
     chosen = settings.changed(**_with_priors(settings, one, wanted))
     refine = chosen.refine
 

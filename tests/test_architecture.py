@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > commands > study, comparison, orient > pipeline, doctor > predict, checkpoint, provenance, spot, effects,
-truth > config > explain > stages > scene > nouns > settings, arrays, kernel, errors.
+__main__ > commands > study, comparison, orient > pipeline, doctor > turned > predict, checkpoint, provenance, spot,
+effects, truth > config > explain > stages > scene > nouns > settings, arrays, kernel, errors.
 """
 
 import ast
@@ -25,6 +25,7 @@ LEVELS = [
     {"explain"},
     {"config"},
     {"predict", "checkpoint", "provenance", "spot", "effects", "truth"},
+    {"turned"},
     {"pipeline", "doctor"},
     {"study", "comparison", "orient"},
     {"commands", "compiled"},

@@ -14,8 +14,13 @@ from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 
 MIN_IMAGES = 3
 """Images needed per pixel: three unknowns (albedo times normal)."""
-_ROBUST_ROUNDS = 5
+_ROBUST_ROUNDS = 8
 _DARK_LIMIT = 3.0
+_GRAZING = 0.3
+"""Cosine between a facet's normal and an aperture's direction below which the facet's own horizon cuts the aperture
+(half-angles of 12 to 17 degrees), so that n . Phi is too small, and much of what it reads is multiple scattering."""
+_LITTLE = 1e-3
+"""Weight left to such data."""
 _SLOPE_STD = 4.0
 """Prior deviation of a beam-frame slope where the albedo is known."""
 _NEWTON_STEPS = 8
@@ -74,8 +79,10 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
 
     Pixels recorded in fewer than 3 images get the flat normal and weight 0 (as in the paper). With more than 3
     images, data darker than the model by several standard deviations are taken as masked and down-weighted
-    (Cauchy weight, one-sided: a mask can only darken). With exactly 3 images nothing is redundant, and masked
-    data stay: they hold all the steep slope there is (DESIGN.md section 3).
+    (Cauchy weight, one-sided: a mask can only darken). Where an aperture is at or below the facet's own horizon and the
+    datum brighter than n . Phi, which is then too small or negative, it tells only that the facet faces away: it is
+    left out where 3 others remain (else steep facets come out too flat). With exactly 3 images nothing is redundant,
+    and masked data stay: they hold all the steep slope there is (DESIGN.md section 3).
 
     Args:
         signal, variance: data [detector, y, x], NaN where not observed.
@@ -87,17 +94,21 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     data = np.where(observed, signal, 0.0)
     base = np.where(observed, 1.0 / np.where(observed, variance, 1.0), 0.0)
     base = np.where(is_solvable, base, 0.0)
-    weight = base
+    weight, is_away = base, np.zeros_like(observed)
     sigma = np.sqrt(np.where(observed, variance, 1.0))
     n_rounds = _ROBUST_ROUNDS if signal.shape[0] > MIN_IMAGES else 1
     for _ in range(n_rounds):
         rho_n = _weighted_solve(phi, data, weight)
-        residuals = np.where(observed, (data - np.einsum("kiyx,yxi->kyx", phi, rho_n)) / sigma, 0.0)
-        weight = base / (1.0 + (np.minimum(residuals, 0.0) / _DARK_LIMIT) ** 2)
+        model = np.einsum("kiyx,yxi->kyx", phi, rho_n)
+        residuals = np.where(observed, (data - model) / sigma, 0.0)
+        is_away = observed & (model < _GRAZING * np.linalg.norm(phi, axis=1) * np.linalg.norm(rho_n, axis=-1))
+        is_away &= (residuals > 0.0) & ((observed & ~is_away).sum(0) >= MIN_IMAGES)
+        weight = base / (1.0 + (np.minimum(residuals, 0.0) / _DARK_LIMIT) ** 2) * np.where(is_away, _LITTLE, 1.0)
     rho = np.linalg.norm(rho_n, axis=-1)
     ok = is_solvable & (rho > 0)
     normals = np.where(ok[..., None], rho_n / np.where(ok, rho, 1.0)[..., None], np.array([0.0, 0.0, 1.0]))
-    confidence = np.where(ok, np.clip((data * np.sqrt(base)).min(0, where=observed, initial=np.inf), 0.0, None), 0.0)
+    tells = observed & ~is_away if n_rounds > 1 else observed
+    confidence = np.where(ok, np.clip((data * np.sqrt(base)).min(0, where=tells, initial=np.inf), 0.0, None), 0.0)
     top = np.quantile(confidence[ok], 0.9) if ok.any() else 1.0
     slope_weight = np.where(ok, np.clip(confidence / (top or 1.0), 0.05, 1.0), 0.0)
     return PhotometricSolution(normals, np.where(ok, rho, np.nan), slope_weight, n_images, residuals)

@@ -1,0 +1,54 @@
+"""Calibration of turned scans: multiple scattering is taken off before gains and background are found."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.crystal import GAINS, SHARE, make_sample, record
+from helio_jax import turned
+from helio_jax.errors import GuardError
+from helio_jax.prepare.resample import resample
+from helio_jax.prepare.selfcalibrate import SelfCalibrateSettings, self_calibrate
+
+
+@pytest.fixture(scope="module")
+def aligned():
+    """A crystal of 600 um on level ground by five turned scans of 41 x 41 pixels, background 75 % of the reading."""
+    known = record(make_sample("crystal"), 41, 16, 4)
+    return resample(known.scans, known.motions, "reference")
+
+
+def test_background_is_found_beside_walls(aligned):
+    """Catches multiple scattering taken for signal: it brightens flanks, and the background comes out 0.1 too low."""
+    assert SelfCalibrateSettings().n_pixels <= aligned.is_observed.all(0).sum()
+    alone = self_calibrate(aligned)
+    record = turned.calibrate_turned(aligned).provenance["self_calibrate"]
+    assert alone.share < SHARE - 0.1  # single scattering only; or the test tests nothing
+    assert abs(record["share"] - SHARE) < 0.04
+    assert np.allclose(np.array(record["gain"]) / record["gain"][0], np.array(GAINS) / GAINS[0], rtol=0.02)
+    assert math.isclose(record["polar_deg"], 46.1, abs_tol=4.0)
+
+
+def test_multiple_scattering_stays_for_a_fit(aligned):
+    """The same calibration either way; what is taken off is light, less than level ground's signal, nowhere negative.
+
+    Catches a fit that takes off multiple scattering a second time.
+    """
+    kept, without = (turned.calibrate_turned(aligned, keeps_multiple=k) for k in (True, False))
+    assert kept.provenance["self_calibrate"]["gain"] == without.provenance["self_calibrate"]["gain"]
+    flat = turned.flat_signal(kept.instrument)[:, None, None]
+    taken = np.where(kept.is_observed, (kept.counts - without.counts) / flat, 0.0)
+    assert taken.min() > -1e-9 and 0.05 < taken.max() < 1.0
+
+
+def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
+    """A surface too wild to trace from leaves the first calibration, and its record says so."""
+
+    def refuse(stack):
+        raise GuardError("too rough")
+
+    monkeypatch.setattr(turned, "_multiple_of", refuse)
+    done = turned.calibrate_turned(aligned).provenance["self_calibrate"]
+    assert done["share"] == self_calibrate(aligned).share
+    assert "not predicted" in done["multiple"] and "too rough" in done["multiple"]
