@@ -123,9 +123,16 @@ def _ripple(
 
 
 def reconstructed_area(rec: Reconstruction, max_std_um: float = 20.0) -> dict[str, Any]:
-    """Return the share of the raster that is reconstructed: valid, and its height known to `max_std_um` if stated."""
+    """Return the share of the raster that is reconstructed: valid, and its height known to `max_std_um` if stated.
+
+    With a free border heights count from their median, for their common level means nothing there.
+    """
     good = rec.is_valid & np.isfinite(rec.height)
-    sure = good if rec.height_std is None else good & (rec.height_std <= max_std_um)
+    std = rec.height_std
+    if rec.height_samples is not None and good.any() and rec.provenance.get("reconstruct", {}).get("border") == "free":
+        level = np.median(rec.height_samples[:, good], axis=1)
+        std = np.sqrt(np.mean((rec.height_samples - level[:, None, None]) ** 2, axis=0))
+    sure = good if std is None else good & (std <= max_std_um)
     return {
         "share": float(sure.mean()),
         "valid_share": float(good.mean()),

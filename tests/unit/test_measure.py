@@ -2,13 +2,14 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.evaluate.facets import find_facets
-from helio_jax.evaluate.measure import Wanted, measure_height_map
+from helio_jax.evaluate.measure import Wanted, measure_height_map, reconstructed_area
 from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.reconstruction import Reconstruction
@@ -152,3 +153,21 @@ def test_measure_answers_in_json(tmp_path):
     assert (tmp_path / "f.png").stat().st_size > 5000
     with pytest.raises(SceneError, match="--facets"):
         measure_height_map(make_rec(octahedron), Wanted())
+
+
+@pytest.mark.parametrize("border, share", [("free", 0.75), ("flat", 0.0)])
+def test_reconstructed_area_of_a_free_border_counts_from_the_median(border, share):
+    """Heights that are known to 5 um but for a common 50 um, a quarter of them to 30 um, at a limit of 20 um.
+
+    Catches the common level counted where it means nothing: all of such a map would be called not reconstructed.
+    """
+    rng, shape = np.random.default_rng(1), (20, 20)
+    own = np.where(np.arange(20) < 5, 30.0, 5.0)[:, None]
+    samples = 50.0 * rng.standard_normal((400, 1, 1)) + own * rng.standard_normal((400, *shape))
+    rec = replace(
+        make_rec(lambda x, y: 0.0 * x, n=shape),
+        height_std=np.sqrt(np.mean(samples**2, axis=0)),
+        height_samples=samples,
+        provenance={"reconstruct": {"border": border}},
+    )
+    assert reconstructed_area(rec)["share"] == share
