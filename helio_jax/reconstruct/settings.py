@@ -60,7 +60,8 @@ class RefineSettings(Settings):
     cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Levenberg-Marquardt step."""
     bias_pairs: int = Field(default=4, ge=0, le=1000)
-    """Pairs of fits to simulated data, of opposite noise, that tell the bias by noise; only with a free border."""
+    """Pairs of fits to simulated data, of opposite noise, that tell the bias by noise; only with a free border. A pair
+    takes about as long as two of the fit's rounds."""
     samples: int = Field(default=32, ge=0, le=10_000)
     """Samples of the posterior, from which the standard deviation of every height is taken; 0: no error bars."""
     multiple: Literal["traced", "radiosity"] = "traced"
