@@ -185,10 +185,10 @@ class _Raster:
     def _continued(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return points of the grid with a ring more, as far out as the surface reaches, as high as the border."""
         x, y, z = (np.pad(field, 1, mode="edge") for field in (x, y, z))
-        for field, at, axis in ((x, self.x, 1), (y, self.y, 0)):
-            first, last = ((0, slice(None)), (-1, slice(None))) if axis == 0 else ((slice(None), 0), (slice(None), -1))
-            field[first] -= self.reach + at.min()
-            field[last] += self.reach - at.max()
+        x[:, 0] -= self.reach + self.x.min()
+        x[:, -1] += self.reach - self.x.max()
+        y[0] -= self.reach + self.y.min()
+        y[-1] += self.reach - self.y.max()
         return x, y, z
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:

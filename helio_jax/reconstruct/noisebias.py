@@ -9,6 +9,7 @@ offsets is known little better than their priors, and a hundredth of what is mad
 import copy
 import zlib
 
+import jax
 import numpy as np
 
 from helio_jax.reconstruct.model import Surface
@@ -31,8 +32,7 @@ def noise_bias(refiner: Refiner, n_pairs: int) -> tuple[Surface, dict[str, np.nd
     """
     s, truth = refiner.settings, refiner.simulated()
     rng = np.random.default_rng(zlib.crc32(refiner.data.tobytes()))
-    change = Surface(*(np.zeros(field.shape) for field in truth.surface))
-    moved = {name: np.zeros(value.shape) for name, value in truth.values.items()}
+    found = []
     for _ in range(n_pairs):
         noise = np.where(refiner.observed, np.sqrt(refiner.variance) * rng.standard_normal(truth.data.shape), 0.0)
         for own in (noise, -noise):
@@ -40,7 +40,6 @@ def noise_bias(refiner: Refiner, n_pairs: int) -> tuple[Surface, dict[str, np.nd
             fit.data, fit.residuals = truth.data + own, own / fit.sigma
             for _ in range(s.reweightings):
                 fit.step(s.robust_limits[-1], s.jump_limits[-1], True)
-            share = 0.5 / n_pairs
-            change = Surface(*(c + share * (f - t) for c, f, t in zip(change, fit.surface, truth.surface, strict=True)))
-            moved = {name: old + share * (fit.values[name] - truth.values[name]) for name, old in moved.items()}
-    return change, moved
+            found.append((fit.surface, fit.values))
+    mean = jax.tree.map(lambda *drawn: np.mean(drawn, axis=0), *found)
+    return jax.tree.map(np.subtract, mean, (truth.surface, truth.values))
