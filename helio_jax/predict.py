@@ -23,7 +23,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.indirect import Radiosity
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
-from helio_jax.scene.surfaces import behind_rims, surface_body
+from helio_jax.scene.surfaces import behind_rims, hollowed, surface_body
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
@@ -174,11 +174,13 @@ class _Raster:
         """Return the surface with its unseen side at a share of the way back."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        sheet = behind_rims(*at, normals, shift, share)
+        behind = behind_rims(*at, normals, shift, share)
         if self.is_flat_around:
-            body = surface_body(*sheet, self.reach, level=0.0, beam_shift=shift)
+            body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
+            body = hollowed(body, at, behind)
         else:
-            body = surface_body(*self._continued(*sheet))
+            around, behind = self._continued(*at), self._continued(*behind)
+            body = hollowed(surface_body(*around), around, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
         return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
 

@@ -7,7 +7,9 @@ region at a number of levels, all physics predicted anew, and keeps the one that
 The level is then fitted like every other height, and its error bar says whether masks or the near field fix it.
 """
 
+import math
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import (
@@ -157,12 +159,67 @@ def joined(region: np.ndarray) -> np.ndarray:
     return _numbered(np.asarray(binary_closing(room, np.ones((2 * _BAND + 1,) * 2))))[_BAND:-_BAND, _BAND:-_BAND]
 
 
+def _way_out(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
+    """Return how far it is from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
+
+    A region that reaches the image's border does not end there.
+    """
+    step = min(pitch)
+    room = np.pad(inside, 1, mode="edge")
+    row, column = (index + 1.0 for index in np.nonzero(inside))
+    left, is_in = np.zeros(row.size), np.ones(row.size, bool)
+    for n in range(1, int(math.hypot(*(np.array(inside.shape) * pitch)) / step) + 2):
+        at_row = np.clip(np.rint(row + n * step * way[1] / pitch[0]), 0, room.shape[0] - 1).astype(int)
+        at_column = np.clip(np.rint(column + n * step * way[0] / pitch[1]), 0, room.shape[1] - 1).astype(int)
+        is_in &= room[at_row, at_column]
+        if not is_in.any():
+            break
+        left[is_in] = n * step
+    distance = np.zeros(inside.shape)
+    distance[inside] = left + 0.5 * step
+    return distance
+
+
+def at_level(
+    inside: np.ndarray,
+    surface: Surface,
+    level: float,
+    ground: float,
+    pitch: tuple[float, float],
+    beam_shift: tuple[float, float] | None,
+) -> Surface:
+    """Return a surface with a region flat at a level above the ground, and with the wall that the beam sees, if any.
+
+    The beam sees the wall that faces it: at the far side of a hollow, at the near side of a plateau. In the beam frame
+    a vertical wall rises by the cotangent of the incidence along the beam. Deeper than the beam reaches, there is
+    nothing but that wall.
+
+    Args:
+        inside: the region [y, x].
+        surface: to begin with.
+        level: above the ground, um.
+        ground: height of the ground, um.
+        pitch: dy, dx, um.
+        beam_shift: `Instrument.beam_shift`; None: no wall, as where the region ends undercut.
+    """
+    flat = Surface(*(np.full(inside.shape, value) for value in (ground + level, 0.0, 0.0)))
+    if beam_shift is not None:
+        along, sign = math.hypot(*beam_shift), np.sign(level)
+        x, y = (-sign * shift / along for shift in beam_shift)
+        height = _way_out(inside, (x, y), pitch) / along
+        is_wall = height < abs(level)
+        values = (ground + sign * height, -sign * x / along, -sign * y / along)
+        flat = Surface(*(np.where(is_wall, wall, field) for wall, field in zip(values, flat, strict=True)))
+    return Surface(*(np.where(inside, new, field) for new, field in zip(flat, surface, strict=True)))
+
+
 def search_levels(
     region: np.ndarray,
     surface: Surface,
     pitch: tuple[float, float],
     max_width: float,
     misfit: Misfit,
+    beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
 ) -> tuple[Surface, list[int]]:
     """Return the surface with all regions at the levels that explain the images best, and the numbers of those moved.
@@ -175,6 +232,7 @@ def search_levels(
         pitch: dy, dx, um.
         max_width: levels up to twice the width of a region are tried, and of this width at most, um.
         misfit: see `Misfit`.
+        beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
     """
     best, found = misfit(surface)
@@ -185,22 +243,25 @@ def search_levels(
         ground = float(np.median(found.height[around]))
         room = np.pad(inside, 1, mode="edge")
         width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
-        tried: dict[float, tuple[float, Surface]] = {}
+        tried: dict[bytes, tuple[float, Surface]] = {}
 
-        def at(level: float, number=number, inside=inside, base=found, tried=tried, ground=ground) -> float:
-            report(f"region {number} of {inside.sum()} pixels: trying the level {level:+.0f} um")
-            values = zip((ground + level, 0.0, 0.0), base, strict=True)
-            trial = Surface(*(np.where(inside, flat, field) for flat, field in values))
-            try:
-                tried[level] = misfit(trial)
-            except GuardError:  # no level of a wall that nothing can be predicted of
-                tried[level] = np.inf, trial
-            return tried[level][0]
+        def at(level: float, has_wall: bool, number=number, inside=inside, base=found, tried=tried, ground=ground):
+            said = " and a wall" if has_wall else ""
+            report(f"region {number} of {inside.sum()} pixels: trying the level {level:+.0f} um{said}")
+            trial = at_level(inside, base, level, ground, pitch, beam_shift if has_wall else None)
+            key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
+            if key not in tried:
+                try:
+                    tried[key] = misfit(trial)
+                except GuardError:  # no level of a wall that nothing can be predicted of
+                    tried[key] = np.inf, trial
+            return tried[key][0]
 
         levels = sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0))
-        i = int(np.argmin([at(level) for level in levels]))
+        kinds = (False, True) if any(beam_shift) else (False,)
+        has_wall, i = min(product(kinds, range(len(levels))), key=lambda trial: at(levels[trial[1]], trial[0]))
         bracket = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
-        minimize_scalar(at, bounds=bracket, method="bounded", options={"maxiter": _LEVEL_STEPS})
+        minimize_scalar(at, bounds=bracket, args=(has_wall,), method="bounded", options={"maxiter": _LEVEL_STEPS})
         value, better = min(tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better

@@ -206,6 +206,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
                 (pitch(stack.y), pitch(stack.x)),
                 MAX_WIDTH * stack.instrument.sample_distance,
                 lambda surface, fit=fit: misfit_on(*problem, surface, settings, roughly, slow_axis, _known(fit)),
+                stack.instrument.beam_shift,
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
             if numbers:

@@ -7,7 +7,7 @@ from helio_jax import pipeline
 from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
 from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.plateaus import GAIN, find_plateaus, joined, search_levels, unexplained
+from helio_jax.reconstruct.plateaus import GAIN, at_level, find_plateaus, joined, search_levels, unexplained
 from helio_jax.truth import true_height
 
 SHAPE = (40, 60)
@@ -100,6 +100,73 @@ def test_a_level_that_gains_little_is_not_taken():
     ground = Surface(*np.zeros((3, *SHAPE)))
     found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
     assert moved == [] and found is ground
+
+
+@pytest.mark.parametrize(("way", "axis"), [((0.5, 0.0), 1), ((-0.5, 0.0), 1), ((0.0, 0.25), 0)])
+@pytest.mark.parametrize("level", [-30.0, 30.0, -1e3])
+def test_the_wall_that_the_beam_sees(way, axis, level):
+    """At the far side of a hollow, at the near side of a plateau: it rises along the beam by the cotangent.
+
+    Half the region is 9 or 13 pixels wide, so both signs of 30 um leave some of the level; -1000 um is never reached.
+    Catches: the wall at the other side, its slope's sign, pixels that count to their far end.
+    """
+    ground = Surface(np.full(SHAPE, 7.0), np.full(SHAPE, 0.1), np.full(SHAPE, 0.2))
+    found = at_level(INSIDE, ground, level, 5.0, (4.0, 4.0), way)
+    index = np.indices(SHAPE)[axis][INSIDE]
+    shift = way[1 - axis]
+    is_from_low = (shift > 0) == (level > 0)
+    to_wall = 4.0 * (index - index.min() if is_from_low else index.max() - index) + 2.0
+    wall = to_wall / abs(shift)
+    expected = np.sign(level) * np.minimum(wall, abs(level))
+    np.testing.assert_allclose(found.height[INSIDE], 5.0 + expected)
+    slopes = found.slope_x, found.slope_y
+    np.testing.assert_allclose(slopes[1 - axis][INSIDE], np.where(wall < abs(level), 1.0 / shift, 0.0))
+    assert not slopes[axis][INSIDE].any()
+    for field, before in zip(found, ground, strict=True):
+        np.testing.assert_array_equal(field[~INSIDE], before[~INSIDE])
+    undercut = at_level(INSIDE, ground, level, 5.0, (4.0, 4.0), None)
+    assert np.all(undercut.height[INSIDE] == 5.0 + level) and not undercut.slope_x[INSIDE].any()
+
+
+def test_a_region_at_the_border_has_no_wall_there():
+    """The far side of the hollow is outside the image: what the beam meets is floor up to that border's far wall."""
+    inside = np.zeros(SHAPE, bool)
+    inside[:, 40:] = True
+    found = at_level(inside, Surface(*np.zeros((3, *SHAPE))), -30.0, 0.0, (4.0, 4.0), (0.5, 0.0))
+    assert np.all(found.height[inside] == -30.0)
+
+
+def test_search_tries_levels_with_a_wall():
+    """A misfit that asks for the far wall of a hollow 60 um deep. Rejects a search of flat levels only."""
+    want = at_level(INSIDE, Surface(*np.zeros((3, *SHAPE))), -60.0, 0.0, (10.0, 10.0), (0.5, 0.0))
+
+    def misfit(surface):
+        return 1e-2 * float(np.sum((surface.height - want.height) ** 2)), surface
+
+    ground = Surface(*np.zeros((3, *SHAPE)))
+    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit, (0.5, 0.0))
+    assert moved == [1]
+    np.testing.assert_allclose(found.height, want.height, atol=3.0)
+
+
+@pytest.mark.slow
+def test_a_slot_across_the_beam_shows_its_far_wall():
+    """A slot twice as deep as wide, of which the beam reaches the far wall only: it is taken for that wall.
+
+    At most 5 % of its pixels are valid and wrong by more than 3 stated deviations and 5 % of the depth; half are valid.
+    Rejects a floor at some level that ends undercut (40 % wrong), for which multiple scattering makes the wall look.
+    """
+    overrides = {"sample.width_um": 240.0, "sample.depth_um": 480.0, "sample.azimuth_deg": 90.0, "trace.rays": 256}
+    overrides |= {"scan.nx": 31, "scan.ny": 61, "scan.pixel_size_um": 20.0, "scan.center_um": [3.0, 4.0]}
+    scene = load_scene("scenes/trench.toml", overrides)
+    stack = pipeline.record(scene, pipeline.simulate(scene, seed=5))
+    rec = pipeline.reconstruct(stack, "refine", refine={"rays": 200_000, "substrate_um": 6000.0})
+    true = true_height(scene, rec).height
+    inside = true < -24.0
+    assert rec.height_std is not None
+    is_wrong = np.abs(rec.height - true) > 3.0 * rec.height_std + 24.0
+    assert np.mean((rec.is_valid & is_wrong)[inside]) <= 0.05
+    assert np.mean(rec.is_valid[inside]) > 0.5
 
 
 @pytest.mark.slow
