@@ -10,6 +10,7 @@ The level is then fitted like every other height, and its error bar says whether
 import math
 from collections.abc import Callable
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import (
@@ -27,6 +28,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from helio_jax.errors import GuardError
 from helio_jax.reconstruct.edges import along, ranked
 from helio_jax.reconstruct.model import Surface
+from helio_jax.reconstruct.validity import FLOATING
 
 WALL = 25.0
 """Change across an edge (chi-square without the detector that changes most) from which on it may be a wall: noise alone
@@ -46,12 +48,21 @@ _BAND = 3
 _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Levels that are tried, up and down, in widths of the region."""
 GAIN = 30.0
-"""By how much another level must lower the misfit [half chi-square] to be kept."""
+"""By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
+worse may be true as well."""
 _LEVEL_STEPS = 8
 """Evaluations by which the best level is refined."""
 
 Misfit = Callable[[Surface], tuple[float, Surface]]
 """Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
+
+
+class Levels(NamedTuple):
+    """What a search found: the surface, the regions that it moved, and those that other levels explain as well."""
+
+    surface: Surface
+    moved: list[int]
+    undecided: list[int]
 
 
 def wall_strength(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
@@ -221,8 +232,8 @@ def search_levels(
     misfit: Misfit,
     beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
-) -> tuple[Surface, list[int]]:
-    """Return the surface with all regions at the levels that explain the images best, and the numbers of those moved.
+) -> Levels:
+    """Return the surface with all regions at the levels that explain the images best.
 
     A moved region starts flat; its own relief is the fit's matter.
 
@@ -236,7 +247,7 @@ def search_levels(
         report: called with what is tried next.
     """
     best, found = misfit(surface)
-    moved = []
+    moved, undecided = [], []
     for number in np.unique(region[region > 0]):
         inside = region == number
         around = _grown(inside) & ~inside
@@ -262,8 +273,18 @@ def search_levels(
         has_wall, i = min(product(kinds, range(len(levels))), key=lambda trial: at(levels[trial[1]], trial[0]))
         bracket = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
         minimize_scalar(at, bounds=bracket, args=(has_wall,), method="bounded", options={"maxiter": _LEVEL_STEPS})
+        explanations = [(best, found), *tried.values()]
         value, better = min(tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
             moved.append(int(number))
-    return found, moved
+        if any(_differ(found, other, inside, ground) for value, other in explanations if value < best + GAIN):
+            undecided.append(int(number))
+    return Levels(found, moved, undecided)
+
+
+def _differ(surface: Surface, other: Surface, inside: np.ndarray, ground: float) -> bool:
+    """Return whether two surfaces' heights in a region differ by a large share of its step to the ground."""
+    heights, others = surface.height[inside], other.height[inside]
+    step = max(abs(float(np.median(h)) - ground) for h in (heights, others))
+    return float(np.median(np.abs(heights - others))) > FLOATING * step

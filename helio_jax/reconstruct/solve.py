@@ -184,8 +184,11 @@ def _known(fit: "Fit") -> dict[str, np.ndarray]:
     return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
 
 
-def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "Fit":
-    """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit."""
+def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "tuple[Fit, np.ndarray]":
+    """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit.
+
+    Return the fit, and where another level explains the images as well [y, x].
+    """
     from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
     signal, variance = signal_of(stack)
@@ -193,6 +196,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
     slow_axis = 0 if stack.fast_axis == "x" else 1
     fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
+    is_undecided = np.zeros(stack.shape[1:], bool)
     roughly = make_predict(max(settings.refine.paths(region.size) // SEARCH_THRIFT, 1000))
     for is_last in (False, True):
         single = unexplained(region, fit.residuals)
@@ -200,7 +204,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
         if fit.is_interrupted or not left.any():
             break
         try:
-            moved, numbers = search_levels(
+            found = search_levels(
                 left,
                 fit.surface,
                 (pitch(stack.y), pitch(stack.x)),
@@ -209,16 +213,17 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
                 stack.instrument.beam_shift,
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
-            if numbers:
-                is_moved = np.isin(left, numbers)
+            is_undecided[left > 0] = np.isin(left, found.undecided)[left > 0]
+            if found.moved:
+                is_moved = np.isin(left, found.moved)
                 levelled[is_moved] = levelled.max() + left[is_moved]
-                fit = fit_heights(*problem, moved, settings, predict, report, levelled, slow_axis)
+                fit = fit_heights(*problem, found.surface, settings, predict, report, levelled, slow_axis)
             elif np.unique(left).size == np.unique(single).size:
                 break
         except KeyboardInterrupt:
             fit = replace(fit, status=f"interrupted in the search for plateaus; before that: {fit.status}")
             break
-    return fit
+    return fit, is_undecided
 
 
 def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
@@ -232,13 +237,12 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
     for _ in range(settings.refine.photometric_rounds - 1):
         start = _corrected(stack, settings, geometry, start.height, start.normals(shift), roughly)
-    fit = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+    fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
     from helio_jax.reconstruct.findings import describe_instrument
 
     posterior = fit.posterior
-    is_floating = np.zeros(stack.shape[1:], bool)
     if posterior is not None:
-        is_floating = floating(
+        is_floating |= floating(
             fit.surface.height, posterior.samples, regions(fit.intact_x, fit.intact_y), posterior.bent
         )
     worst = fit.weight.min(0, where=stack.is_observed, initial=1.0)

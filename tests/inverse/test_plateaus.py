@@ -72,8 +72,8 @@ def test_search_finds_the_level_of_least_misfit(best):
         return 1e4 + min(0.3 * (level - best) ** 2, 800.0 + (level - 2.0) ** 2), surface
 
     ground = Surface(np.full(SHAPE, 7.0), np.full(SHAPE, 0.1), np.full(SHAPE, 0.2))
-    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
-    assert moved == [1]
+    found, moved, undecided = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
+    assert moved == [1] and undecided == []
     assert np.median(found.height[INSIDE]) - 7.0 == pytest.approx(best, abs=3.0)
     assert np.all(found.slope_x[~INSIDE] == 0.1) and np.all(found.slope_x[INSIDE] == 0.0)
     assert np.all(found.height[~INSIDE] == 7.0)
@@ -89,7 +89,7 @@ def test_a_level_that_cannot_be_predicted_is_passed_over():
         return 1e4 + 0.3 * (level + 120.0) ** 2, surface
 
     ground = Surface(*np.zeros((3, *SHAPE)))
-    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
+    found, moved, _ = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
     assert moved == [1] and np.median(found.height[INSIDE]) == pytest.approx(-120.0, abs=3.0)
 
 
@@ -98,7 +98,7 @@ def test_a_level_that_gains_little_is_not_taken():
         return -0.9 * GAIN * (surface.height[INSIDE].mean() < -20.0), surface
 
     ground = Surface(*np.zeros((3, *SHAPE)))
-    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
+    found, moved, _ = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
     assert moved == [] and found is ground
 
 
@@ -144,9 +144,23 @@ def test_search_tries_levels_with_a_wall():
         return 1e-2 * float(np.sum((surface.height - want.height) ** 2)), surface
 
     ground = Surface(*np.zeros((3, *SHAPE)))
-    found, moved = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit, (0.5, 0.0))
+    found, moved, _ = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit, (0.5, 0.0))
     assert moved == [1]
     np.testing.assert_allclose(found.height, want.height, atol=3.0)
+
+
+@pytest.mark.parametrize(("worse", "is_open"), [(0.5 * GAIN, True), (2.0 * GAIN, False)])
+def test_two_levels_that_explain_alike_are_undecided(worse, is_open):
+    """-250 um is best, 62 um worse by half or twice what counts as a difference. Rejects keeping the best silently."""
+
+    def misfit(surface):
+        level = surface.height[INSIDE].mean()
+        return min(0.02 * (level + 250.0) ** 2, worse + 0.02 * (level - 62.0) ** 2, 1e4), surface
+
+    ground = Surface(*np.zeros((3, *SHAPE)))
+    found, moved, undecided = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
+    assert moved == [1] and undecided == ([1] if is_open else [])
+    assert np.median(found.height[INSIDE]) == pytest.approx(-250.0, abs=5.0)
 
 
 @pytest.mark.slow
