@@ -2,9 +2,10 @@
 
 Slopes say nothing about the height of a floor behind a wall that the beam does not see: a least-squares fit bridges the
 wall by slopes that the images contradict. The images show the wall, though: across a mask's edge one detector changes,
-across a wall two or more do. `find_plateaus` parts the image along such lines; `search_levels` tries each
-region at a number of levels, all physics predicted anew, and keeps the one that explains the images best.
-The level is then fitted like every other height, and its error bar says whether masks or the near field fix it.
+across a wall two or more do. `find_plateaus` parts the image along such lines; `search_levels` tries each region at a
+number of levels, flat and with the wall that the beam would see, all physics predicted anew, and keeps what explains the
+images best. The level is then fitted like every other height, and its error bar says whether masks or the near field
+fix it; a region that something else explains about as well is undecided.
 """
 
 import math
