@@ -17,9 +17,10 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
+from helio_jax.reconstruct.levels import search_levels
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.plateaus import find_plateaus, joined, search_levels, unexplained
+from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
 from helio_jax.reconstruction import Reconstruction

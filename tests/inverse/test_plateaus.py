@@ -6,8 +6,9 @@ import pytest
 from helio_jax import pipeline
 from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
+from helio_jax.reconstruct.levels import GAIN, at_level, search_levels
 from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.plateaus import GAIN, at_level, find_plateaus, joined, search_levels, unexplained
+from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.truth import true_height
 
 SHAPE = (40, 60)
