@@ -324,10 +324,11 @@ def trench_row(record: Record, seed: int) -> None:
             floor, inside = true < -0.9 * depth, true < -0.05 * depth
             assert rec.height_std is not None
             wrong = rec.is_valid & (np.abs(rec.height - true) > 3.0 * rec.height_std + 0.05 * depth)
-            found, std = rec.spread(lambda h: float(np.median(h[~inside]) - np.median(h[floor])))
+            # where the beam reaches no floor there is no depth to tell
+            seen = rec.spread(lambda h: float(np.median(h[~inside]) - np.median(h[floor]))) if floor.any() else None
             return {
-                "depth_um": found,
-                "std_um": std,
+                "depth_um": seen and seen[0],
+                "std_um": seen and seen[1],
                 "true_um": depth,
                 "valid_inside": float(rec.is_valid[inside].mean()),
                 "invented_inside": float(wrong[inside].mean()),
