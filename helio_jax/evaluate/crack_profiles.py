@@ -89,7 +89,7 @@ _Shape = Callable[[np.ndarray, float, float], np.ndarray]
 
 @dataclass(frozen=True)
 class _Fit:
-    """Where a profile lies beside its path, its width and blur [pixels], and chi-square per degree of freedom (>= 1)."""
+    """Where a profile lies beside its path, its width and blur [pixels]; chi-square per degree of freedom, >= 1."""
 
     aside: float
     width: float
@@ -99,32 +99,26 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Beside:
-    """Pixels beside a line [pixel]: contrast and variance by detector, distance t, and the line's median normal."""
+    """Pixels beside a line [pixel]: contrast and variance by detector, distance t, place along; its median normal."""
 
     values: np.ndarray
     variance: np.ndarray
     t: np.ndarray
+    along: np.ndarray
     normal: np.ndarray
 
     @classmethod
     def of(cls, path: Path, contrast: Contrast, reach: float) -> "_Beside":
         """Return the known pixels within reach of a path."""
-        rows, columns, t, _, normal = _across(path, contrast.is_known.shape, reach)
+        rows, columns, t, along, normal = _across(path, contrast.is_known.shape, reach)
         use = contrast.is_known[rows, columns]
         rows, columns = rows[use], columns[use]
         middle = np.median(normal, axis=0)
-        return cls(contrast.values[:, rows, columns], contrast.variance[:, rows, columns], t[use], middle)
+        return cls(contrast.values[:, rows, columns], contrast.variance[:, rows, columns], t[use], along[use], middle)
 
-    def fit(
-        self, shape: _Shape, *, aside: float, width: float, blur: float, also: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Fit level, slope and a shape to every detector; return its factors, their deviations, and chi-square.
-
-        `also`: an edge in the same place, too, for one wall of a slit may be bright and the other one dark.
-        """
-        t = self.t - aside
-        columns = [np.ones(t.size), self.t, *([_edge(t, width, blur)] if also else []), shape(t, width, blur)]
-        design = np.stack(columns, -1)
+    def fit(self, shape: _Shape, *, aside: float, width: float, blur: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Fit level, slope and a shape to every detector; return its factors, their deviations, and chi-square."""
+        design = np.stack([np.ones(self.t.size), self.t, shape(self.t - aside, width, blur)], -1)
         found, std, chi2 = [], [], 0.0
         for values, variance in zip(self.values, self.variance, strict=True):
             root = 1.0 / np.sqrt(variance)
@@ -142,35 +136,65 @@ class _Beside:
         return self.values.size - 3 * len(self.values)
 
 
-def find_ends(path: Path, contrast: Contrast, shape: _Shape, factors: np.ndarray, fit: "_Fit") -> tuple[float, ...]:
-    """Return where a line of a known profile begins and ends along an (extended) path, with deviations [pixels].
-
-    Every pixel beside the path says how much likelier it is with the line than without; summed from the middle outwards
-    that is the log-likelihood of an end there. Returned are mean and deviation of each under a flat prior.
-    """
-    rows, columns, t, along, _ = _across(path, contrast.is_known.shape, _CORE)
-    use = contrast.is_known[rows, columns]
-    rows, columns, t, along = rows[use], columns[use], t[use], along[use]
-    profile = shape(t - fit.aside, fit.width, fit.blur)
-    base = np.stack([np.ones(t.size), t], -1)
+def _gain_of_edge(beside: "_Beside", factors: np.ndarray, fit: _Fit) -> np.ndarray:
+    """Return how much likelier every pixel is with an edge of known change than without [pixel]."""
+    profile = _edge(beside.t - fit.aside, fit.width, fit.blur)
+    base = np.stack([np.ones(beside.t.size), beside.t], -1)
     profile = profile - base @ np.linalg.lstsq(base, profile, rcond=None)[0]
+    change = factors[:, None] * profile
+    level = np.median(beside.values, axis=1, keepdims=True)
+    return np.sum((change * (beside.values - level) - 0.5 * change**2) / (beside.variance * fit.excess), axis=0)
+
+
+def _gain_of_line(beside: "_Beside", is_sure: np.ndarray, fit: _Fit) -> np.ndarray:
+    """Return how much likelier every pixel is with a thin line of random brightness than without [pixel].
+
+    Walls and floor of a slit may be bright and dark in turns: only that more than noise is there is looked at. With m
+    times the noise's variance more, the logarithm is (z^2 m / (1 + m) - log(1 + m)) / 2. Source: own derivation.
+
+    Args:
+        beside: pixels.
+        is_sure: those that surely lie between the ends [pixel].
+        fit: of the line.
+    """
+    t = beside.t - fit.aside
+    core = np.abs(t) <= 0.5 * fit.width + fit.blur
+    base = np.stack([np.ones(t.size), t, beside.along, t * beside.along], -1)
     gain = np.zeros(t.size)
-    for f, values, variance in zip(factors, contrast.values, contrast.variance, strict=True):
-        q, v = values[rows, columns], variance[rows, columns] * fit.excess
-        gain += (f * profile * (q - np.median(q)) - 0.5 * (f * profile) ** 2) / v
-    ends = []
-    middle = 0.5 * path.length
+    for values, variance in zip(beside.values, beside.variance, strict=True):
+        flank = np.linalg.lstsq(base[~core], values[~core], rcond=None)[0]
+        z = (values - base @ flank) / np.sqrt(variance)
+        noise = max(float(np.mean(z[~core] ** 2)), 1.0)
+        more = max(float(np.mean(z[core & is_sure] ** 2)) / noise - 1.0, 0.0)
+        gain[core] += 0.5 * (z[core] ** 2 / noise * more / (1.0 + more) - math.log1p(more))
+    return gain
+
+
+def find_ends(along: np.ndarray, gain: np.ndarray, length: float) -> tuple[float, float, float, float]:
+    """Return where a line begins along its extended path, the deviation, where it ends, the deviation [pixels].
+
+    Gains summed from the middle outwards are the log-likelihood of an end there; returned are mean and deviation under
+    a flat prior.
+
+    Args:
+        along: places of pixels along the path.
+        gain: how much likelier each is with the line than without.
+        length: of the path.
+    """
+    ends: list[float] = []
+    middle = 0.5 * length
     for side in (-1.0, 1.0):
         place = side * (along - middle)
         order = np.argsort(place)
         order = order[place[order] >= 0]
-        at, total = place[order], np.cumsum(gain[order])
-        weight = np.gradient(at) if at.size > 1 else np.ones_like(at)
-        weight = np.maximum(weight, 1e-9) * np.exp(total - total.max()) if at.size else weight
-        mean = float(np.sum(weight * at) / np.sum(weight)) if at.size else 0.0
-        std = float(np.sqrt(np.sum(weight * (at - mean) ** 2) / np.sum(weight))) if at.size else 0.0
-        ends += [middle + side * mean, std]
-    return tuple(ends)
+        at, total = np.r_[0.0, place[order], middle], np.r_[0.0, np.cumsum(gain[order])]
+        gap = np.diff(at)  # the end lies between two pixels, the first of them within
+        weight = gap * np.exp(total - total.max())
+        center = 0.5 * (at[1:] + at[:-1])
+        mean = float(np.sum(weight * center) / np.sum(weight))
+        variance = float(np.sum(weight * ((center - mean) ** 2 + gap**2 / 12.0)) / np.sum(weight))
+        ends += [middle + side * mean, math.sqrt(variance + 1.0 / 12.0)]  # and pixels are points, not areas
+    return ends[0], ends[1], ends[2], ends[3]
 
 
 def measure_line(
@@ -190,11 +214,14 @@ def measure_line(
     edges = [(beside.fit(_edge, aside=d, width=0.0, blur=b)[2], d, b) for d in places for b in s.blurs_px]
     is_thin = min(lines)[0] < min(edges)[0]
     shape = _line if is_thin else _edge
-    chi2, aside, size = min(lines if is_thin else edges)
+    chi2, aside, size = min(lines) if is_thin else min(edges)
     fit = _Fit(aside, *((size, middle) if is_thin else (0.0, size)), max(chi2 / beside.freedom, 1.0))
     factors, std, _ = beside.fit(shape, aside=fit.aside, width=fit.width, blur=fit.blur)
     longer = path.extended(_BEYOND)
-    start, start_std, end, end_std = find_ends(longer, contrast, shape, factors, fit)
+    wide = _Beside.of(longer, contrast, s.reach_px if is_thin else _CORE)
+    inner = np.abs(wide.along - 0.5 * longer.length) < 0.5 * path.length - _BEYOND / 3.0
+    gain = _gain_of_line(wide, inner, fit) if is_thin else _gain_of_edge(wide, factors, fit)
+    start, start_std, end, end_std = find_ends(wide.along, gain, longer.length)
     path = longer.between(start, end).moved(fit.aside)
     if path.length < s.min_length_px:
         return None
@@ -218,9 +245,8 @@ def _measure_thin(
     """Measure a thin line: one width, a darkness of its own in every detector; a slit, a step, a line, or None."""
     step, names = pitch(rec.raster_x), stack.instrument.detector_names
     widths = np.arange(0.25, _WIDEST + 0.1, 0.25)
-    fits = [
-        min((beside.fit(_line, aside=aside, width=w, blur=b) for b in s.blurs_px), key=lambda f: f[2]) for w in widths
-    ]
+    blurs = np.arange(min(s.blurs_px), max(s.blurs_px) + 0.05, 0.1)
+    fits = [min((beside.fit(_line, aside=aside, width=w, blur=b) for b in blurs), key=lambda f: f[2]) for w in widths]
     chi2 = np.array([f[2] for f in fits])
     excess = max(float(chi2.min()) / beside.freedom, 1.0)
     dark, std = np.array([f[0] for f in fits]), np.array([f[1] for f in fits]) * math.sqrt(excess)
@@ -237,7 +263,7 @@ def _measure_thin(
     is_resolved = two[0] > widths[possible][0] * step and two[-1] < widths[-1] * step
     seen: dict[str, Any] = {
         "width_um": float(widths[best]) * step if is_resolved else math.nan,
-        "width_std_um": max(0.5 * float(one[-1] - one[0]), 0.125 * step) if is_resolved else math.nan,
+        "width_std_um": max(0.5 * float(one[-1] - one[0]), 0.25 * step) if is_resolved else math.nan,
         "width_range_um": (float(two[0]), float(two[-1])),
         "missing_um": dict(zip(names, missing.tolist(), strict=True)),
         "missing_std_um": dict(zip(names, missing_std.tolist(), strict=True)),
@@ -299,7 +325,8 @@ def _measure_kink(
     piece = np.minimum((along / path.length * n_pieces).astype(int), n_pieces - 1)
     known = ((rec.is_valid | (rec.reason == REASONS.index("floating"))) & np.isfinite(rec.height))[rows, columns]
     pieces = [
-        _Profile.of(rec, *(v[(piece == i) & known] for v in (rows, columns, t)), s.flank_px) for i in range(n_pieces)
+        _Profile.of(rec, rows[use], columns[use], t[use], s.flank_px)
+        for use in ((piece == i) & known for i in range(n_pieces))
     ]
     deep = [(*rec.spread(q.depth), q) for q in pieces if q is not None]
     sure = [d for d in deep if d[0] > (_SURE * d[1] if math.isfinite(d[1]) else 0.0)]

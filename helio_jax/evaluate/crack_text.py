@@ -42,8 +42,9 @@ def crack_lines(found: Cracks) -> list[str]:
     density, std = found.density
     total = sum(c.length_um for c in found.counted)
     lines = [
-        f"cracks: {len(found.counted)}, {total / 1e3:.2f} mm long in all, {1e3 * density:.2f} +- {1e3 * std:.2f} mm per "
-        f"mm2 of {found.area_um2 / 1e6:.2f} mm2; {len(found.cracks) - len(found.counted)} creases, steps and other lines",
+        f"cracks: {len(found.counted)}, {total / 1e3:.2f} mm long in all, {1e3 * density:.2f} +- {1e3 * std:.2f} mm "
+        f"per mm2 of {found.area_um2 / 1e6:.2f} mm2; besides {len(found.cracks) - len(found.counted)} creases, steps "
+        "and other lines",
         f"  noise alone is allowed {found.allowed:g} lines; {found.left_out} lines left out (one detector's alone, no "
         f"concave kink); {found.n_ridges} ridges found the same way",
         "  no kind     from (um)          to (um)       length (um)    width (um)  depth (um)     false alarms",
@@ -54,8 +55,9 @@ def crack_lines(found: Cracks) -> list[str]:
             width = f"{c.width_range_um[0]:.0f}-{c.width_range_um[1]:.0f}"
         depth = _with_std(c.depth_um, c.depth_std_um, 1)
         depth = f">= {c.depth_at_least_um:.0f}" if c.kind == "slit" else depth
+        length = _with_std(c.length_um, c.length_std_um, 0)
         lines.append(
-            f"  {c.number:>2} {c.kind:<6} {_place(c.start)} {_place(c.end)} {_with_std(c.length_um, c.length_std_um, 0):>12}"
+            f"  {c.number:>2} {c.kind:<6} {_place(c.start)} {_place(c.end)} {length:>12}"
             f"  {width:>12}  {depth:<13} {c.false_alarms:.0e}"
         )
         lines.append(f"     {_contrast(c)}; depth: {c.depth_note}")

@@ -3,18 +3,18 @@
 Lines are found (`lines`) and told apart by their profiles (`crack_profiles`). A *slit* is thin, and dark in two
 detectors or more in a way that no step explains. The width of flat surface whose signal is missing needs no resolution,
 and bounds its depth from below: a floor at depth d hides at most d times the tangent of a detector's lowest direction
-across the slit, and the beam's slant as much again times its own; what scatters more often only adds. From above nothing
-bounds the depth. Slits lack less signal than they are wide, for their walls give most atoms back, and may even be bright
-in a detector that looks at the lit wall, or along them. A *groove* is open: its flanks are seen, and depth and width are
-measured in the heights. Listed, but not counted as cracks, are a *crease*, a concave kink without two flanks; a *step*;
-and a thin *line* that is none of these, which may be a slit with lit walls, a scratch or a ridge.
+across the slit, and the beam's slant as much again times its own; what scatters more often only adds. From above
+nothing bounds the depth. Slits lack less signal than they are wide, for their walls give most atoms back, and may even
+be bright in a detector that looks at the lit wall, or along them. A *groove* is open: its flanks are seen, and depth
+and width are measured in the heights. Listed, but not counted as cracks, are a *crease*, a concave kink without two
+flanks; a *step*; and a thin *line* that is none of these: perhaps a slit with lit walls, a scratch or a ridge.
 
 Lengths and places are in beam positions. Sources of the formulas: own derivations, tests/unit/test_cracks.py.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -108,7 +108,7 @@ class Cracks:
 
     Attributes:
         cracks: the most significant first; creases among them.
-        area_um2: that was searched.
+        area_um2: that was searched: five pixels beside unknown ones and the border are not.
         n_ridges: convex kinks found in the same way: how rough the surface is.
         left_out: lines that their profiles do not bear out, and bright ones.
         threshold: score that a line had to exceed, by kind.
@@ -179,18 +179,18 @@ def find_cracks(
         raise SceneError(f"cracks are looked for on square pixels, the raster has {steps[0]:g} x {steps[1]:g} um")
     contrast = contrast_of(stack)
     cracks: list[Crack] = []
-    threshold, left_out, n = {}, 0, int(inside.sum())
+    threshold, left_out, n = {}, 0, 0
     for kind in ORDER:
         found = find_lines(contrast, inside, kind, s)
-        threshold[kind] = found.threshold
+        threshold[kind], n = found.threshold, found.n_pixels
         for path in trace_lines(found, s):
             seen = measure_line(path, contrast, rec, stack, s)
             left_out += seen is None
             if seen is not None:
-                cracks.append(_crack(path, found, rec, stack, n, seen))
+                cracks.append(_crack(path, found, rec, stack, seen))
     n_ridges = len(trace_lines(find_lines(contrast, inside, "groove", s, sign=-1.0), s))
     cracks = _without_doubles(sorted(cracks, key=lambda c: -c.score), _SAME * steps[0])
-    numbered = tuple(Crack(**vars(c) | {"number": i}) for i, c in enumerate(cracks, 1))
+    numbered = tuple(replace(c, number=i) for i, c in enumerate(cracks, 1))
     return Cracks(numbered, n * steps[0] * steps[1], n_ridges, left_out, threshold, s.false_alarms)
 
 
@@ -204,9 +204,7 @@ def _without_doubles(cracks: list[Crack], near: float) -> list[Crack]:
     return kept
 
 
-def _crack(
-    path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, n: int, seen: dict[str, Any]
-) -> Crack:
+def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, seen: dict[str, Any]) -> Crack:
     """Return a crack from its path [pixels] and what was measured across it."""
     step = pitch(rec.raster_x)
     points = np.array([rec.raster_x[0], rec.raster_y[0]]) + step * seen.pop("points")
@@ -237,7 +235,7 @@ def _crack(
         points=points,
         direction_deg=direction,
         score=score,
-        false_alarms=found.false_alarms(score, n),
+        false_alarms=found.false_alarms(score),
         along_scan_deg=abs(direction) if stack.fast_axis == "x" else 90.0 - abs(direction),
         **(unknown | seen),
     )

@@ -14,12 +14,13 @@ Source: Steger, IEEE PAMI 20 (1998) 113 (lines as maxima of directed second deri
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from scipy import fft, ndimage, optimize
+from scipy import ndimage, optimize, signal
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
@@ -35,11 +36,14 @@ _TURNS = 16
 _ELONGATION = 3.0
 _CUT = 4.0
 """Filters end at so many standard deviations."""
-_CLIP = 3.0
-_CLIPPED_MEAN = 0.79691
-"""Mean of min(abs(z), 3) of a normal z."""
-_SURROUNDINGS = 12.0
+_CLIP, _CLIPPED_MEAN = 2.0, 0.78089
+"""The mean of min(abs(z), 2) of a normal z."""
+_SURROUNDINGS = 16.0
 """Standard deviation of the surroundings that a line must stand out of, too [pixels]."""
+_LINES, _LINE_ROUNDS = (9, 1), 6
+"""Window of the running median across scan lines [pixels], and how often it is taken."""
+_LOBE, _LOBE_SHARE = 5.0, 0.6
+"""The filters' side lobes are within so many pixels of a line, and answer with less than this share of its score."""
 _SMOOTH = 2.5
 """Standard deviation by which a line's course is smoothed [points, about a pixel apart]."""
 _SIDE = 0.7
@@ -90,6 +94,7 @@ class Found:
         threshold: score that noise exceeds with the allowed false alarms.
         density: from `false_alarm_density`, summed over the widths.
         degrees: of freedom of the chi-square; 0: a Gaussian field.
+        n_pixels: that were searched.
     """
 
     score: np.ndarray
@@ -98,10 +103,11 @@ class Found:
     threshold: float
     density: float
     degrees: int
+    n_pixels: int
 
-    def false_alarms(self, score: float, n_pixels: int) -> float:
-        """Return how many maxima at or above a score noise alone shows in so many pixels, on average."""
-        return n_pixels * self.density * euler_density(score, self.degrees)
+    def false_alarms(self, score: float) -> float:
+        """Return how many maxima at or above a score noise alone shows in the searched pixels, on average."""
+        return self.n_pixels * self.density * euler_density(score, self.degrees)
 
 
 @dataclass(frozen=True)
@@ -149,7 +155,8 @@ class Path:
 def contrast_of(stack: MicrographStack) -> Contrast:
     """Return the micrographs relative to their median, with the offsets of scan lines taken off.
 
-    The offset of a scan line is the median, along it, of what a running median across the scan lines leaves.
+    The offset of a scan line is the median, along it, of what a running median across the scan lines leaves; again and
+    again, for that running median follows the offsets at first.
 
     Raises:
         SceneError: the stack is not calibrated, its noise is unknown, or there are fewer than three detectors.
@@ -166,9 +173,13 @@ def contrast_of(stack: MicrographStack) -> Contrast:
     for counts, noise in zip(stack.counts, stack.variance, strict=True):
         flat = float(np.median(counts[known]))
         q = np.where(known, counts / flat - 1.0, 0.0)
-        smooth = ndimage.median_filter(q, size=(1, 9) if axis == 0 else (9, 1), mode="nearest")
-        lines = np.nanmedian(np.where(known, q - smooth, np.nan), axis=axis, keepdims=True)
-        values.append(np.where(known, q - np.nan_to_num(lines), 0.0))
+        for _ in range(_LINE_ROUNDS):
+            smooth = ndimage.median_filter(q, size=_LINES if axis == 1 else _LINES[::-1], mode="nearest")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of lines without a known pixel
+                lines = np.nanmedian(np.where(known, q - smooth, np.nan), axis=axis, keepdims=True)
+            q = np.where(known, q - np.nan_to_num(lines), 0.0)
+        values.append(q)
         variance.append(np.where(known, noise, 0.0) / flat**2)
     apertures = stack.instrument.apertures()
     directions = np.array([a.center for a in apertures]) / stack.instrument.sample_distance
@@ -248,10 +259,13 @@ def find_lines(contrast: Contrast, inside: np.ndarray, kind: Kind, s: LineSettin
         GuardError: no pixel is left to search.
     """
     order = ORDER[kind]
-    reach = math.ceil(_CUT * min(s.widths_px))  # what a filter sees beyond unknown pixels is zero there
-    searched = inside & ndimage.binary_erosion(contrast.is_known, iterations=max(reach // 2, 1))
+    reach = math.ceil(_ELONGATION * max(s.widths_px))  # beyond the border and in unknown pixels nothing is known
+    searched = inside & ndimage.binary_erosion(contrast.is_known, np.ones((3, 3), bool), iterations=reach)
     if not searched.any():
-        raise GuardError("no pixel to look for cracks at: they need a surrounding of pixels known in all detectors")
+        raise GuardError(
+            f"no pixel to look for cracks at: they need {reach} pixels known in all detectors around them; take "
+            "another region"
+        )
     shape = contrast.is_known.shape
     score, amplitude, angle = (np.zeros(shape) for _ in range(3))
     degrees = len(contrast.values) if kind == "line" else 0
@@ -262,7 +276,7 @@ def find_lines(contrast: Contrast, inside: np.ndarray, kind: Kind, s: LineSettin
             k = kernel(order, width, turn)
             values, variances = _filtered(contrast.values, k), _filtered(contrast.variance, k**2)
             answers.append((turn, sign * values, np.maximum(variances, 1e-30)))
-        scale = _excess([a[1] / np.sqrt(a[2]) for a in answers], searched)
+        scale = np.max([_excess(values / np.sqrt(variances), searched) for _, values, variances in answers], axis=0)
         for turn, values, variances in answers:
             r = contrast.directions @ np.array([math.cos(turn), math.sin(turn)])
             if kind == "line":
@@ -278,22 +292,23 @@ def find_lines(contrast: Contrast, inside: np.ndarray, kind: Kind, s: LineSettin
     share = s.false_alarms / len(ORDER)
     lowest = math.sqrt(max(2 * degrees, 4))
     surplus = lambda t: n * density * euler_density(t, degrees) - share  # noqa: E731
-    threshold = float(optimize.brentq(surplus, lowest, 40.0)) if surplus(lowest) > 0 else lowest
-    return Found(score, amplitude, angle, threshold, density, degrees)
+    threshold = optimize.root_scalar(surplus, bracket=(lowest, 40.0)).root if surplus(lowest) > 0 else lowest
+    return Found(score, amplitude, angle, threshold, density, degrees, n)
 
 
 def _filtered(images: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Return images [detector, y, x] correlated with a kernel, their borders continued by mirroring."""
     n = k.shape[0] // 2
     padded = np.pad(images, ((0, 0), (n, n), (n, n)), mode="symmetric")
-    size = [fft.next_fast_len(m, real=True) for m in padded.shape[1:]]
-    product = fft.rfft2(padded, size) * np.conj(fft.rfft2(k, size))
-    return fft.irfft2(product, size)[:, : images.shape[1], : images.shape[2]]
+    return signal.fftconvolve(padded, k[None, ::-1, ::-1], mode="valid", axes=(1, 2))
 
 
-def _excess(scores: list[np.ndarray], searched: np.ndarray) -> np.ndarray:
-    """Return by what factor the answers about each pixel exceed those of the noise, at least 1 [detector, y, x]."""
-    clipped = np.mean([np.minimum(np.abs(z), _CLIP) for z in scores], axis=0)
+def _excess(scores: np.ndarray, searched: np.ndarray) -> np.ndarray:
+    """Return by what factor one direction's answers about each pixel exceed those of noise, >= 1 [detector, y, x].
+
+    The largest of all directions counts: so a line has to stand out of a ripple, too.
+    """
+    clipped = np.minimum(np.abs(scores), _CLIP)
     mean = lambda image: ndimage.gaussian_filter(image, _SURROUNDINGS, mode="constant")  # noqa: E731
     weight = mean(searched.astype(float)) + 1e-12
     return np.maximum(np.stack([mean(np.where(searched, c, 0.0)) / weight for c in clipped]) / _CLIPPED_MEAN, 1.0)
@@ -349,8 +364,9 @@ def trace_lines(found: Found, s: LineSettings) -> list[Path]:
         path = _trimmed(points[order], here[order], found.amplitude[is_top][order])
         if path is not None and path.length >= s.min_length_px and path.score >= found.threshold:
             paths.append(path)
-        taken = np.unique(np.concatenate([[start], order, *cKDTree(points).query_ball_point(points[order], _REACH)]))
-        left[taken.astype(int)] = False
+        away, nearest = cKDTree(points[order]).query(points)
+        left[away <= _REACH] = False
+        left[(away <= _LOBE) & (here < _LOBE_SHARE * here[order][nearest])] = False
         keep = left.astype(float)
         graph = graph.multiply(keep[:, None]).multiply(keep[None, :]).tocsr()
         graph.eliminate_zeros()

@@ -10,7 +10,7 @@ Source: regions grown by direction are those of von Gioi et al., IEEE PAMI 32 (2
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,9 @@ def find_walls(rec: Reconstruction, inside: np.ndarray | None = None, settings: 
     if inside is not None:
         marked &= inside
     height = np.where(np.isfinite(rec.height), rec.height, np.nanmedian(rec.height))
-    fall = -np.stack([ndimage.gaussian_filter(height, s.blur_px, order=o) for o in ((0, 1), (1, 0))], -1)
+    smooth = ndimage.gaussian_filter(height, s.blur_px)
+    upward, rightward = np.gradient(smooth)
+    fall = np.stack([-rightward, -upward], -1)
     left, walls, used = marked.copy(), [], 0
     steepest = np.argsort(-np.hypot(*np.moveaxis(fall, -1, 0)), axis=None)
     for start in steepest[marked.ravel()[steepest]]:
@@ -128,7 +130,7 @@ def find_walls(rec: Reconstruction, inside: np.ndarray | None = None, settings: 
             walls.append(wall)
             used += int(region.sum())
     walls.sort(key=lambda w: -w.length_um)
-    numbered = tuple(Wall(**vars(w) | {"number": i}) for i, w in enumerate(walls, 1))
+    numbered = tuple(replace(w, number=i) for i, w in enumerate(walls, 1))
     return Walls(numbered, marked, used / max(int(marked.sum()), 1))
 
 
