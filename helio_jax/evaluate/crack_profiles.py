@@ -4,7 +4,6 @@ Every pixel beside a line takes part with its own distance from it, so that a li
 raster is sampled far more finely than the pitch. Source: own derivations, tests/unit/test_cracks.py.
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,9 @@ from scipy import special, stats
 from scipy.spatial import cKDTree
 
 from helio_jax.arrays import pitch
-from helio_jax.evaluate.lines import Contrast, LineSettings, Path
+from helio_jax.evaluate.groove_depth import HeightProfile
+from helio_jax.evaluate.line_paths import Path
+from helio_jax.evaluate.lines import Contrast, LineSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS, Reconstruction
 
@@ -325,7 +326,7 @@ def _measure_kink(
     piece = np.minimum((along / path.length * n_pieces).astype(int), n_pieces - 1)
     known = ((rec.is_valid | (rec.reason == REASONS.index("floating"))) & np.isfinite(rec.height))[rows, columns]
     pieces = [
-        _Profile.of(rec, rows[use], columns[use], t[use], s.flank_px)
+        HeightProfile.of(rec, rows[use], columns[use], t[use], s.flank_px)
         for use in ((piece == i) & known for i in range(n_pieces))
     ]
     deep = [(*rec.spread(q.depth), q) for q in pieces if q is not None]
@@ -346,59 +347,3 @@ def _measure_kink(
         "width_std_um": math.hypot(width_std, 1.0 / math.sqrt(12.0)) * step,
         "depth_note": f"where it is deepest; two flanks on {len(sure)} of {n_pieces} pieces of its length",
     }
-
-
-@dataclass(frozen=True)
-class _Profile:
-    """Heights across a piece of a line: pixels in bins a pixel wide; its bottom and shoulders, as bins."""
-
-    rows: np.ndarray
-    columns: np.ndarray
-    place: np.ndarray
-    known: np.ndarray
-    bottom: int
-    shoulders: tuple[int, int]
-
-    @classmethod
-    def of(
-        cls, rec: Reconstruction, rows: np.ndarray, columns: np.ndarray, t: np.ndarray, reach: int
-    ) -> "_Profile | None":
-        """Return the profile of pixels at distances t, or None where too little is known on either side."""
-        place = np.round(t).astype(int) + reach
-        counts = np.bincount(place, minlength=2 * reach + 1)
-        known = counts >= max(2.0, 0.3 * float(np.median(counts)))
-        if not known[reach] or known[: reach - 1].sum() < 3 or known[reach + 2 :].sum() < 3:
-            return None
-        self = cls(rows, columns, place, known, reach, (reach, reach))
-        q = self.means(rec.height)
-        bottom = reach - 1 + int(np.argmin(np.where(known, q, np.inf)[reach - 1 : reach + 2]))
-        sides = np.flatnonzero(known[:bottom]), bottom + 1 + np.flatnonzero(known[bottom + 1 :])
-        left, right = (int(side[np.argmax(q[side])]) for side in sides)
-        return cls(rows, columns, place, known, bottom, (left, right))
-
-    def means(self, height: np.ndarray) -> np.ndarray:
-        """Return the mean height in every bin."""
-        n = self.known.size
-        total = np.bincount(self.place, height[self.rows, self.columns], n)
-        return total / np.maximum(np.bincount(self.place, minlength=n), 1)
-
-    def depth(self, height: np.ndarray) -> float:
-        """Return the depth of the bottom below the lower shoulder."""
-        q = self.means(height)
-        return float(min(q[i] for i in self.shoulders) - q[self.bottom])
-
-    def width(self, height: np.ndarray) -> float:
-        """Return the width at half of the depth [pixels]."""
-        q = self.means(height)
-        level = q[self.bottom] + 0.5 * self.depth(height)
-        bins = np.flatnonzero(self.known)
-        left, right = bins[bins <= self.bottom][::-1], bins[bins >= self.bottom]
-        return _crossing(q, right, level) + _crossing(q, left, level)
-
-
-def _crossing(q: np.ndarray, bins: np.ndarray, level: float) -> float:
-    """Return how far from its first bin a profile first rises to a level."""
-    for i, j in itertools.pairwise(bins):
-        if q[j] >= level:
-            return abs(float(i - bins[0])) + abs(float(j - i)) * float((level - q[i]) / (q[j] - q[i]))
-    return abs(float(bins[-1] - bins[0]))

@@ -23,14 +23,8 @@ from scipy.spatial import cKDTree
 from helio_jax.arrays import pitch
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.crack_profiles import CrackSettings, measure_line
-from helio_jax.evaluate.lines import (
-    ORDER,
-    Found,
-    Path,
-    contrast_of,
-    find_lines,
-    trace_lines,
-)
+from helio_jax.evaluate.line_paths import Path, trace_lines
+from helio_jax.evaluate.lines import ORDER, Found, contrast_of, find_lines
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 

@@ -82,9 +82,10 @@ def test_corners_part_edges():
 def test_nothing_known_beside():
     """Above the wall all is masked: no step, a reason; in a region without it no edge; without samples no deviation."""
     rec = terrace()
-    reason = np.where((ACROSS > 15.0) & (ACROSS < 200.0), MASKED, rec.reason)
-    found = find_walls(rec.replace(reason=reason, is_valid=reason == 0))
-    assert found.walls == () or all(not w.is_determined for w in found.walls)
+    reason = np.where((ACROSS > 15.0) & (ACROSS < 600.0), MASKED, rec.reason)
+    hidden = find_walls(rec.replace(reason=reason, is_valid=reason == 0), np.abs(ACROSS) < 60.0)
+    assert hidden.walls and all(not w.is_determined and "too little is known" in w.note for w in hidden.walls)
+    assert math.isnan(hidden.walls[0].step_um)
     assert find_walls(rec, GRID_X > 600.0).walls == ()
     (w,) = find_walls(rec.replace(height_samples=None)).walls
     assert math.isnan(w.step_std_um) and "no deviation" in w.note and w.as_dict()["step_std_um"] is None
