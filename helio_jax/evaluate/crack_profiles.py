@@ -329,8 +329,8 @@ def _measure_kink(
         HeightProfile.of(rec, rows[use], columns[use], t[use], s.flank_px)
         for use in ((piece == i) & known for i in range(n_pieces))
     ]
-    deep = [(*rec.spread(q.depth), q) for q in pieces if q is not None]
-    sure = [d for d in deep if d[0] > (_SURE * d[1] if math.isfinite(d[1]) else 0.0)]
+    deep = [(*q.depth_and_std(rec), q) for q in pieces if q is not None]
+    sure = [d for d in deep if d[0] > _SURE * d[1]]
     if not sure:
         most = f"{max(d[0] for d in deep):.1f} um" if deep else "no heights"
         return seen | {

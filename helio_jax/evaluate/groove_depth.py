@@ -47,6 +47,16 @@ class HeightProfile:
         q = self.means(height)
         return float(min(q[i] for i in self.shoulders) - q[self.bottom])
 
+    def depth_and_std(self, rec: Reconstruction) -> tuple[float, float]:
+        """Return the depth and its deviation: of the samples, or else the scatter of the heights along the piece.
+
+        That scatter is not divided by a number of pixels, for errors of neighbouring heights go together.
+        """
+        depth, std = rec.spread(self.depth)
+        if rec.height_samples is None:
+            std = float(np.std(rec.height[self.rows, self.columns] - self.means(rec.height)[self.place]))
+        return depth, std
+
     def width(self, height: np.ndarray) -> float:
         """Return the width at half of the depth [pixels]."""
         q = self.means(height)

@@ -118,6 +118,8 @@ def measure_height_map(
         if cracks is not None:
             found["cracks"] = cracks.as_dict()
             lines += crack_lines(cracks)
+            if not regions:
+                lines.append("  all of the raster was searched, feet of steps and debris too: --region takes one face")
         if walls is not None:
             found["vertical_edges"] = walls.as_dict()
             lines += wall_lines(walls)
