@@ -27,6 +27,8 @@ _SEEN = 2.0
 """Deviations from which on a detector counts as dark or bright; so many are allowed in bounds."""
 _BEYOND = 6.0
 """How far beyond a path its ends are looked for [pixels]."""
+_AT_END = 1.0
+"""A line that reaches so near to the end of where it may be goes on beyond it [pixels]."""
 _CORE = 3.0
 """Distance to both sides that tells whether a line is there [pixels]."""
 _EXPLAINED = 0.01
@@ -199,9 +201,16 @@ def find_ends(along: np.ndarray, gain: np.ndarray, length: float) -> tuple[float
 
 
 def measure_line(
-    path: Path, contrast: Contrast, rec: Reconstruction, stack: MicrographStack, s: CrackSettings
+    path: Path,
+    contrast: Contrast,
+    inside: np.ndarray,
+    rec: Reconstruction,
+    stack: MicrographStack,
+    s: CrackSettings,
 ) -> dict[str, Any] | None:
     """Measure what runs along a path: as a thin line or as an edge, whichever explains the micrographs better.
+
+    Its ends are looked for where `inside` is True [y, x].
 
     Returns:
         Attributes of `cracks.Crack`, or None where it is one detector's alone, or no kink that is concave.
@@ -218,7 +227,7 @@ def measure_line(
     chi2, aside, size = min(lines) if is_thin else min(edges)
     fit = _Fit(aside, *((size, middle) if is_thin else (0.0, size)), max(chi2 / beside.freedom, 1.0))
     factors, std, _ = beside.fit(shape, aside=fit.aside, width=fit.width, blur=fit.blur)
-    longer = path.extended(_BEYOND)
+    longer = path.extended(_BEYOND).within(inside)
     wide = _Beside.of(longer, contrast, s.reach_px if is_thin else _CORE)
     inner = np.abs(wide.along - 0.5 * longer.length) < 0.5 * path.length - _BEYOND / 3.0
     gain = _gain_of_line(wide, inner, fit) if is_thin else _gain_of_edge(wide, factors, fit)
@@ -234,6 +243,7 @@ def measure_line(
     step = pitch(rec.raster_x)
     place = {
         "points": path.points,
+        "is_cut": bool(start < _AT_END or end > longer.length - _AT_END),
         "length_um": step * path.length,
         "length_std_um": step * math.hypot(start_std, end_std),
     }

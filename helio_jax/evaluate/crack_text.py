@@ -19,6 +19,7 @@ COLUMNS = (
     "y1_um",
     "length_um",
     "length_std_um",
+    "is_cut",
     "direction_deg",
     "width_um",
     "width_std_um",
@@ -61,6 +62,8 @@ def crack_lines(found: Cracks) -> list[str]:
             f"  {width:>12}  {depth:<13} {c.false_alarms:.0e}"
         )
         lines.append(f"     {_contrast(c)}; depth: {c.depth_note}")
+        if c.is_cut:
+            lines.append("     cut by the region's border: it may be longer")
         if c.along_scan_deg < _ALONG_SCAN:
             lines.append(f"     {c.along_scan_deg:.0f} deg from the scan lines: drift within one of them looks alike")
     return lines

@@ -43,6 +43,7 @@ class Crack:
         start, end: its ends, beam positions (x, y) [um].
         points: along it [n, 2], um.
         length_um, length_std_um: along it.
+        is_cut: it reaches the border of the region, and so may be longer.
         direction_deg: from end to end, from +x counter-clockwise, -90 to 90.
         width_um, width_std_um: of the dark line if its profile resolves it (slits, steps); of a groove at half its
             depth; else NaN.
@@ -66,6 +67,7 @@ class Crack:
     points: np.ndarray
     length_um: float
     length_std_um: float
+    is_cut: bool
     direction_deg: float
     width_um: float
     width_std_um: float
@@ -178,7 +180,7 @@ def find_cracks(
         found = find_lines(contrast, inside, kind, s)
         threshold[kind], n = found.threshold, found.n_pixels
         for path in trace_lines(found, s):
-            seen = measure_line(path, contrast, rec, stack, s)
+            seen = measure_line(path, contrast, inside, rec, stack, s)
             left_out += seen is None
             if seen is not None:
                 cracks.append(_crack(path, found, rec, stack, seen))

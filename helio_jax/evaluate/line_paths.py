@@ -61,6 +61,17 @@ class Path:
         at = np.linspace(start, end, max(round(end - start), 2) + 1)
         return Path(np.stack([np.interp(at, self.places, c) for c in self.points.T], -1), self.score)
 
+    def within(self, inside: np.ndarray) -> "Path":
+        """Return the piece about the middle whose pixels are all inside [y, x]."""
+        at = np.linspace(0.0, self.length, max(round(4.0 * self.length), 8))
+        x, y = (np.round(np.interp(at, self.places, c)).astype(int) for c in self.points.T)
+        on = (x >= 0) & (y >= 0) & (x < inside.shape[1]) & (y < inside.shape[0])
+        on[on] = inside[y[on], x[on]]
+        off, middle = np.flatnonzero(~on), at.size // 2
+        first = max((i + 1 for i in off if i < middle), default=0)
+        last = min((i - 1 for i in off if i > middle), default=at.size - 1)
+        return self.between(at[first], at[last])
+
     def moved(self, aside: float) -> "Path":
         """Return the path moved along its normals, to the left."""
         tangent = self.tangents

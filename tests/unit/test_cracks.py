@@ -178,7 +178,8 @@ def test_traced_slits(azimuth, kind):
 def test_the_command_answers(tmp_path):
     """Record, lines, picture and table of cracks and edges; what is out of place is told with its remedy.
 
-    The length per area is that of the one slit over the region. Catches an area of the whole raster.
+    The length per area is that of the one slit over the region. Of a region that ends across the slit
+    only its part counts. Catches an area of the whole raster, and a line that runs out of the region.
     """
     stack = make_stack(slit(), 2)
     wanted = Wanted(cracks=True, vertical_edges=True, regions=("-600,-600 600,600",), table=True)
@@ -187,6 +188,10 @@ def test_the_command_answers(tmp_path):
     assert record["n_cracks"] == 1 and record["area_mm2"] == pytest.approx(1.2**2, rel=0.05)
     assert record["length_per_area_per_mm"] == pytest.approx(0.7 / 1.44, rel=0.15)
     assert any("slit" in line for line in lines) and (tmp_path / "c.png").stat().st_size > 10_000
+    assert not record["lines"][0]["is_cut"]
+    half, lines = measure_height_map(make_rec(), Wanted(cracks=True, regions=("-600,-600 0,600",)), None, stack)
+    cut = half["cracks"]["lines"][0]
+    assert cut["is_cut"] and 250.0 < cut["length_um"] < 400.0 and any("cut by the region" in line for line in lines)
     rows = list(csv.DictReader(table(found).splitlines()))
     assert rows[0]["kind"] == "slit" and float(rows[0]["length_um"]) == pytest.approx(700.0, abs=60.0)
     assert float(rows[0]["left"]) == pytest.approx(16.0, abs=4.0) and rows[0]["depth_um"] == ""

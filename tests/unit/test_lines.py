@@ -104,22 +104,25 @@ def test_course_of_a_bent_line():
 
     Catches a line broken at every change of direction, two paths side by side, and a course that wanders.
     """
-    r, a = np.hypot(GRID_X + 300.0, GRID_Y + 300.0), np.arctan2(GRID_Y + 300.0, GRID_X + 300.0)
+    r, a = np.hypot(GRID_X + 300.0, GRID_Y + 200.0), np.arctan2(GRID_Y + 200.0, GRID_X + 300.0)
     arc = -0.4 * np.exp(-0.5 * ((r - 600.0) / 12.0) ** 2) * ((a > 0.0) & (a < 0.5 * math.pi))
     s = LineSettings()
     contrast = contrast_of(make_stack(arc, 3))
     (path,) = trace_lines(find_lines(contrast, np.ones((SIZE, SIZE), bool), "line", s), s)
     assert path.length * PITCH == pytest.approx(0.5 * math.pi * 600.0, abs=60.0)
     x, y = (path.points * PITCH + AXIS[0]).T
-    assert np.max(np.abs(np.hypot(x + 300.0, y + 300.0) - 600.0)) < 0.5 * PITCH
+    assert np.max(np.abs(np.hypot(x + 300.0, y + 200.0) - 600.0)) < 0.5 * PITCH
 
 
 def test_pieces_of_a_path():
-    """An extended path of 10 pixels is 16 long; its middle part lies where the path lay; moved to the left by 1."""
+    """An extended path of 10 pixels is 16 long; parts of it lie where they lay; moved left by 1."""
     path = Path(np.stack([np.linspace(3.0, 9.0, 11), np.linspace(4.0, 12.0, 11)], -1), 9.0)
     assert path.length == pytest.approx(10.0) and path.extended(3.0).length == pytest.approx(16.0)
     piece = path.extended(3.0).between(3.0, 13.0)
     assert piece.points[[0, -1]] == pytest.approx(np.array([[3.0, 4.0], [9.0, 12.0]]))
+    inside = np.zeros((20, 20), bool)
+    inside[:, 4:8] = True  # x from 3.5 to 7.5: 4 / 0.6 pixels of the path
+    assert path.extended(3.0).within(inside).length == pytest.approx(4.0 / 0.6, abs=0.6)
     assert path.moved(1.0).points[0] == pytest.approx(np.array([3.0 - 0.8, 4.0 + 0.6]))
 
 

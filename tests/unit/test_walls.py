@@ -26,20 +26,21 @@ def make_rec(height, reason, level=0.0) -> Reconstruction:
 
 
 def terrace(floats: bool = False) -> Reconstruction:
-    """A terrace 50 um high beyond a straight wall at 40 deg, 900 um of it flagged; lone flagged pixels elsewhere."""
+    """A terrace 50 um high beyond a straight wall at 40 deg, 900 um of it and 60 um further on flagged; lone pixels."""
     high = ACROSS > 0.0
     reason = np.where(high & floats, FLOATING, 0)
     reason[(np.abs(ACROSS) < 15.0) & (np.abs(ALONG) < 450.0)] = JUMP
     reason[(np.abs(ACROSS) < 15.0) & (ALONG > 100.0) & (ALONG < 160.0)] = MASKED
+    reason[(np.abs(ACROSS) < 15.0) & (np.abs(ALONG - 620.0) < 30.0)] = JUMP
     reason[5:70:9, 3] = JUMP
     return make_rec(np.where(high, 50.0, 0.0), reason, high.astype(float))
 
 
 def test_a_wall_is_listed():
-    """One edge of 900 um at 40 deg that falls at -50 deg by 50 +- 1.5 um; lone pixels are none.
+    """One edge of 900 um at 40 deg that falls at -50 deg by 50 +- 1.5 um; short pieces are none.
 
     The deviation is that of the two levels' difference, not of one pixel. Catches the direction of the rise, heights
-    read on the flagged pixels, lone pixels taken together, and deviations of pixels averaged away.
+    read on the flagged pixels, short pieces and lone pixels taken for edges, and deviations of pixels averaged away.
     """
     found = find_walls(terrace())
     (w,) = found.walls
