@@ -67,7 +67,7 @@ def slit_rows(sizes: list[tuple[float, float]], azimuths: list[int]) -> list[Row
             sample = {"kind": "trench", "width_um": width, "length_um": LENGTH, "depth_um": depth, "size_um": 8000.0}
             sample |= {"azimuth_deg": azimuth, "center_um": [7.0, 3.0]}
             given = {"sample": sample, "scan.nx": PIXELS, "scan.ny": PIXELS, "trace.rays": 64}
-            stack = _with_noise(pipeline.simulate(load_scene(SALT, given)), SEED)
+            stack = _with_noise(pipeline.simulate(load_scene(SALT, given)).only(), SEED)
             found = find_cracks(_flat(stack), stack, [np.ones(stack.shape[1:], bool)]).cracks
             what = f"slit {width:.0f} x {depth:.0f} um at {azimuth} deg"
             if not found:
