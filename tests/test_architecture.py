@@ -41,7 +41,17 @@ DOORS = {
     "pooch": {"formats/fetch.py"},
     "matplotlib": {
         f"evaluate/{name}.py"
-        for name in ("figures", "agreement_figure", "before_after", "overlay", "pick", "ripple_figure", "spot", "sweep")
+        for name in (
+            "figures",
+            "agreement_figure",
+            "before_after",
+            "crack_figure",
+            "overlay",
+            "pick",
+            "ripple_figure",
+            "spot",
+            "sweep",
+        )
     },
     "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
     "optimistix": {"reconstruct/leastsquares.py"},

@@ -69,6 +69,8 @@ ObjFile = Annotated[
 ]
 FIGURE = _written_as("a figure", ".png", ".pdf", ".svg")
 """Callback of options that name a picture to write."""
+CSV = _written_as("a table", ".csv")
+"""Callback of options that name a table to write."""
 TOML = _written_as("TOML", ".toml")
 """Callback of options that name a scene or instrument file to write."""
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from helio_jax.commands.app import (
+    CSV,
     FIGURE,
     TOML,
     AsJson,
@@ -110,22 +111,48 @@ def measure(
     roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
     ripple: Annotated[bool, typer.Option("--ripple", help="The strongest ripple: wavelength, amplitude.")] = False,
     region: Annotated[
-        list[str] | None, typer.Option(help="'X,Y X,Y ...': corners in um, for roughness and ripple (repeat).")
+        list[str] | None,
+        typer.Option(help="'X,Y X,Y ...': corners in um, for roughness, ripple, cracks, edges (repeat)."),
     ] = None,
-    stack: Annotated[Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple?")] = None,
+    cracks: Annotated[bool, typer.Option("--cracks", help="Slits and grooves in the micrographs of --stack.")] = False,
+    vertical_edges: Annotated[
+        bool, typer.Option("--vertical-edges", help="Walls in the map of jumps, masked and floating pixels.")
+    ] = False,
+    stack: Annotated[
+        Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple? Where are cracks?")
+    ] = None,
     min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
     figure: Annotated[
-        Path | None, typer.Option(help="Facets or ripple as a picture (.png, .pdf, .svg).", callback=FIGURE)
+        Path | None, typer.Option(help="Facets, ripple, or cracks as a picture (.png, .pdf, .svg).", callback=FIGURE)
+    ] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="Cracks and vertical edges, a row for each (.csv).", callback=CSV)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on a height map: facets, a profile between two beam positions, a step, roughness, a ripple."""
+    """Measure on a height map: facets, a profile or step, roughness, a ripple, cracks, vertical edges."""
+    from helio_jax.evaluate.crack_text import table as as_table
     from helio_jax.evaluate.measure import Wanted, measure_height_map
     from helio_jax.formats.hdf5 import read_height, read_stack
+    from helio_jax.formats.safe import atomic_path
 
-    wanted = Wanted(facets, profile, step, roughness, min_pixels, ripple, tuple(region or ()))
+    wanted = Wanted(
+        facets=facets,
+        profile=profile,
+        step=step,
+        roughness=roughness,
+        min_pixels=min_pixels,
+        ripple=ripple,
+        regions=tuple(region or ()),
+        cracks=cracks,
+        vertical_edges=vertical_edges,
+        table=table is not None,
+    )
     images = read_stack(stack) if stack else None
     found, lines = measure_height_map(read_height(height), wanted, figure, images)
+    if table:
+        with atomic_path(table) as part:
+            part.write_text(as_table(found), encoding="utf-8")
     print(json.dumps(found) if as_json else "\n".join(lines))
 
 

@@ -1,4 +1,4 @@
-"""What `helio measure` answers: facets, a profile, a step, roughness, a ripple, as JSON and as lines of text."""
+"""What `helio measure` answers: facets, profile, step, roughness, ripple, cracks, edges, as JSON and lines of text."""
 
 import math
 from pathlib import Path
@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from helio_jax.errors import SceneError
+from helio_jax.evaluate.crack_figure import crack_panel
+from helio_jax.evaluate.crack_text import crack_lines, wall_lines
+from helio_jax.evaluate.cracks import find_cracks
 from helio_jax.evaluate.facets import Facets, FacetSettings, find_facets
 from helio_jax.evaluate.figures import save_figure
 from helio_jax.evaluate.overlay import facet_map
@@ -18,12 +21,13 @@ from helio_jax.evaluate.ripple import (
 )
 from helio_jax.evaluate.ripple_figure import ripple_panel
 from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
+from helio_jax.evaluate.walls import find_walls
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where the last two."""
+    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where."""
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None
@@ -32,6 +36,9 @@ class Wanted(NamedTuple):
     min_pixels: int = 60
     ripple: bool = False
     regions: tuple[str, ...] = ()
+    cracks: bool = False
+    vertical_edges: bool = False
+    table: bool = False
 
 
 def measure_height_map(
@@ -42,23 +49,36 @@ def measure_height_map(
     Args:
         rec: heights.
         wanted: what to measure.
-        figure: picture of the facets or of the ripple.
-        stack: calibrated micrographs of these heights, to ask about the ripple.
+        figure: picture of the facets, of the ripple, or of cracks and vertical edges.
+        stack: calibrated micrographs of these heights: to ask about the ripple, to find cracks in.
 
     Raises:
         SceneError: nothing is wanted, or a step or a figure without what it needs.
         GuardError: too little is known there.
     """
-    if not (wanted.facets or wanted.profile or wanted.roughness or wanted.ripple):
-        raise SceneError("measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple")
+    lines_wanted = wanted.cracks or wanted.vertical_edges
+    if not (wanted.facets or wanted.profile or wanted.roughness or wanted.ripple or lines_wanted):
+        raise SceneError(
+            "measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple, --cracks, "
+            "--vertical-edges"
+        )
     if wanted.step and not wanted.profile:
         raise SceneError("--step needs --profile X0 Y0 X1 Y1 across the step")
-    if figure and wanted.facets == wanted.ripple:
-        raise SceneError("--figure draws the facets or the ripple: give one of --facets and --ripple with it")
-    if wanted.regions and not (wanted.ripple or wanted.roughness):
-        raise SceneError("--region says where --ripple and --roughness measure: give one of them, too")
-    if stack is not None and not wanted.ripple:
-        raise SceneError("--stack is asked about the ripple: give --ripple, too")
+    if figure and wanted.facets + wanted.ripple + lines_wanted != 1:
+        raise SceneError(
+            "--figure draws the facets, the ripple, or cracks and vertical edges: give --facets, --ripple, or --cracks "
+            "and/or --vertical-edges with it, and none of the others"
+        )
+    if wanted.regions and not (wanted.ripple or wanted.roughness or lines_wanted):
+        raise SceneError(
+            "--region says where --ripple, --roughness, --cracks and --vertical-edges measure: give one of them, too"
+        )
+    if stack is not None and not (wanted.ripple or wanted.cracks):
+        raise SceneError("--stack is asked about the ripple, and for cracks: give --ripple or --cracks, too")
+    if stack is None and wanted.cracks:
+        raise SceneError("--cracks are found in the micrographs: give --stack FILE.h5, which helio calibrate wrote")
+    if wanted.table and not lines_wanted:
+        raise SceneError("--table has a row for every crack and vertical edge: give --cracks or --vertical-edges, too")
     regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
     found: dict[str, Any] = {"reconstructed": reconstructed_area(rec)}
     lines = [f"reconstructed: {found['reconstructed']['share']:.1%} of the raster"]
@@ -91,6 +111,20 @@ def measure_height_map(
     if wanted.ripple:
         found["ripple"], more = _ripple(rec, regions or [np.ones(rec.height.shape, bool)], figure, stack)
         lines += more
+    if lines_wanted:
+        whole = regions or [np.ones(rec.height.shape, bool)]
+        cracks = find_cracks(rec, stack, whole) if wanted.cracks and stack is not None else None
+        walls = find_walls(rec, np.any(whole, axis=0)) if wanted.vertical_edges else None
+        if cracks is not None:
+            found["cracks"] = cracks.as_dict()
+            lines += crack_lines(cracks)
+            if not regions:
+                lines.append("  all of the raster was searched, feet of steps and debris too: --region takes one face")
+        if walls is not None:
+            found["vertical_edges"] = walls.as_dict()
+            lines += wall_lines(walls)
+        if figure:
+            save_figure(crack_panel(rec, whole, stack, cracks, walls), figure)
     return found, lines
 
 

@@ -27,7 +27,7 @@ from helio_jax.evaluate.spectrum import (
     without_trend,
 )
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.reconstruction import REASONS, Reconstruction
 
 Pair = tuple[float, float]
 _SURE = 1e-3
@@ -79,7 +79,8 @@ def height_ripple(
     """Find the strongest ripple of a height map.
 
     Args:
-        rec: heights; invalid pixels, and those beside them, take no part.
+        rec: heights; invalid pixels, and those beside them, take no part. Where only a region's level floats, they do:
+            slopes know nothing of it.
         regions: True inside [y, x].
         settings: blocks, range of wavelengths.
 
@@ -92,7 +93,8 @@ def height_ripple(
     """
     settings = settings or RippleSettings()
     steps = pitch(rec.raster_x), pitch(rec.raster_y)
-    known = ndimage.binary_erosion(rec.is_valid & np.isfinite(rec.height))
+    shown = rec.is_valid | (rec.reason == REASONS.index("floating"))
+    known = ndimage.binary_erosion(shown & np.isfinite(rec.height))
     rows, columns = np.gradient(np.where(np.isfinite(rec.height), rec.height, 0.0), steps[1], steps[0])
     inside = [known & region for region in regions]
     blocks = make_blocks(inside, settings.block_px)

@@ -9,7 +9,7 @@ from helio_jax.arrays import pitch
 from helio_jax.evaluate.figures import robust_range, symmetric_range
 from helio_jax.evaluate.ripple import Ripple
 from helio_jax.evaluate.spectrum import Spectrum
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.reconstruction import REASONS, Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,8 +46,9 @@ def ripple_panel(
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     style = {"origin": "lower", "extent": extent, "interpolation": "nearest"}
     inside = np.any(regions, axis=0)
-    low, high = robust_range(rec.height[rec.is_valid], 1.0)
-    axes[0].imshow(np.ma.masked_array(rec.height, ~rec.is_valid), cmap="viridis", vmin=low, vmax=high, **style)
+    shown = np.ma.masked_array(rec.height, ~(rec.is_valid | (rec.reason == REASONS.index("floating"))))
+    low, high = robust_range(shown.compressed(), 1.0)
+    axes[0].imshow(shown, cmap="viridis", vmin=low, vmax=high, **style)
     for region in regions:
         axes[0].contour(x, y, region.astype(float), [0.5], colors=_LINE, linewidths=1.0)
     low, high = symmetric_range(along[inside])
@@ -62,7 +63,7 @@ def ripple_panel(
     for ax, (title, spectrum) in zip(axes[2:], spectra.items(), strict=True):
         kx, ky = 1e3 * spectrum.kx, 1e3 * spectrum.ky
         box = (kx[0], kx[-1], ky[0], ky[-1])
-        shown = ax.imshow(
+        picture = ax.imshow(
             spectrum.ratio, origin="lower", extent=box, cmap="magma", vmin=0.0, vmax=_HIGHEST, aspect="equal"
         )
         ax.contour(kx, ky, spectrum.is_searched.astype(float), [0.5], colors="white", linewidths=0.6)
@@ -70,7 +71,7 @@ def ripple_panel(
             ax.plot(*(sign * 1e3 * k for k in ripple.raster_k), "o", mfc="none", mec=_LINE, ms=14, mew=1.2)
         ax.set_title(f"spectrum: {title}", fontsize=9, loc="left")
         ax.set_xlabel("wave number (1/mm)", fontsize=8)
-    figure.colorbar(shown, ax=axes[-1], shrink=0.8, label="power over floor")
+    figure.colorbar(picture, ax=axes[-1], shrink=0.8, label="power over floor")
     for ax in axes:
         ax.tick_params(labelsize=7)
     r, unit = ripple, ripple.unit.replace("um", "µm")

@@ -77,6 +77,8 @@ def test_wrong_suffix(files, command):
         ("rays {scene} --rays 8 -o {out}/a.csv --directions {out}/a.csv", "two names"),
         ("measure {files}/height.h5 --roughness --profile 0,0,9,9", "write --profile 0 0 9 9"),
         ("measure {files}/height.h5 --facets --figure {out}/a.txt", ".png or .pdf or .svg"),
+        ("measure {files}/height.h5 --vertical-edges --table {out}/a.txt", "the suffix .csv"),
+        ("measure {files}/height.h5 --cracks", "--stack FILE.h5"),
         ("report {files}/height.h5 -o {out}/a.txt", ".html"),
         ("spot {scene} --heights nan -o {out}/a.png", "finite numbers of um, got nan"),
         ("spot {scene} --heights 9000 -o {out}/a.png", "below the plate"),

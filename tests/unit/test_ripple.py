@@ -20,6 +20,7 @@ from helio_jax.evaluate.ripple import (
 from helio_jax.evaluate.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruction import REASONS
 
 AXIS = (np.arange(60) - 29.5) * PITCH
 TRIANGLE = inside_polygon(parse_region("-450,-450 430,-450 -450,430"), AXIS, AXIS)
@@ -71,6 +72,22 @@ def test_wavelength_amplitude_and_errors():
     for name, z in zip(("wavelength", "direction", "amplitude"), np.array(pulls).T, strict=True):
         tail = stats.chi2(48).sf(np.sum(z**2))
         assert_likely(2 * min(tail, 1 - tail), f"pulls of the {name}: {np.sqrt(np.mean(z**2)):.2f} instead of 1")
+
+
+def test_floating_regions_ripple_too():
+    """Where only a region's level floats its ripple is measured; where it is masked it is not.
+
+    Catches floating pixels left out: a crystal whose level nothing fixes then has no ripple.
+    """
+    rec = make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01)
+    for name in ("floating", "masked in too many detectors"):
+        reason = np.full(rec.height.shape, REASONS.index(name))
+        unsure = rec.replace(reason=reason, is_valid=np.zeros(rec.height.shape, bool))
+        if name == "floating":
+            assert height_ripple(unsure, [TRIANGLE])[0].wavelength_um == pytest.approx(WAVELENGTH, rel=0.02)
+        else:
+            with pytest.raises(GuardError, match="64 or more known pixels"):
+                height_ripple(unsure, [TRIANGLE])
 
 
 def test_noise_alone():
