@@ -186,7 +186,7 @@ def true_normals(sample: Sample, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         (sample.surface(x + a * h, y + b * h) - sample.surface(x - a * h, y - b * h)) / (2 * h)
         for a, b in ((1, 0), (0, 1))
     ]
-    return np.moveaxis(unit_normal(*slopes, (0.0, 0.0)), 0, -1)
+    return np.moveaxis(unit_normal(slopes[0], slopes[1], (0.0, 0.0)), 0, -1)
 
 
 def against_truth(rec: Reconstruction, sample: Sample) -> dict:
@@ -257,12 +257,14 @@ def main() -> None:
             if any(all(r.get(k) == v for k, v in key.items()) for r in done):
                 continue
             which = stage, method == "refine"
-            if which not in stacks and sample is None:
-                stacks[which] = measured(args.shared, method)
-            elif which not in stacks:
+            if which in stacks:
+                stack = stacks[which]
+            elif sample is None:
+                stack = measured(args.shared, method)
+            else:
                 known = known or record(sample, args.size, args.rays, args.seed)
-                stacks[which] = calibrated(known, stage, method)
-            stack = stacks[which]
+                stack = calibrated(known, stage, method)
+            stacks[which] = stack
             rec = reconstructed(stack, method, args.refine)
             found = facets_of(rec, max(15, round(60 * (args.size / 101) ** 2)))
             found["calibration"] = stack.provenance["self_calibrate"]
