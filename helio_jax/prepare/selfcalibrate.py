@@ -26,6 +26,9 @@ _MODEL_ERROR = 0.02
 """Deviation of a reading, over level ground's, from the model: facets are not quite flat, albedos not quite one."""
 _TOGETHER = 25
 """Pixels that share such an error."""
+_WINDOW = 5
+"""Side of the square whose median stands for a pixel. A mean would mix facets: their mean normal is shorter than one,
+which looks like more background (0.78 for 0.75 on pyramids without any noise; by the median 0.757)."""
 _TILT_STEP, _AZIMUTH_STEP, _MAX_TILT = 3.0, 9.0, 78.0
 
 
@@ -34,8 +37,6 @@ class SelfCalibrateSettings(Settings):
 
     polar_std_deg: float = Field(default=5.0, gt=0.0, le=45.0)
     """Prior deviation of the apertures' polar angle from the instrument file's [deg]."""
-    smooth_px: float = Field(default=1.5, ge=0.0, le=20.0)
-    """Smoothing before the fit [pixels]."""
     n_pixels: int = Field(default=400, ge=50, le=100_000)
     """Pixels, seen in all scans, that take part."""
     seed: int = Field(default=1, ge=0)
@@ -78,15 +79,13 @@ def self_calibrate(
     inside = np.asarray(ndimage.binary_erosion(stack.is_observed.all(0), iterations=3), bool)
     if inside.sum() < settings.n_pixels:
         raise GuardError(f"self-calibration needs {settings.n_pixels} pixels in all images, got {int(inside.sum())}")
-    smoothed = [
-        ndimage.gaussian_filter(
-            ndimage.median_filter(np.where(known, image, np.median(image[known])), 5), settings.smooth_px
-        )
+    calm = [
+        ndimage.median_filter(np.where(known, image, np.median(image[known])), _WINDOW)
         for image, known in zip(stack.counts, stack.is_observed, strict=True)
     ]
     draw = np.random.default_rng(settings.seed)
     chosen = np.asarray(draw.permutation(int(inside.sum()))[: settings.n_pixels], np.int64)
-    data = np.stack([np.asarray(image)[inside][chosen] for image in smoothed])
+    data = np.stack([np.asarray(image)[inside][chosen] for image in calm])
     scale = np.median(data, axis=1)
     azimuth, prior = np.arctan2(centers[:, 1], centers[:, 0]), math.degrees(polar.mean())
 

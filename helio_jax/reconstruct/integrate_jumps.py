@@ -17,12 +17,14 @@ from helio_jax.reconstruct.integrate_poisson import (
     differentiate,
     integrate_poisson,
     mean_to_edges,
+    solve_directly,
     solve_weighted,
     solve_weighted_checked,
 )
 
 Edges = tuple[EdgesX, EdgesY]
 COARSE = 1e-3, 40  # relative residual and largest number of steps of the solves between two reweightings
+MOST_DIRECT = 250_000  # pixels up to which a last solve that does not converge is done by factorisation instead
 MEMBRANE = 1e-7  # weight, of the largest edge weight, that draws every edge to a slope of zero: no region floats
 
 
@@ -150,14 +152,15 @@ def integrate_cutting_jumps(
         weights: pixel confidences >= 0, proportional to the inverse variance of the slopes.
         cut: misfit, in standard deviations of an edge, at which its weight has fallen to a quarter; > 0.
         min_noise: least noise of one pixel's slope [1]; with less, errors of the trapezoid rule become jumps.
-        tolerance, max_steps: relative residual and largest number of steps of the last solve.
+        tolerance, max_steps: relative residual and largest number of steps of the last solve; a raster of
+            `MOST_DIRECT` pixels or fewer is solved directly where they are not enough.
 
     Returns:
         height [um], mean zero; and jump_x, jump_y in (0, 1]: 1 intact, 0 cut, 1/4 at a misfit of `cut`.
 
     Raises:
         SceneError: `cut` or `min_noise` not > 0.
-        GuardError: the last solve did not reach `tolerance`.
+        GuardError: the last solve of a larger raster did not reach `tolerance`.
 
     Source: Geman and McClure, Bull. ISI 52 (1987) 5; Black and Rangarajan, IJCV 19 (1996) 57, sec. 4 (reweighting);
         Blake and Zisserman, Visual Reconstruction (1987), ch. 3 (graduated non-convexity).
@@ -180,6 +183,9 @@ def integrate_cutting_jumps(
         problem = _problem(slopes, sigma, jump, dx, dy)
         if i < len(scales) - 1:
             height, _ = solve_weighted(problem, height, COARSE[0], COARSE[1])
+        elif height.size <= MOST_DIRECT:
+            height, is_converged = solve_weighted(problem, height, tolerance, max_steps)
+            height = height if is_converged else solve_directly(problem)
         else:
             height = solve_weighted_checked(problem, height, tolerance, max_steps)
     return height, jump[0], jump[1]

@@ -5,9 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.crystal import GAINS, SHARE, make_sample, record
+from benchmarks.alignment import INSTRUMENT
+from benchmarks.crystal import FIELD_UM, GAINS, SHARE, make_sample, record, true_normals
 from helio_jax import turned
+from helio_jax.config import load_instrument
 from helio_jax.errors import GuardError
+from helio_jax.instrument import Detector
+from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.resample import resample
 from helio_jax.prepare.selfcalibrate import SelfCalibrateSettings, self_calibrate
 
@@ -52,3 +56,25 @@ def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
     done = turned.calibrate_turned(aligned).provenance["self_calibrate"]
     assert done["share"] == self_calibrate(aligned).share
     assert "not predicted" in done["multiple"] and "too rough" in done["multiple"]
+
+
+def test_facets_side_by_side_are_not_taken_for_background():
+    """Single scattering of pyramids in the far field, no noise, five azimuths: the background is found to 0.02.
+
+    Catches readings averaged over the edges of facets: a mean of normals is shorter than one and reads as 0.78.
+    """
+    sample = make_sample("pyramids")
+    axis = (np.arange(101) - 50) * FIELD_UM / 101
+    azimuth = 2.0 * np.pi * np.arange(5) / 5
+    to_aperture = np.stack([3120.0 * np.cos(azimuth), 3120.0 * np.sin(azimuth), np.full(5, 3000.0)], -1)
+    signal = np.maximum(true_normals(sample, *np.meshgrid(axis, axis)) @ to_aperture.T / 3000.0, 0.0)  # level ground: 1
+    reading = np.array(GAINS)[:, None, None] * (np.moveaxis(signal, -1, 0) * (1.0 - SHARE) + SHARE)
+    detectors = tuple(
+        Detector(name=f"turned{k}", center_um=(x, y), axes_um=(1790.0, 1400.0))
+        for k, (x, y) in enumerate(to_aperture[:, :2].tolist())
+    )
+    instrument = load_instrument(INSTRUMENT).model_copy(update={"detector": detectors})
+    found = self_calibrate(MicrographStack(reading, axis, axis, instrument))
+    assert found.share == pytest.approx(SHARE, abs=0.02)
+    assert found.polar_deg == pytest.approx(46.1, abs=1.5)
+    np.testing.assert_allclose(found.gain, GAINS, rtol=0.003)
