@@ -7,7 +7,7 @@ that it asks for.
 """
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_dilation, gaussian_filter, label, maximum_filter, uniform_filter1d
+from scipy.ndimage import binary_closing, binary_dilation, label, maximum_filter, uniform_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
@@ -26,8 +26,6 @@ _LARGEST = 25.0
 """A datum counts with this square at most."""
 _UNKNOWN = 1e6
 """Variance of data that were not observed, in those of the worst ones: finite, for running means."""
-_BLUR = 2.0
-"""Width of the Gaussian by which squared residuals are averaged [pixels]."""
 _BAND = 3
 """Half width of a region's border [pixels]."""
 
@@ -67,27 +65,14 @@ def grown(mask: np.ndarray) -> np.ndarray:
     return np.asarray(binary_dilation(mask, iterations=_BAND))
 
 
-def ill_explained(residuals: np.ndarray) -> np.ndarray:
-    """Return the areas that a fit explains worse than most of the image, spots smaller than a region left out [y, x].
-
-    Args:
-        residuals: of the fit, in standard deviations [detector, y, x].
-    """
-    square = gaussian_filter(np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST).mean(0), _BLUR)
-    area = _numbered(square > UNEXPLAINED * np.median(square))
-    return (area > 0) & (np.bincount(area.ravel()) >= MIN_REGION)[area]
-
-
-def find_plateaus(signal: np.ndarray, variance: np.ndarray, is_ill: np.ndarray | None = None) -> np.ndarray:
+def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return the number of every pixel's region [y, x], 0 being the largest: the ground.
 
     Seeds are the connected areas without a strong change; they grow by a minimum spanning forest over the edges, so
-    that their borders lie on the strongest edges between them. Where a wall is as bright as what is beyond, seeds would
-    join through the gap: no seed reaches across the rim of what a fit explains ill.
+    that their borders lie on the strongest edges between them.
 
     Args:
         signal, variance: data [detector, y, x]; NaN where not observed.
-        is_ill: from `ill_explained` [y, x], if anything has been fitted.
 
     Source: watershed cuts: Cousty, Bertrand, Najman, Couprie, IEEE PAMI 31 (2009) 1362, theorem 14.
     """
@@ -105,8 +90,6 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray, is_ill: np.ndarray |
     for axis, change in enumerate(strength):
         for end in along(is_calm, axis):
             end &= change <= WALL
-    if is_ill is not None:
-        is_calm &= ~(grown(is_ill) & grown(~is_ill))
     seed = _numbered(is_calm).ravel()
     seed[np.bincount(seed)[seed] < MIN_REGION] = 0
     inside = np.flatnonzero(seed)

@@ -20,7 +20,7 @@ from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.levels import search_levels
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
 from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.plateaus import find_plateaus, ill_explained, joined, unexplained
+from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
 from helio_jax.reconstruction import Reconstruction
@@ -196,7 +196,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
     slow_axis = 0 if stack.fast_axis == "x" else 1
     fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
-    region, levelled = find_plateaus(signal, variance, ill_explained(fit.residuals)), np.zeros(stack.shape[1:], int)
+    region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     is_undecided = np.zeros(stack.shape[1:], bool)
     roughly = make_predict(max(settings.refine.paths(region.size) // SEARCH_THRIFT, 1000))
     for is_last in (False, True):
