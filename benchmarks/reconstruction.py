@@ -309,11 +309,13 @@ def trench_row(record: Record, seed: int) -> None:
         (0.5, 0.0, "along the beam, multiple scattering ignored", without_multiple),
         (1.0, 0.0, "along the beam, multiple scattering ignored", without_multiple),
         (2.0, 90.0, "across the beam", lambda p: p),
+        (0.5, 90.0, "across the beam", lambda p: p),
+        (2.0, 60.0, "oblique to the raster", lambda p: p),
     ):
 
         def trench(ratio=ratio, azimuth=azimuth, change=change) -> Case:
             width, depth = 240.0, 240.0 * ratio
-            nx, ny = (121, 61) if azimuth == 0.0 else (61, 121)
+            nx, ny = {0.0: (121, 61), 60.0: (91, 111), 90.0: (61, 121)}[azimuth]
             sample = {"width_um": width, "depth_um": depth, "azimuth_deg": azimuth}
             overrides = {f"sample.{key}": value for key, value in sample.items()}
             # off the raster by a fraction of a pixel: no wall lies exactly on a row of pixels
