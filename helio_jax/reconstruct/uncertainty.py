@@ -132,16 +132,22 @@ class Posterior:
             return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
         bent = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
-        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
-        how_far /= np.sqrt(np.mean(how_far**2))
-        return replace(
+        enlarged = replace(
             self,
-            samples=factor * self.samples + how_far[:, None, None] * bent,
+            samples=factor * self.samples,
             instrument_samples=factor * self.instrument_samples,
             instrument_covariance=factor**2 * self.instrument_covariance,
             widening=factor * self.widening,
-            bent=bent if self.bent is None else np.hypot(bent, factor * self.bent),
+            bent=None if self.bent is None else factor * self.bent,
         )
+        return enlarged.also_off_by(bent, seed)
+
+    def also_off_by(self, error: np.ndarray, seed: int = 1) -> "Posterior":
+        """Return it with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um."""
+        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
+        how_far /= np.sqrt(np.mean(how_far**2))
+        bent = error if self.bent is None else np.hypot(error, self.bent)
+        return replace(self, samples=self.samples + how_far[:, None, None] * error, bent=bent)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
