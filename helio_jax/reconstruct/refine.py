@@ -213,7 +213,7 @@ def fit_heights(
                 refiner.surface, is_interrupted = before, True
                 break
             refiner.torn = None
-            last_change = refiner.surface.height - before.height
+            last_change = np.asarray(refiner.surface.height - before.height)
             changes.append(float(np.sqrt(np.mean(last_change**2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
@@ -228,12 +228,15 @@ def fit_heights(
                 is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         if posterior is not None:
-            posterior = posterior.also_off_by(_left_to_go(changes) * last_change, seed=2)
+            posterior = posterior.also_off_by(left_to_go(changes) * last_change, seed=2)
         return _finish(refiner, changes, is_interrupted, posterior)
 
 
-def _left_to_go(changes: Sequence[float]) -> float:
-    """Return how far the heights are from where further rounds would take them, in last changes (geometric series)."""
+def left_to_go(changes: Sequence[float]) -> float:
+    """Return how far the heights are from where further rounds would take them, in changes of the last one.
+
+    The changes are continued as a geometric series; after a single round they are taken to halve.
+    """
     contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 0.5
     return 1.0 / (1.0 - min(contraction, SLOWEST)) - 1.0
 

@@ -88,7 +88,8 @@ class Posterior:
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
         widening: factor by which all deviations were enlarged, for the instrument disagrees with what it says.
-        bent: error of all heights together that was added for the same reason, one standard deviation [y, x], um.
+        bent: error of all heights together that was added for the same reason, or for a fit that has not converged,
+            one standard deviation [y, x], um.
     """
 
     samples: np.ndarray

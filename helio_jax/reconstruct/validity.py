@@ -58,8 +58,8 @@ def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
 def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
-    So are heights that an instrument far from what was stated has bent, relative to most others, by a large share of
-    all relief: another explanation of the data would have taken them elsewhere.
+    So are heights that an instrument far from what was stated has bent, or that are not converged, relative to most
+    others, by a large share of all relief: another explanation, or more rounds, would have taken them elsewhere.
 
     Args:
         height: [y, x], um.
