@@ -88,5 +88,5 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         terms = np.argsort(-np.abs(vector[:, i]))[:_TERMS]
         of = {_plain(posterior.names[told[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
         weak.append({"left": float(np.sqrt(size[i])), "of": of})
-    bent = 0.0 if posterior.bent is None else float(np.abs(posterior.bent).max())
+    bent = 0.0 if posterior.bent is None else float(np.sqrt((posterior.bent**2).sum(0)).max())
     return {"values": values, "weak": weak, "widening": posterior.widening, "bent_um": bent}

@@ -193,6 +193,7 @@ def fit_heights(
     with jax.enable_x64(True):
         refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, slow_axis)
         changes: list[float] = []
+        last_change = np.zeros(start.height.shape)
         is_interrupted = False
         said = "start"
         n_fixed = 0 if refiner.is_unknown else s.fixed_rounds

@@ -65,11 +65,12 @@ def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: 
         height: [y, x], um.
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
-        bent: as in `Posterior` [y, x], um.
+        bent: as in `Posterior` [error, y, x], um.
     """
     flags = np.zeros(height.shape, bool)
     if bent is not None:
-        flags |= np.abs(bent - np.median(bent)) > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
+        relative = np.sqrt(((bent - np.median(bent, (1, 2), keepdims=True)) ** 2).sum(0))
+        flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
     ground = region == 0
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number
