@@ -64,7 +64,7 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
     what the stack and the instrument say. `weak`: the combinations of which the data leave more than `WEAK` of their
     prior deviation: `left` is that share, `of` the largest terms of the (unit) combination, in prior deviations.
     `widening`: factor by which all deviations are enlarged, for the geometry disagrees with what the file says;
-    `bent_um`: the largest deviation that was added for it, of all heights together.
+    `bent_um`: the largest deviation that was added for it, or for a fit that has not converged, of all heights as one.
     """
     posterior = fit.posterior
     if posterior is None:
@@ -88,5 +88,5 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         terms = np.argsort(-np.abs(vector[:, i]))[:_TERMS]
         of = {_plain(posterior.names[told[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
         weak.append({"left": float(np.sqrt(size[i])), "of": of})
-    bent = 0.0 if posterior.bent is None else float(np.abs(posterior.bent).max())
+    bent = 0.0 if posterior.bent is None else float(np.sqrt((posterior.bent**2).sum(0)).max())
     return {"values": values, "weak": weak, "widening": posterior.widening, "bent_um": bent}

@@ -25,6 +25,9 @@ GEOMETRY = "distance", "tilt", "aim"
 GAINS, OFF_BY_FAR = ("log_gain", "offset"), 2.0
 """The same, but only where they are off by more than this factor: it is they that usually differ by chance."""
 
+SLOWEST = 0.9
+"""Contraction per round that a fit is credited with at least: what does not converge is off by nine last changes."""
+
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
 
@@ -190,6 +193,7 @@ def fit_heights(
     with jax.enable_x64(True):
         refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, slow_axis)
         changes: list[float] = []
+        last_change = np.zeros(start.height.shape)
         is_interrupted = False
         said = "start"
         n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
@@ -210,7 +214,8 @@ def fit_heights(
                 refiner.surface, is_interrupted = before, True
                 break
             refiner.torn = None
-            changes.append(float(np.sqrt(np.mean((refiner.surface.height - before.height) ** 2))))
+            last_change = np.asarray(refiner.surface.height - before.height)
+            changes.append(float(np.sqrt(np.mean(last_change**2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um and number >= n_fixed:
@@ -223,7 +228,18 @@ def fit_heights(
             except KeyboardInterrupt:
                 is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
+        if posterior is not None:
+            posterior = posterior.also_off_by(left_to_go(changes) * last_change, seed=2)
         return _finish(refiner, changes, is_interrupted, posterior)
+
+
+def left_to_go(changes: Sequence[float]) -> float:
+    """Return how far the heights are from where further rounds would take them, in changes of the last one.
+
+    The changes are continued as a geometric series; after a single round they are taken to halve.
+    """
+    contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 0.5
+    return 1.0 / (1.0 - min(contraction, SLOWEST)) - 1.0
 
 
 def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:

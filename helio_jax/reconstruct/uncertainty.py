@@ -88,7 +88,8 @@ class Posterior:
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
         widening: factor by which all deviations were enlarged, for the instrument disagrees with what it says.
-        bent: error of all heights together that was added for the same reason, one standard deviation [y, x], um.
+        bent: errors of all heights together that were added for the same reason, or for a fit that has not converged,
+            one standard deviation of each [error, y, x], um.
     """
 
     samples: np.ndarray
@@ -132,16 +133,22 @@ class Posterior:
             return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
         bent = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
-        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
-        how_far /= np.sqrt(np.mean(how_far**2))
-        return replace(
+        enlarged = replace(
             self,
-            samples=factor * self.samples + how_far[:, None, None] * bent,
+            samples=factor * self.samples,
             instrument_samples=factor * self.instrument_samples,
             instrument_covariance=factor**2 * self.instrument_covariance,
             widening=factor * self.widening,
-            bent=bent if self.bent is None else np.hypot(bent, factor * self.bent),
+            bent=None if self.bent is None else factor * self.bent,
         )
+        return enlarged.also_off_by(bent, seed)
+
+    def also_off_by(self, error: np.ndarray, seed: int = 1) -> "Posterior":
+        """Return it with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um."""
+        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
+        how_far /= np.sqrt(np.mean(how_far**2))
+        bent = error[None] if self.bent is None else np.concatenate([self.bent, error[None]])
+        return replace(self, samples=self.samples + how_far[:, None, None] * error, bent=bent)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
@@ -152,7 +159,7 @@ class Posterior:
             for n, m in zip(shape, self.samples.shape[1:], strict=True)
         ]
         full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
-        bent = None if self.bent is None else full(self.bent[None])[0]
+        bent = None if self.bent is None else full(self.bent)
         return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
 
 

@@ -58,18 +58,19 @@ def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
 def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
-    So are heights that an instrument far from what was stated has bent, relative to most others, by a large share of
-    all relief: another explanation of the data would have taken them elsewhere.
+    So are heights that an instrument far from what was stated has bent, or that are not converged, relative to most
+    others, by a large share of all relief: another explanation, or more rounds, would have taken them elsewhere.
 
     Args:
         height: [y, x], um.
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
-        bent: as in `Posterior` [y, x], um.
+        bent: as in `Posterior` [error, y, x], um.
     """
     flags = np.zeros(height.shape, bool)
     if bent is not None:
-        flags |= np.abs(bent - np.median(bent)) > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
+        relative = np.sqrt(((bent - np.median(bent, (1, 2), keepdims=True)) ** 2).sum(0))
+        flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
     ground = region == 0
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number

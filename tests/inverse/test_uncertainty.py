@@ -74,8 +74,8 @@ def test_regions_and_floating():
     height = 100.0 * inside
     assert np.array_equal(floating(height, 50.0 * level, region), inside)
     assert not floating(height, 2.0 * level, region).any()
-    bent = np.zeros(height.shape)
-    bent[0] = -0.25 * np.ptp(height)
+    bent = np.zeros((1, *height.shape))
+    bent[0, 0] = -0.25 * np.ptp(height)
     found = floating(height, 2.0 * level, region, bent + 1000.0)  # all heights together are no relief
     assert found[0].all() and not found[1:].any()
     assert not floating(height, 2.0 * level, region, 0.7 * bent).any()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from helio_jax.reconstruct.refine import SLOWEST, left_to_go
 from helio_jax.reconstruct.uncertainty import Posterior
 
 NAMES = ("log_gain[0]", "aim[0, 0]", "aim[1, 0]")
@@ -31,7 +32,7 @@ def test_geometry_that_moved_too_far_adds_what_it_did_to_the_heights():
     assert after.widening == pytest.approx(factor)
     bend = np.sqrt(1.0 - factor**-2) * np.array([-0.5 * 3.0 * 8.0, 3.0 * 10.0, -4.0 * 20.0])
     assert after.bent is not None
-    assert after.bent[[0, 1, 2], [0, 1, 2]] == pytest.approx(bend)
+    assert after.bent[0, [0, 1, 2], [0, 1, 2]] == pytest.approx(bend)
     assert after.height_std[[0, 1, 2], [0, 1, 2]] == pytest.approx(np.hypot(2.0 * factor, bend), rel=0.05)
     assert after.height_std[3, 4] == pytest.approx(2.0 * factor, rel=0.05)
     agree = np.corrcoef(after.samples[:, 1, 1], after.samples[:, 2, 2])[0, 1]
@@ -64,11 +65,43 @@ def test_gains_that_are_off_by_far_widen_too_and_add_to_geometry():
     factor = 5.0 / np.sqrt(1.0 - left)
     assert further.widening == pytest.approx(after.widening * factor)
     assert further.bent is not None and after.bent is not None
-    assert further.bent[2, 2] == pytest.approx(factor * abs(after.bent[2, 2]))  # its own aim does not follow the gain
-    assert further.bent[0, 0] > factor * abs(after.bent[0, 0]) + 1.0
+    np.testing.assert_allclose(further.bent[0], factor * after.bent[0])
+    assert abs(further.bent[1, 0, 0]) > 1.0 and further.bent[1, 2, 2] == 0.0  # the third aim does not follow the gain
 
 
 def test_the_bend_follows_the_raster():
     """Catches a bend left on the thinned raster, where findings and heights would no longer have one shape."""
     after = posterior(50).widened({"aim": np.array([[3.0], [4.0]])}, ("aim",)).on_raster((8, 10), 2)
-    assert after.bent is not None and after.bent.shape == (8, 10) == after.samples.shape[1:]
+    assert after.bent is not None and after.bent.shape == (1, 8, 10)
+
+
+@pytest.mark.parametrize("contraction", [0.2, 0.8])
+def test_what_is_left_of_a_fit_that_converges_geometrically(contraction):
+    """Heights go to 100 um by a constant share of what is left: the sum of all changes to come is known exactly.
+
+    Catches the last change itself for it, which is right for a contraction of a half only.
+    """
+    height = 100.0 * (1.0 - contraction ** np.arange(4))
+    changes = np.diff(height)
+    assert left_to_go(list(changes)) * changes[-1] == pytest.approx(100.0 - height[-1])
+
+
+def test_what_is_left_of_other_fits():
+    """A single round, one that stands still, one that diverges. Catches infinite and negative error bars."""
+    assert left_to_go([7.0]) == pytest.approx(1.0)
+    assert left_to_go([0.0, 0.0]) == pytest.approx(1.0)
+    assert left_to_go([1.0, 3.0]) == pytest.approx(SLOWEST / (1.0 - SLOWEST))
+
+
+def test_an_error_of_all_heights_is_added_in_squares():
+    """Pixels agree by it and by nothing else, and earlier ones stay. Catches one error per pixel."""
+    error = np.zeros(SHAPE)
+    error[0, 0], error[3, 3] = 6.0, -8.0
+    before = posterior()
+    after = before.also_off_by(error)
+    assert after.bent is not None
+    np.testing.assert_allclose(after.bent[0], error)
+    np.testing.assert_allclose(after.height_std, np.hypot(2.0, error), rtol=0.06)
+    both = 6.0 * -8.0 / np.sqrt((36.0 + 4.0) * (64.0 + 4.0))
+    assert np.corrcoef(after.samples[:, 0, 0], after.samples[:, 3, 3])[0, 1] == pytest.approx(both, abs=0.05)
+    np.testing.assert_allclose(after.also_off_by(error, seed=5).bent, [error, error])
