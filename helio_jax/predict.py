@@ -196,5 +196,5 @@ class _Raster:
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
         """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0)[0], at[0])
+        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0), at)
         return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]

@@ -229,7 +229,7 @@ def fit_heights(
                 is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         if posterior is not None:
-            posterior = posterior.also_off_by(left_to_go(changes) * last_change, seed=2)
+            posterior = posterior.also_off_by(left_to_go(changes) * last_change)
         return _finish(refiner, changes, is_interrupted, posterior)
 
 
