@@ -36,7 +36,7 @@ def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> 
 
     Args:
         stack: aligned readings.
-        keeps_multiple: leave multiple scattering in the result, for a method that predicts it itself.
+        keeps_multiple: leave multiple scattering in the result, for a method that predicts it itself (`refine`).
     """
     first = _in_beam_units(stack, self_calibrate(stack))
     try:

@@ -11,6 +11,7 @@ Source: parametric bootstrap: Efron and Tibshirani, An Introduction to the Boots
 from collections.abc import Callable
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from helio_jax.arrays import border_mask
 from helio_jax.reconstruct.formfactor import SpotGeometry
@@ -20,6 +21,11 @@ from helio_jax.reconstruct.settings import ReconstructSettings
 
 MAX_PIXELS = 10_000
 """Larger rasters are thinned: every 2nd (4th, ...) row and column stands for the rest."""
+MOST_LEFT_OUT = 0.3
+"""Largest correction of a datum, in the signal of a facet that faces the aperture: at the foot of a sphere and in a
+trench multiple scattering comes near it."""
+_ALBEDO_PIXELS = 5
+"""Side of the square over which the albedo's median is taken for it [pixels]."""
 _SEED = 11
 
 Solve = Callable[[np.ndarray, np.ndarray, SpotGeometry, int], np.ndarray]
@@ -96,6 +102,9 @@ def what_is_left_out(
 ) -> np.ndarray:
     """Return by how much the signal of a solution's own surface differs from what the method takes it for.
 
+    Single pixels beside rims come out with any normal and albedo: the latter is a median over neighbours here, and no
+    datum differs by more than `MOST_LEFT_OUT` of what a facet that faces the aperture sends it.
+
     Args:
         solution: normals and albedo of the method [y, x].
         used, near: form factors that the method took, and at the heights that it found [detector, 3, y, x].
@@ -104,9 +113,10 @@ def what_is_left_out(
     Returns:
         Signal [detector, y, x], in units of the beam.
     """
-    albedo = np.nan_to_num(solution.albedo)
-    change = np.einsum("kiyx,yxi->kyx", near - prediction.hidden - used, solution.normals)
-    return albedo * change + albedo * prediction.multiple
+    albedo = median_filter(np.nan_to_num(solution.albedo), _ALBEDO_PIXELS)
+    change = np.einsum("kiyx,yxi->kyx", near - prediction.hidden - used, solution.normals) + prediction.multiple
+    most = MOST_LEFT_OUT * np.linalg.norm(used, axis=1)
+    return albedo * np.clip(change, -most, most)
 
 
 def also_off_by(samples: np.ndarray, error: np.ndarray) -> np.ndarray:

@@ -106,8 +106,3 @@ class ReconstructSettings(Settings):
     samples: int = Field(default=16, ge=0, le=10_000)
     """`linear`, `nearfield`: how often noise and calibration are drawn anew for the error bars; 0: no error bars."""
     refine: RefineSettings = RefineSettings()
-
-    @property
-    def predicts(self) -> bool:
-        """Whether the method itself takes multiple scattering into account."""
-        return self.method == "refine" or (self.method == "nearfield" and self.corrections > 0)

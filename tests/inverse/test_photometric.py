@@ -110,7 +110,7 @@ def test_what_is_left_out_of_a_bump_is_an_error_bar(bshem):
     rec = photometric_heights(stack, settings, SpotGeometry(bshem), hidden)
     assert rec.height_samples is not None and rec.height_std is not None
     wide = rec.height_std > 5.0
-    assert wide.sum() > 40
+    assert wide.sum() > 30
     one = np.linalg.svd(rec.height_samples[:, wide], compute_uv=False)
     assert one[0] ** 2 > 0.98 * np.sum(one**2)
     corrected = photometric_heights(stack, settings.changed(corrections=1), SpotGeometry(bshem), hidden)
@@ -128,7 +128,19 @@ def test_left_out_is_the_difference_of_two_renderings(bshem):
     prediction = Prediction(rng.uniform(0, 1e-3, stack.counts.shape), 0.1 * near)
     found = what_is_left_out(solution, used, near, prediction)
     lit = lambda phi: solution.albedo * np.einsum("kiyx,yxi->kyx", phi, solution.normals)  # noqa: E731
-    np.testing.assert_allclose(found, 0.9 * lit(near) - lit(used) + solution.albedo * prediction.multiple, atol=1e-12)
+    inner = (..., slice(2, -2), slice(2, -2))
+    wanted = 0.9 * lit(near) - lit(used) + solution.albedo * prediction.multiple
+    np.testing.assert_allclose(found[inner], wanted[inner], rtol=0.02)  # the median of a smooth albedo
+
+
+def test_wild_pixels_correct_little(bshem):
+    """A pixel with ten times the albedo counts as its neighbours, and a bright prediction as 30 % of a facing facet."""
+    stack = bump_scan(bshem)
+    phi = SpotGeometry(bshem).form_factor(np.zeros((N, N)))
+    solution = solve_linear(stack.counts / N_RAYS, np.full(stack.counts.shape, 1e-8), phi)
+    solution.albedo[12, 12] *= 10.0
+    found = what_is_left_out(solution, phi, phi, Prediction(np.ones(stack.counts.shape), 0.0 * phi))
+    np.testing.assert_allclose(found[:, 12, 12], 0.3 * np.linalg.norm(phi[..., 12, 12], axis=1), rtol=0.1)
 
 
 def test_data_are_brought_to_the_flat_only_where_there_is_one(bshem):
