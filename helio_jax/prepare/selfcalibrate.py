@@ -41,8 +41,8 @@ class SelfCalibrateSettings(Settings):
     """Degree of the polynomial in scan time that describes each background; 0: none drifts."""
     drift_std: float = Field(default=0.2, gt=0.0, le=1.0)
     """Prior deviation of its coefficients, relative to the reading."""
-    multiple_std: float = Field(default=0.5, gt=0.0, le=10.0)
-    """Prior deviation of the factor of predicted multiple scattering from 1."""
+    multiple_std: float = Field(default=0.25, gt=0.0, le=10.0)
+    """Prior deviation of the factor of predicted multiple scattering from 1; the surface is not yet known well."""
     n_pixels: int = Field(default=800, ge=50, le=100_000)
     """Pixels, seen in 4 scans or more, that take part, at most."""
     seed: int = Field(default=1, ge=0)
