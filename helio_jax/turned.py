@@ -20,7 +20,7 @@ from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import limited, reconstruct_stack
 
 _ROUNDS, _SETTLED = 8, (0.01, 0.5)
-"""The surface is found anew until share and polar angle [deg] change by less than this, or so often (flanks of 55 degrees
+"""The surface is found anew until share and polar angle [deg] change by less than this, or so often (flanks of 55 deg
 are 40 by the first calibration of a tall crystal, and 52, 55 by the next ones)."""
 _GROUND = 0.05
 """Quantile of the border's heights that is taken for level ground."""

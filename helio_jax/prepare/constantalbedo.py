@@ -1,6 +1,6 @@
 """The fit of instrument and normals to readings of one aperture from several sides, with one albedo everywhere.
 
-reading_k = signal_k (max(0, n . d_k) + m M_k) + background_k(t), level ground reading signal + background. Unknown
+reading_k = signal_k ((n . d_k)+ + m M_k) + background_k(t), level ground reading signal + background. Unknown
 are polar angle, signals, backgrounds (Legendre polynomials in the scan's own time t), the share m of a predicted
 multiple scattering M, and a normal in every pixel. The normals are eliminated (Schur complement); normals anew from a
 grid, in turns with Gauss-Newton steps of all unknowns, keep it out of local minima. Cast shadows count as outliers.
@@ -42,7 +42,8 @@ class Readings(NamedTuple):
         height: of the surface, where something is known of it, over the sample's plane [n], um.
         multiple: predicted multiple scattering, over level ground's signal [k, n].
         azimuth: of the apertures [k], rad.
-        radius: of the apertures on the plate, um.
+        radius: of the apertures' centres on the plate, um.
+        size: radius of a disc of an aperture's area, um.
     """
 
     value: np.ndarray
@@ -52,6 +53,7 @@ class Readings(NamedTuple):
     multiple: np.ndarray
     azimuth: np.ndarray
     radius: float
+    size: float
 
 
 class Priors(NamedTuple):
@@ -142,6 +144,25 @@ def _directions(readings: Readings, polar: float) -> np.ndarray:
     return size[:, None] * np.stack([radius * np.cos(turn) + 0.0 * up, radius * np.sin(turn) + 0.0 * up, up], -1)
 
 
+def _half_angle(readings: Readings, polar: float) -> float:
+    """Return the angle [rad] of the disc that looks as large as an aperture from the sample's plane."""
+    return readings.size * math.sqrt(math.cos(polar)) * math.sin(polar) / readings.radius
+
+
+def _beside_horizon(facing: np.ndarray, direction: np.ndarray, half_angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signal of facets whose own horizon may cut the aperture, and its derivative by `facing` [k, n].
+
+    The mean of max(0, c + s t) over a disc, c = n . d of its middle and s = |d| half_angle: where the middle is on the
+    horizon, 0.2 s is seen and not nothing, which would look like background.
+    """
+    s = np.linalg.norm(direction, axis=-1) * half_angle
+    u = np.clip(facing / s, -1.0, 1.0)
+    root = np.sqrt(1.0 - u * u)
+    seen = 0.5 + (np.arcsin(u) + u * root) / math.pi
+    signal = s * (u * seen + 2.0 / (3.0 * math.pi) * root**3)
+    return np.where(facing > s, facing, signal), seen
+
+
 def _background(readings: Readings, model: Model) -> np.ndarray:
     return np.einsum("kj,knj->kn", model.background, readings.basis)
 
@@ -176,7 +197,8 @@ def _step(
     direction, nudge = _directions(readings, model.polar), 1e-3
     turned = (_directions(readings, model.polar + nudge) - _directions(readings, model.polar - nudge)) / (2.0 * nudge)
     facing = np.einsum("kni,ni->kn", direction, normal)
-    is_lit, light = facing > 0.0, np.maximum(facing, 0.0) + model.multiple * readings.multiple
+    single, is_lit = _beside_horizon(facing, direction, _half_angle(readings, model.polar))
+    light = single + model.multiple * readings.multiple
     residual = readings.known * (readings.value - _background(readings, model) - signal * light)
     weight = readings.known / ((1.0 + (residual / limit) ** 2) ** 2 * _MODEL_ERROR**2)
     by_model = np.zeros((k, n, 2 + k + k * n_terms))

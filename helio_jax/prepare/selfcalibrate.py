@@ -133,7 +133,9 @@ def self_calibrate(
     if candidates.size < least:
         raise GuardError(f"self-calibration needs {least} pixels in {MIN_SCANS} images, got {candidates.size}")
     chosen = np.random.default_rng(settings.seed).permutation(candidates)[: settings.n_pixels]
-    readings, unit = _readings(stack, settings, relief, inside, chosen, (np.arctan2(*centers.T[::-1]), radius.mean()))
+    size = math.sqrt(np.mean([np.prod(a.semi_axes) for a in stack.instrument.apertures()]))
+    aperture = np.arctan2(*centers.T[::-1]), float(radius.mean()), size
+    readings, unit = _readings(stack, settings, relief, inside, chosen, aperture)
     mean = float(polar.mean())
     priors = Priors(
         mean, math.radians(settings.polar_std_deg), settings.share_std, settings.drift_std, settings.multiple_std
