@@ -133,7 +133,7 @@ def test_time_of_turned_scans():
 
 
 def test_what_stands_closer_to_the_plate_is_seen_from_there():
-    """Pyramids 900 um high under an aperture at 46 deg, near field: with the heights the model fits, else not.
+    """Pyramids 900 um high under an aperture at 46 deg, near field: with the heights the angle is right, else not.
 
     Catches one direction for all heights, which a tall crystal's flanks then pay for.
     """
@@ -157,5 +157,6 @@ def test_what_stands_closer_to_the_plate_is_seen_from_there():
     settings = SelfCalibrateSettings(drift_degree=0)
     near = self_calibrate(stack, settings, Relief(height, np.zeros(stack.shape)))
     far = self_calibrate(stack, settings)
-    assert near.polar_deg == pytest.approx(46.1, abs=1.5) and near.share == pytest.approx(SHARE, abs=0.02)
-    assert near.misfit < 0.5 * far.misfit
+    assert near.share == pytest.approx(SHARE, abs=0.02)
+    assert abs(near.polar_deg - 46.1) < 0.6 < 1.0 < abs(far.polar_deg - 46.1)
+    assert near.misfit < far.misfit
