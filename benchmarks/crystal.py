@@ -4,7 +4,7 @@ python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--tiny]
                              [--sample crystal|tall|hills|pyramids|rough|measured]
 
 A truncated crystal ({100} top of 438 x 250 um, tilted by 6 degrees, four {111} sides at 125.26 degrees to it) on level
-ground is traced anew for five rotations of one detector, with gains, background (75 % of level ground's reading) and
+ground is traced anew for five rotations of one detector, with gains, background (75 % of the reading), its drift and
 noise as the measured scans have them. Then one thing after the other is given as it truly is: the motions, the gains
 and background, the multiple scattering. `tall` stands 1100 um high and fills the field, `hills` and `rough` have no
 facets and are, as `pyramids`, scored by their slopes. Truth scores, and is given where a row says so; no reconstruction
