@@ -4,7 +4,7 @@ python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--tiny]
                              [--sample crystal|tall|hills|pyramids|rough|measured]
 
 A truncated crystal ({100} top of 438 x 250 um, tilted by 6 degrees, four {111} sides at 125.26 degrees to it) on level
-ground is traced anew for five rotations of one detector, with gains, background (75 % of level ground's reading) and
+ground is traced anew for five rotations of one detector, with gains, background (75 % of the reading), its drift and
 noise as the measured scans have them. Then one thing after the other is given as it truly is: the motions, the gains
 and background, the multiple scattering. `tall` stands 1100 um high and fills the field, `hills` and `rough` have no
 facets and are, as `pyramids`, scored by their slopes. Truth scores, and is given where a row says so; no reconstruction
@@ -53,6 +53,8 @@ GAINS = (6.4e-10, 1.3e-10, 1.3e-10, 4.5e-10, 5.1e-10)
 """Readings of level ground in the five measured scans, as their self-calibration finds them."""
 SHARE, NOISE = 0.75, 0.02
 """Background and noise of a pixel, both as a share of level ground's reading."""
+DRIFTS = ((-0.09, 0.05, -0.01), (0.01, 0.09, 0.01), (0.0, 0.02, 0.02), (-0.03, 0.02, 0.02), (-0.05, 0.02, 0.0))
+"""Drift of the background, Legendre polynomials in scan time over level ground's reading, as in the measured scans."""
 STAGES = ("full", "motions", "calibration", "multiple")
 """What is given as it truly is: nothing; motions; also gains, background, polar angle; also multiple scattering."""
 
@@ -106,7 +108,7 @@ class Recorded(NamedTuple):
     multiple: MicrographSet
 
 
-def record(sample: Sample, n: int, rays: int, seed: int) -> Recorded:
+def record(sample: Sample, n: int, rays: int, seed: int, drifts: tuple = DRIFTS) -> Recorded:
     """Trace five turned scans and read them as the measured ones were read."""
     instrument, rng = load_instrument(INSTRUMENT), np.random.default_rng(seed)
     step = FIELD_UM / n
@@ -117,7 +119,8 @@ def record(sample: Sample, n: int, rays: int, seed: int) -> Recorded:
     pixel_x, pixel_y = (a.ravel() for a in np.meshgrid(axis, axis))
     flat = float(pipeline.flat_signal(instrument)[0])
     scans, multiples, motions = [], [], []
-    for k, gain in enumerate(GAINS):
+    time = np.linspace(-1.0, 1.0, n)[:, None]
+    for k, (gain, drift) in enumerate(zip(GAINS, drifts, strict=True)):
         turn = -k * 2.0 * math.pi / len(GAINS)
         shift = rng.uniform(-3.0, 3.0, 2) * step if k else np.zeros(2)
         motion = Rigid(turn + math.radians(rng.uniform(-1.0, 1.0) if k else 0.0), (float(shift[0]), float(shift[1])))
@@ -128,7 +131,8 @@ def record(sample: Sample, n: int, rays: int, seed: int) -> Recorded:
         signal, several = (
             a.reshape(n, n) / flat for a in (traced.total_mean[0], traced.mean[1:, 0].sum(0))
         )  # level ground: 1
-        reading = gain * ((1.0 - SHARE) * signal + SHARE + NOISE * rng.normal(size=(n, n)))
+        level = SHARE + np.polynomial.legendre.legval(time, (0.0, *drift))
+        reading = gain * ((1.0 - SHARE) * signal + level + NOISE * rng.normal(size=(n, n)))
         about = {"sample_rotation": turn, "name": f"turned{k}"}
         spread = np.full((1, n, n), (gain * NOISE) ** 2)
         scans.append(MicrographStack(reading[None], axis, axis, instrument, spread, noise="measured", **about))
@@ -144,7 +148,7 @@ def calibrated(known: Recorded, stage: str, method: str) -> MicrographStack:
     if stage in ("full", "motions"):
         return pipeline.calibrate_turned(stack, keeps_multiple=method == "refine")
     polar = math.degrees(math.atan2(3120.0, 3000.0))
-    found = SelfCalibration(np.array(GAINS), SHARE, polar, 0.0, 0.0)
+    found = SelfCalibration(np.array(GAINS), np.full(5, SHARE), np.array(DRIFTS), polar, 0.0, 1.0, 0.0, 0.0)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
     done = apply_calibration(stack, found, pipeline.flat_signal(instrument), instrument)
     if stage == "multiple":

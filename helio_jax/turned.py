@@ -1,24 +1,28 @@
 """Calibration of aligned scans of a turned sample: by their constant albedo, multiple scattering taken off.
 
-Joins the self-calibration (`prepare.selfcalibrate`), which knows single scattering only, with the linear solution and
-the prediction of what its surface scatters more than once. On synthetic crystals with ground in the field the
-background came out a fifth too low, and flanks of 55 degrees at 32, without it (benchmarks/crystal.py).
+Joins the self-calibration (`prepare.selfcalibrate`), which knows no surface, with the near-field solution and the
+prediction of what its surface scatters more than once. On synthetic crystals with ground in the field the background
+came out a fifth too low, and flanks of 55 degrees at 32, without it (benchmarks/crystal.py).
 """
 
 import numpy as np
+from scipy import ndimage
 
 from helio_jax.arrays import border_mask
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.predict import make_predictor
-from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrument, self_calibrate
+from helio_jax.prepare.selfcalibrate import Relief, SelfCalibration, effective_instrument, self_calibrate
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.photometric import limited
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.solve import reconstruct_stack
 
+_ROUNDS, _SETTLED = 8, (0.01, 0.5)
+"""The surface is found anew until share and polar angle [deg] change by less than this, or so often (flanks of 55 deg
+are 40 by the first calibration of a tall crystal, and 52, 55 by the next ones)."""
 _GROUND = 0.05
 """Quantile of the border's heights that is taken for level ground."""
 
@@ -31,24 +35,29 @@ def flat_signal(instrument: Instrument) -> np.ndarray:
 def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> MicrographStack:
     """Bring aligned scans of a turned sample into units of the beam by a constant albedo (`prepare.selfcalibrate`).
 
-    Done twice: what the surface of a first, linear solution scatters several times is predicted and taken off before
-    the second, for else gains and background take it for signal. The lowest part of the border lies on level ground.
+    Done several times: the surface found with one calibration tells the next one how far away each point is and what
+    is scattered several times, which is taken off in the share that the readings ask for.
 
     Args:
         stack: aligned readings.
         keeps_multiple: leave multiple scattering in the result, for a method that predicts it itself (`refine`).
     """
-    first = _in_beam_units(stack, self_calibrate(stack))
-    try:
-        multiple = _multiple_of(first)
-    except GuardError as error:
-        return _noted(first, f"multiple scattering not predicted, so calibrated with it: {error}")
-    reading = first.provenance["self_calibrate"]
-    scale = np.asarray(reading["gain"]) * (1.0 - reading["share"]) / flat_signal(first.instrument)
-    without = stack.replace(counts=stack.counts - scale[:, None, None] * multiple)
-    found = self_calibrate(without)
-    calibrated = _in_beam_units(stack if keeps_multiple else without, found)
-    return _noted(calibrated, "multiple scattering predicted once", without_multiple=not keeps_multiple)
+    found = self_calibrate(stack)
+    done, note, is_off = _in_beam_units(stack, found), "not settled", False
+    for _ in range(_ROUNDS):
+        try:
+            relief = _relief_of(done)
+        except GuardError as error:
+            note = f"not predicted, so calibrated with what is left of it: {error}"
+            break
+        before, found = found, self_calibrate(stack, relief=relief, start=found)
+        taken = (found.multiple * found.signal)[:, None, None] * relief.multiple
+        done, is_off = _in_beam_units(stack.replace(counts=stack.counts - taken), found), not keeps_multiple
+        changes = abs(np.mean(found.share - before.share)), abs(found.polar_deg - before.polar_deg)
+        if all(change < limit for change, limit in zip(changes, _SETTLED, strict=True)):
+            note = "predicted until it settled"
+            break
+    return _noted(_in_beam_units(stack, found) if keeps_multiple else done, f"multiple scattering {note}", is_off)
 
 
 def _in_beam_units(stack: MicrographStack, found: SelfCalibration) -> MicrographStack:
@@ -56,16 +65,26 @@ def _in_beam_units(stack: MicrographStack, found: SelfCalibration) -> Micrograph
     return apply_calibration(stack, found, flat_signal(instrument), instrument)
 
 
-def _noted(stack: MicrographStack, note: str, *, without_multiple: bool = False) -> MicrographStack:
+def _noted(stack: MicrographStack, note: str, without_multiple: bool) -> MicrographStack:
     """Return a self-calibrated stack whose record says how multiple scattering was dealt with."""
-    record = stack.provenance["self_calibrate"] | {"multiple": note, "without_multiple": without_multiple}
+    record = stack.provenance["self_calibrate"] | {"note": note, "without_multiple": without_multiple}
     return stack.replace(provenance={**stack.provenance, "self_calibrate": record})
 
 
-def _multiple_of(stack: MicrographStack) -> np.ndarray:
-    """Return the multiple scattering [detector, y, x] of the linear solution's surface, in units of the beam."""
-    settings = ReconstructSettings(method="linear", border="free")
+def _relief_of(stack: MicrographStack) -> Relief:
+    """Return heights of the near-field solution of a calibrated stack, and what its surface scatters several times.
+
+    Beyond what three images show heights go on as at the nearest pixel; the slopes guessed there would be cliffs, which
+    scatter much. The lowest part of the border is level ground, and there is such ground around.
+    """
+    settings = ReconstructSettings(method="nearfield", border="free")
     rec = reconstruct_stack(stack, settings)
-    frame = border_mask(rec.height.shape, settings.border_fraction)
-    height = limited(np.maximum(rec.height - np.quantile(rec.height[frame], _GROUND), 0.0), stack)
-    return make_predictor(stack, settings.refine.paths(height.size))(height, rec.normals).multiple
+    near = ndimage.distance_transform_edt(~rec.is_valid, return_distances=False, return_indices=True)
+    height = limited(rec.height[tuple(near)], stack)  # type: ignore[arg-type]
+    normals = np.where(rec.is_valid[..., None], rec.normals, np.array([0.0, 0.0, 1.0]))
+    ground = float(np.quantile(height[border_mask(height.shape, settings.border_fraction)], _GROUND))
+    plate = stack.instrument.plate.model_copy(update={"sample_distance_um": stack.instrument.sample_distance - ground})
+    above = stack.replace(instrument=stack.instrument.model_copy(update={"plate": plate}))
+    predict = make_predictor(above, settings.refine.paths(height.size))
+    multiple = predict(np.maximum(height - ground, 0.0), normals).multiple
+    return Relief(height, multiple / flat_signal(stack.instrument)[:, None, None])

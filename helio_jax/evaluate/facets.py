@@ -23,6 +23,8 @@ _TUKEY = 4.685
 _ROUNDS = 30
 _LEAST_CORE = 0.25
 """A strip of which less is left without its rim is the rounding of an edge."""
+_NO_CORE = 1e-6
+"""Sum of Gaussian weights below which a facet is not continued."""
 
 
 class FacetSettings(Settings):
@@ -161,7 +163,7 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
     slope, misfit = _local_slopes(rec, use, s.window | 1)
     normal, known = _normal(slope), np.isfinite(misfit)
     labels = np.zeros(use.shape, int)
-    planes: dict[int, np.ndarray] = {}
+    numbers: list[int] = []
     order = np.argsort(np.where(known, misfit, np.inf), axis=None)[: int(known.sum())]
     near = math.cos(math.radians(s.max_turn_deg))
     tried = np.zeros(use.shape, bool)
@@ -182,11 +184,11 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
             tried |= region
             inner = ndimage.binary_erosion(region, iterations=max(s.rim_pixels, 1))
             if region.sum() >= s.min_pixels and inner.sum() >= _LEAST_CORE * region.sum():
-                number = len(planes) + 1
+                number = len(numbers) + 1
                 labels[region] = number
-                planes[number] = _fit_plane(rec, _core(region, s.rim_pixels))[0]
+                numbers.append(number)
         tried[seed] = True
-    return _shared_out(rec, labels, planes, use, s)
+    return _shared_out(rec, labels, numbers, use, s)
 
 
 def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
@@ -204,20 +206,52 @@ def _core(region: np.ndarray, rim: int) -> np.ndarray:
     return region
 
 
-def _shared_out(rec, labels, planes, use, s: FacetSettings) -> np.ndarray:
-    """Give pixels within a window of facets to the facet whose plane is nearest in height; one piece each."""
+def _shared_out(rec, labels, numbers, use, s: FacetSettings) -> np.ndarray:
+    """Give pixels within a window of facets to the facet whose plane there is nearest in height; one piece each.
+
+    Borders are local: a flank that is bent by 2 degrees over its length makes its plane as a whole miss its edge by
+    tens of um, and a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
+    """
     out, best = labels.copy(), np.full(labels.shape, np.inf)
-    for number, (a, b, c) in planes.items():
-        away = np.abs(rec.height - (a * rec.x + b * rec.y + c))
-        reach = ndimage.binary_dilation(labels == number, iterations=(s.window | 1)) & use
+    for number in numbers:
+        region = labels == number
+        away = np.abs(rec.height - _continued(rec, _core(region, s.rim_pixels), s.window | 1))
+        reach = ndimage.binary_dilation(region, iterations=(s.window | 1)) & use
         is_nearer = reach & (away < best)
         out, best = np.where(is_nearer, number, out), np.where(is_nearer, away, best)
-    for number in planes:
+    for number in numbers:
         piece, n = _pieces(out == number)
         if n > 1:
             sizes = np.bincount(piece.ravel())[1:]
             out[(piece > 0) & (piece != 1 + int(np.argmax(sizes)))] = 0
     return out
+
+
+def _continued(rec: Reconstruction, core: np.ndarray, reach: float) -> np.ndarray:
+    """Return the heights [y, x] of the planes fitted, about every pixel, to the core with Gaussian weights.
+
+    Args:
+        rec: heights.
+        core: pixels of a facet.
+        reach: standard deviation of the weights [pixels]; beyond 5 of them from the core: infinite.
+    """
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(np.where(core, values, 0.0), reach, mode="constant", truncate=5.0) / total
+
+    total = np.maximum(
+        ndimage.gaussian_filter(core.astype(float), reach, mode="constant", truncate=5.0), np.finfo(float).tiny
+    )
+    x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), rec.height
+    at = np.stack([mean(x), mean(y)], -1)
+    level = mean(z)
+    moments = [[mean(a * b) - mean(a) * mean(b) for b in (x, y)] for a in (x, y)]
+    slopes = np.stack([mean(a * z) - mean(a) * level for a in (x, y)], -1)
+    ridge = 0.1 * pitch(rec.raster_x) * pitch(rec.raster_y)  # a core one pixel wide has no slope across
+    matrix = np.moveaxis(np.array(moments), (0, 1), (-2, -1)) + ridge * np.eye(2)
+    plane = np.linalg.solve(matrix, slopes[..., None])[..., 0]
+    height = level + np.sum(plane * (np.stack([x, y], -1) - at), -1)
+    return np.where(total > _NO_CORE, height, np.inf)
 
 
 def _fit_plane(

@@ -115,6 +115,20 @@ def turned_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     return stacks[0].instrument.model_copy(update={"detector": tuple(detectors)})
 
 
+def scan_times(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> list[list[float]]:
+    """Return, for every image, a, b, c of its scan's time a x + b y + c at points of the common frame, -1 to 1.
+
+    Time counts along the slow axis; which end is the earlier is not told, nor needed for a smooth drift.
+    """
+    told = []
+    for stack, motion in zip(stacks, motions, strict=True):
+        axis, slow = (1, stack.y) if stack.fast_axis == "x" else (0, stack.x)
+        half, middle = max(0.5 * float(np.ptp(slow)), pitch(slow)), 0.5 * float(slow[0] + slow[-1])
+        a, b = motion.matrix[axis] / half
+        told += [[float(a), float(b), (motion.shift[axis] - middle) / half]] * len(stack.instrument.detector)
+    return told
+
+
 def resample(
     scans: MicrographSet,
     motions: tuple[Rigid, ...],
@@ -175,5 +189,8 @@ def resample(
         noise=first.noise,
         unit=first.unit,
         name=f"{first.name} and {len(scans.stacks) - 1} more",
-        provenance={"scans": [dict(s.provenance) for s in scans.stacks]},
+        provenance={
+            "scans": [dict(s.provenance) for s in scans.stacks],
+            "scan_time": scan_times(scans.stacks, motions),
+        },
     )

@@ -1,10 +1,9 @@
-"""Gains, background and polar angle of turned scans from the scans themselves: an albedo that is the same everywhere.
+"""Gains, backgrounds, drifts and distance of turned scans from the scans themselves: one albedo everywhere.
 
-For measured scans of one aperture, aligned (align.py), without a flat border. Model, far field, per pixel and scan k:
-reading = gain_k (max(0, n . d_k) / cos(polar) (1 - share) + share), level ground reading 1. Unknown are the gains, the
-`share` of the background in level ground's reading, the polar angle of the aperture (prior: the plate's own), and
-a normal in every pixel. Cast shadows count as outliers; multiple scattering goes into the share. Polar angle and share
-are tied to each other and to the slopes: `spread_deg`, how far the angle may move, is stated, and slopes go with it.
+For measured scans of one aperture, aligned (align.py), without a flat border. Reading per pixel and scan = gain (signal
+of the facet x (1 - share) + share + drift of the scan's time), where the signal of level ground is 1. The fit itself is
+`constantalbedo.py`. Polar angle (the sample's distance) and shares are tied to each other and to the slopes:
+`spread_deg`, how far the angle may move, is stated, and slopes go with it.
 """
 
 import math
@@ -13,23 +12,22 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 from scipy import ndimage
-from scipy.optimize import minimize
 
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
+from helio_jax.prepare.constantalbedo import Model, Priors, Readings, fit_constant_albedo, level_model
 from helio_jax.settings import Settings
 
-_ROUNDS = 6
-_OUTLIER = 0.06
-_MODEL_ERROR = 0.02
-"""Deviation of a reading, over level ground's, from the model: facets are not quite flat, albedos not quite one."""
-_TOGETHER = 25
-"""Pixels that share such an error."""
+MIN_SCANS = 4
+"""Images that a pixel which takes part is seen in: two of them fix its normal, the others test the model."""
 _WINDOW = 5
 """Side of the square whose median stands for a pixel. A mean would mix facets: their mean normal is shorter than one,
-which looks like more background (0.78 for 0.75 on pyramids without any noise; by the median 0.757)."""
-_TILT_STEP, _AZIMUTH_STEP, _MAX_TILT = 3.0, 9.0, 78.0
+which looks like more background (0.78 for 0.75 on pyramids without any noise)."""
+_MARGIN = 3
+"""Pixels along a scan's border that are left out."""
+_SHARES = (0.5, 0.7, 0.8)
+"""Shares of background from which the fit starts."""
 
 
 class SelfCalibrateSettings(Settings):
@@ -37,10 +35,26 @@ class SelfCalibrateSettings(Settings):
 
     polar_std_deg: float = Field(default=5.0, gt=0.0, le=45.0)
     """Prior deviation of the apertures' polar angle from the instrument file's [deg]."""
-    n_pixels: int = Field(default=400, ge=50, le=100_000)
-    """Pixels, seen in all scans, that take part."""
+    share_std: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Prior deviation of the background from that of the other scans, relative to the reading."""
+    drift_degree: int = Field(default=3, ge=0, le=9)
+    """Degree of the polynomial in scan time that describes each background; 0: none drifts."""
+    drift_std: float = Field(default=0.2, gt=0.0, le=1.0)
+    """Prior deviation of its coefficients, relative to the reading."""
+    multiple_std: float = Field(default=0.25, gt=0.0, le=10.0)
+    """Prior deviation of the factor of predicted multiple scattering from 1; the surface is not yet known well."""
+    n_pixels: int = Field(default=800, ge=50, le=100_000)
+    """Pixels, seen in 4 scans or more, that take part, at most."""
     seed: int = Field(default=1, ge=0)
     """Which pixels those are."""
+
+
+class Relief(NamedTuple):
+    """What is known of the surface: heights over the sample's plane [y, x], um, and the multiple scattering of it
+    [image, y, x], relative to level ground's signal."""
+
+    height: np.ndarray
+    multiple: np.ndarray
 
 
 class SelfCalibration(NamedTuple):
@@ -48,90 +62,122 @@ class SelfCalibration(NamedTuple):
 
     Attributes:
         gain: reading of level ground in each image.
-        share: background's share of it.
+        share: background's share of it [image].
+        drift: coefficients of the Legendre polynomials in scan time, from the first on, over the gain [image, degree].
         polar_deg: effective polar angle.
-        spread_deg: its deviation, from the curvature of the misfit and the prior.
+        spread_deg: its standard deviation.
+        multiple: factor of the predicted multiple scattering.
+        multiple_std: its standard deviation.
         misfit: rms of reading / gain about the model.
     """
 
     gain: np.ndarray
-    share: float
+    share: np.ndarray
+    drift: np.ndarray
     polar_deg: float
     spread_deg: float
+    multiple: float
+    multiple_std: float
     misfit: float
+
+    @property
+    def signal(self) -> np.ndarray:
+        """What level ground reads above the background [image]."""
+        return self.gain * (1.0 - self.share)
+
+    def background(self, time: np.ndarray) -> np.ndarray:
+        """Return the background's reading at scan times [image, y, x], -1 to 1."""
+        terms = np.polynomial.legendre.legvander(time, self.drift.shape[1])
+        level = np.concatenate([self.share[:, None], self.drift], 1)
+        return self.gain[:, None, None] * np.einsum("kj,kyxj->kyx", level, terms)
+
+
+def scan_time(stack: MicrographStack) -> np.ndarray | None:
+    """Return the time of its own scan at which every pixel was recorded, -1 to 1 [image, y, x]; None: not told."""
+    told = stack.provenance.get("scan_time")
+    if told is None:
+        return None
+    x, y = np.meshgrid(stack.x, stack.y)
+    return np.stack([a * x + b * y + c for a, b, c in told])
 
 
 def self_calibrate(
-    stack: MicrographStack, settings: SelfCalibrateSettings = SelfCalibrateSettings()
+    stack: MicrographStack,
+    settings: SelfCalibrateSettings = SelfCalibrateSettings(),
+    relief: Relief | None = None,
+    start: SelfCalibration | None = None,
 ) -> SelfCalibration:
-    """Fit gains, background and polar angle of an aligned stack.
+    """Fit gains, backgrounds and polar angle of an aligned stack.
+
+    Args:
+        stack: readings; drift is fitted where it knows its scans' time (`resample` tells it).
+        settings: priors.
+        relief: the surface, if something is known of it; else all is in the sample's plane, and scatters once.
+        start: an earlier calibration, from which the fit starts instead of at the priors.
 
     Raises:
-        GuardError: fewer than 4 images, apertures at different polar angles, or too few pixels seen in all.
+        GuardError: fewer than 4 images, apertures at different polar angles, or too few pixels seen in 4.
     """
     centers = np.array([a.center for a in stack.instrument.apertures()])
-    polar = np.arctan2(np.linalg.norm(centers, axis=1), stack.instrument.working_distance)
-    if len(polar) < 4 or np.ptp(polar) > math.radians(0.5):
+    radius = np.linalg.norm(centers, axis=1)
+    polar = np.arctan2(radius, stack.instrument.sample_distance)
+    if len(polar) < MIN_SCANS or np.ptp(polar) > math.radians(0.5):
         raise GuardError(
-            f"self-calibration needs 4 or more images by one turned aperture, got {len(polar)} at polar angles of "
-            f"{np.degrees(polar.min()):.1f} to {np.degrees(polar.max()):.1f} deg: calibrate on a flat border instead"
+            f"self-calibration needs {MIN_SCANS} or more images by one turned aperture, got {len(polar)} at polar "
+            f"angles of {np.degrees(polar.min()):.1f} to {np.degrees(polar.max()):.1f} deg: calibrate on a flat border "
+            "instead"
         )
-    inside = np.asarray(ndimage.binary_erosion(stack.is_observed.all(0), iterations=3), bool)
-    if inside.sum() < settings.n_pixels:
-        raise GuardError(f"self-calibration needs {settings.n_pixels} pixels in all images, got {int(inside.sum())}")
+    inside = np.stack([ndimage.binary_erosion(known, iterations=_MARGIN) for known in stack.is_observed])
+    candidates = np.flatnonzero(inside.sum(0) >= MIN_SCANS)
+    least = SelfCalibrateSettings.model_fields["n_pixels"].metadata[0].ge
+    if candidates.size < least:
+        raise GuardError(f"self-calibration needs {least} pixels in {MIN_SCANS} images, got {candidates.size}")
+    chosen = np.random.default_rng(settings.seed).permutation(candidates)[: settings.n_pixels]
+    size = math.sqrt(np.mean([np.prod(a.semi_axes) for a in stack.instrument.apertures()]))
+    aperture = np.arctan2(*centers.T[::-1]), float(radius.mean()), size
+    readings, unit = _readings(stack, settings, relief, inside, chosen, aperture)
+    mean = float(polar.mean())
+    priors = Priors(
+        mean, math.radians(settings.polar_std_deg), settings.share_std, settings.drift_std, settings.multiple_std
+    )
+    if start is None:
+        starts = [level_model(readings, priors, share) for share in _SHARES]
+    else:
+        near = float(np.clip(start.share.mean(), 0.1, 0.95))
+        starts = [level_model(readings, priors, near + by, math.radians(start.polar_deg)) for by in (0.0, -0.05)]
+    found = fit_constant_albedo(readings, priors, starts)
+    return _described(found.model, unit, found.covariance, found.misfit)
+
+
+def _readings(stack, settings, relief, inside, chosen, aperture) -> tuple[Readings, np.ndarray]:
+    """Return the chosen pixels' readings, and the median reading of each image."""
     calm = [
         ndimage.median_filter(np.where(known, image, np.median(image[known])), _WINDOW)
         for image, known in zip(stack.counts, stack.is_observed, strict=True)
     ]
-    draw = np.random.default_rng(settings.seed)
-    chosen = np.asarray(draw.permutation(int(inside.sum()))[: settings.n_pixels], np.int64)
-    data = np.stack([np.asarray(image)[inside][chosen] for image in calm])
-    scale = np.median(data, axis=1)
-    azimuth, prior = np.arctan2(centers[:, 1], centers[:, 0]), math.degrees(polar.mean())
+    k, time = len(calm), scan_time(stack)
+    value, known = (np.stack([np.asarray(image).ravel()[chosen] for image in images]) for images in (calm, inside))
+    unit = np.array([np.median(v[seen]) for v, seen in zip(value, known, strict=True)])
+    when = np.zeros(value.shape) if time is None else time.reshape(k, -1)[:, chosen]
+    basis = np.polynomial.legendre.legvander(when, 0 if time is None else settings.drift_degree)
+    height = np.zeros(chosen.size) if relief is None else relief.height.ravel()[chosen]
+    multiple = np.zeros(value.shape) if relief is None else relief.multiple.reshape(k, -1)[:, chosen]
+    data = np.where(known, value / unit[:, None], 0.0)
+    return Readings(data, known.astype(float), basis, height, multiple, *aperture), unit
 
-    def cost(at: np.ndarray) -> float:
-        if not (10.0 < at[0] < 75.0 and 0.0 <= at[1] < 0.97):
-            return 1e9
-        misfit, _ = _fit(data / scale[:, None], azimuth, math.radians(at[0]), at[1])
-        return (
-            0.5 * settings.n_pixels / _TOGETHER * misfit**2 / _MODEL_ERROR**2
-            + 0.5 * ((at[0] - prior) / settings.polar_std_deg) ** 2
-        )
 
-    starts = [np.array([prior, share]) for share in (0.2, 0.5, 0.7, 0.8)]
-    start = min(starts, key=cost)
-    simplex = np.array([start, start + [4.0, 0.0], start + [0.0, 0.05]])
-    found = minimize(
-        cost,
-        start,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": 50, "xatol": 0.2, "fatol": 0.01},
+def _described(model: Model, unit: np.ndarray, covariance: np.ndarray, misfit: float) -> SelfCalibration:
+    level = model.signal + model.background[:, 0]
+    return SelfCalibration(
+        gain=unit * level,
+        share=model.background[:, 0] / level,
+        drift=model.background[:, 1:] / level[:, None],
+        polar_deg=math.degrees(model.polar),
+        spread_deg=math.degrees(math.sqrt(covariance[0, 0])),
+        multiple=model.multiple,
+        multiple_std=math.sqrt(covariance[1, 1]),
+        misfit=misfit,
     )
-    misfit, gain = _fit(data / scale[:, None], azimuth, math.radians(found.x[0]), found.x[1])
-    sides = [min(cost(found.x + [turn, by]) for by in (-0.05, -0.025, 0.0, 0.025, 0.05)) for turn in (-4.0, 4.0)]
-    curvature = max((sum(sides) - 2 * found.fun) / 16.0, 1e-4)
-    return SelfCalibration(scale / gain, float(found.x[1]), float(found.x[0]), 1 / math.sqrt(curvature), misfit)
-
-
-def _fit(data: np.ndarray, azimuth: np.ndarray, polar: float, share: float) -> tuple[float, np.ndarray]:
-    """Return the rms misfit and the factors [image] that bring images [image, pixel] to level ground = 1."""
-    tilt, turn = (
-        g.ravel()
-        for g in np.meshgrid(
-            np.radians(np.arange(0.0, _MAX_TILT, _TILT_STEP)), np.radians(np.arange(0.0, 360.0, _AZIMUTH_STEP))
-        )
-    )
-    cosine = np.cos(tilt) + np.sin(tilt) * math.tan(polar) * np.cos(azimuth[:, None] - turn)
-    model = (1.0 - share) * np.maximum(cosine, 0.0) + share
-    factor = np.ones(len(data))
-    for number in range(_ROUNDS):
-        scaled = data * factor[:, None]
-        away = (scaled[:, :, None] - model[:, None, :]) ** 2
-        best = model[:, np.argmin(np.minimum(away, _OUTLIER**2 if number > 2 else 1.0).sum(0), axis=1)]
-        weight = np.abs(scaled - best) < (_OUTLIER if number > 2 else 1.0)
-        factor = np.sum(weight * best * data, 1) / np.maximum(np.sum(weight * data**2, 1), 1e-12)
-    away = (data * factor[:, None] - best) ** 2
-    return float(np.sqrt(np.mean(np.minimum(away, _OUTLIER**2)))), factor
 
 
 def apply(
@@ -145,13 +191,12 @@ def apply(
         flat_signal: detection probability of level ground by the effective instrument [detector].
         instrument: from `effective_instrument`.
     """
-    factor = flat_signal / (found.gain * (1.0 - found.share))
-    spread = factor[:, None, None]
-    record = {"gain": found.gain.tolist(), "share": found.share, "polar_deg": found.polar_deg}
-    record |= {"polar_spread_deg": found.spread_deg, "misfit": found.misfit}
+    time = scan_time(stack)
+    scale = (flat_signal / found.signal)[:, None, None]
+    record = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in found._asdict().items()}
     return stack.replace(
-        counts=(stack.counts - (found.share * found.gain)[:, None, None]) * spread,
-        variance=None if stack.variance is None else stack.variance * spread**2,
+        counts=(stack.counts - found.background(np.zeros(stack.shape) if time is None else time)) * scale,
+        variance=None if stack.variance is None else stack.variance * scale**2,
         background=None,
         n_rays=1.0,
         unit="detected per beam atom",
@@ -161,21 +206,10 @@ def apply(
 
 
 def effective_instrument(instrument: Instrument, polar_deg: float) -> Instrument:
-    """Return the instrument with every aperture moved to a polar angle, its solid angle about kept."""
-    detectors = []
-    for detector, aperture in zip(instrument.detector, instrument.apertures(), strict=True):
-        azimuth = math.atan2(aperture.center[1], aperture.center[0])
-        radius = instrument.working_distance * math.tan(math.radians(polar_deg))
-        detectors.append(
-            detector.model_copy(
-                update={
-                    "center_um": (radius * math.cos(azimuth), radius * math.sin(azimuth)),
-                    "axes_um": (2 * aperture.semi_axes[0], 2 * aperture.semi_axes[1]),
-                    "rotation_deg": math.degrees(aperture.rotation),
-                    "polar_deg": None,
-                    "azimuth_deg": None,
-                    "half_angle_deg": None,
-                }
-            )
-        )
-    return instrument.model_copy(update={"detector": tuple(detectors)})
+    """Return the instrument with the sample so far away that it sees the apertures under a polar angle.
+
+    The plate is as it was drilled; how far away a tall sample stands is the less certain number.
+    """
+    radius = np.mean([math.hypot(*a.center) for a in instrument.apertures()])
+    distance = float(radius / math.tan(math.radians(polar_deg)))
+    return instrument.model_copy(update={"plate": instrument.plate.model_copy(update={"sample_distance_um": distance})})

@@ -115,7 +115,7 @@ def test_what_is_left_out_of_a_bump_is_an_error_bar(bshem):
     assert one[0] ** 2 > 0.98 * np.sum(one**2)
     corrected = photometric_heights(stack, settings.changed(corrections=1), SpotGeometry(bshem), hidden)
     error = corrected.height - rec.height
-    assert np.corrcoef(error[wide], rec.height_samples[0][wide])[0, 1] ** 2 > 0.8
+    assert np.corrcoef(error[wide], rec.height_samples[0][wide])[0, 1] ** 2 > 0.6
 
 
 def test_left_out_is_the_difference_of_two_renderings(bshem):

@@ -279,16 +279,17 @@ def test_picker_keeps_points():
 def test_self_calibration_finds_gains_and_background():
     """Gains of 1 to 3.4, background 75 % of the level reading, aperture at 46 deg: found from the crystal itself.
 
-    The normals' grid of 3 x 9 deg limits it. Catches a background of the dark pixels only per image, and equal gains.
+    Catches a background of the dark pixels only per image, and equal gains.
     """
     scans, true = make_scans(counts=2e5, share=0.75)
     stack = resample(scans, tuple(true), "reference")
     found = self_calibrate(stack, SelfCalibrateSettings(n_pixels=120))
-    assert found.share == pytest.approx(0.75, abs=0.04) and found.polar_deg == pytest.approx(POLAR, abs=5.0)
+    assert found.share == pytest.approx(0.75, abs=0.04)  # in each scan
+    assert found.polar_deg == pytest.approx(POLAR, abs=5.0)
     np.testing.assert_allclose(found.gain / found.gain[0], [(0.5 + 0.3 * k) / 0.5 for k in range(5)], rtol=0.03)
-    moved = effective_instrument(stack.instrument, 30.0).apertures()
-    for old, new in zip(stack.instrument.apertures(), moved, strict=True):
-        assert math.hypot(*new.center) == pytest.approx(3000.0 * math.tan(math.radians(30.0)))
-        assert math.atan2(*new.center) == pytest.approx(math.atan2(*old.center))
+    moved = effective_instrument(stack.instrument, 30.0)
+    radius = np.mean([math.hypot(*a.center) for a in stack.instrument.apertures()])
+    assert moved.apertures() == stack.instrument.apertures()  # the plate is as it was drilled
+    assert math.degrees(math.atan2(radius, moved.sample_distance)) == pytest.approx(30.0)
     with pytest.raises(GuardError, match="4 or more images"):
         self_calibrate(scans.stacks[0])
