@@ -76,7 +76,7 @@ def _rise_across(
         way: unit vector (x, y).
         pitch: dy, dx, um.
     """
-    y, x = (d * index for d, index in zip(pitch, np.indices(is_wall.shape), strict=True))
+    y, x = np.indices(is_wall.shape) * np.reshape(pitch, (2, 1, 1))
     across, level = y * way[0] - x * way[1], distance + x * way[0] + y * way[1]
 
     def mean(field: np.ndarray) -> np.ndarray:

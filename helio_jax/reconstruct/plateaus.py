@@ -7,7 +7,15 @@ that it asks for.
 """
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_dilation, gaussian_filter, label, maximum_filter, uniform_filter
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    gaussian_filter,
+    gaussian_filter1d,
+    label,
+    maximum_filter,
+    uniform_filter,
+)
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
@@ -81,7 +89,7 @@ def _structure(data: np.ndarray) -> np.ndarray:
 
     Source: Di Zenzo, CVGIP 33 (1986) 116, for several channels; averaged: Bigun and Granlund, ICCV (1987) 433.
     """
-    y, x = (gaussian_filter(data, _BLUR, axes=(1, 2), order=order) for order in ((1, 0), (0, 1)))
+    y, x = (gaussian_filter1d(gaussian_filter1d(data, _BLUR, axis, 1), _BLUR, 3 - axis) for axis in (1, 2))
     return gaussian_filter(np.stack([y * y, x * x, x * y]).sum(1), _SWEEP, axes=(1, 2))
 
 
@@ -183,7 +191,7 @@ def _straightened(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> n
             room = tuple(slice(max(i.min() - _REACH, 0), i.max() + _REACH + 1) for i in np.nonzero(inside))
             mean = _mean_within(inside[room], data[:, *room], 2 * _REACH + 1)
             misfit = uniform_filter(((data[:, *room] - mean) ** 2 / spread[:, *room]).sum(0), 3)
-            is_better = binary_dilation(inside)[room] & (misfit < best[room])
+            is_better = np.asarray(binary_dilation(inside[room]), bool) & (misfit < best[room])
             best[room] = np.where(is_better, misfit, best[room])
             nearest[room] = np.where(is_better, number, nearest[room])
         region = nearest
