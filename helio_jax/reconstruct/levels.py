@@ -62,13 +62,13 @@ def _way_out(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, f
     return distance
 
 
-def _rise_across(
+def _smooth_way_out(
     distance: np.ndarray, is_wall: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]
-) -> np.ndarray:
-    """Return how fast the way out of a region changes across that way, to its left, within a wall [y, x].
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the way out of a region, within a wall, without the steps of its border along the raster [y, x], um.
 
-    It is 0 where the beam meets the wall head-on. Local planes, which fall by the distance itself along the way, are
-    fitted to the neighbours on the wall, for the border runs in steps along the raster.
+    And how fast it changes across that way, to its left: 0 where the beam meets the wall head-on. Both are those of
+    local planes, which fall by the distance itself along the way, fitted to the neighbours on the wall.
 
     Args:
         distance: from `_way_out` [y, x], um.
@@ -86,7 +86,8 @@ def _rise_across(
     at, rise = mean(across) / n, mean(level) / n
     width = mean(across**2) / n - at**2
     common = mean(across * level) / n - at * rise
-    return np.where(width > 0.1 * min(pitch) ** 2, common / np.maximum(width, 1e-12), 0.0)
+    turn = np.where(width > 0.1 * min(pitch) ** 2, common / np.maximum(width, 1e-12), 0.0)
+    return rise + turn * (across - at) - (level - distance), turn
 
 
 def at_level(
@@ -116,9 +117,9 @@ def at_level(
         along, sign = math.hypot(*beam_shift), np.sign(level)
         x, y = (-sign * shift / along for shift in beam_shift)
         distance = _way_out(inside, (x, y), pitch)
+        is_wall = inside & (distance < abs(level) * along)
+        distance, turn = _smooth_way_out(distance, is_wall, (x, y), pitch)
         height = distance / along
-        is_wall = inside & (height < abs(level))
-        turn = _rise_across(distance, is_wall, (x, y), pitch)
         slopes = (sign * (-way + turn * aside) / along for way, aside in ((x, -y), (y, x)))
         values = ground + sign * height, *slopes
         flat = Surface(*(np.where(is_wall, wall, field) for wall, field in zip(values, flat, strict=True)))

@@ -33,6 +33,8 @@ _BLUR, _SWEEP = 1.0, 3.0
 [pixels]."""
 _SIDE = 5
 """Side of the squares of which the parts on both sides of a border are compared [pixels]."""
+_SEED = 12
+"""Smallest area without a strong change that a region may grow from [pixels]."""
 MIN_REGION = 50
 """Smallest region that is looked for [pixels]."""
 UNEXPLAINED = 2.0
@@ -157,7 +159,7 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
         for end in along(is_calm, axis):
             end &= _crests(change, axis) <= WALL
     seed = _numbered(is_calm).ravel()
-    seed[np.bincount(seed)[seed] < MIN_REGION] = 0
+    seed[np.bincount(seed)[seed] < _SEED] = 0
     inside = np.flatnonzero(seed)
     if inside.size == 0:
         return np.zeros(shape, int)
@@ -222,7 +224,7 @@ def _border_strength(first: np.ndarray, second: np.ndarray, data: np.ndarray, sp
 
 
 def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return the regions [y, x] with those merged, weakest border first, between which there is no wall.
+    """Return the regions [y, x] with those merged, weakest border first, between which there is no wall, or too small.
 
     Averages along a wall reach beyond its end, up to the image's border, and would part the ground there.
     """
@@ -233,9 +235,11 @@ def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndar
         for a, b in pairs[pairs[:, 0] != pairs[:, 1]].tolist():
             if (a, b) not in known:
                 known[a, b] = _border_strength(region == a, region == b, data, spread)
-        if not known or min(known.values()) >= 0.5 * WALL:
+        size = np.bincount(region.ravel())
+        weak = {pair: value for pair, value in known.items() if value < 0.5 * WALL or size[list(pair)].min() < MIN_REGION}
+        if not weak:
             return ranked(region.ravel()).reshape(region.shape)
-        a, b = min(known, key=known.__getitem__)
+        a, b = min(weak, key=weak.__getitem__)
         region[region == b] = a
         known = {pair: value for pair, value in known.items() if not {a, b} & set(pair)}
 
