@@ -236,7 +236,9 @@ def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndar
             if (a, b) not in known:
                 known[a, b] = _border_strength(region == a, region == b, data, spread)
         size = np.bincount(region.ravel())
-        weak = {pair: value for pair, value in known.items() if value < 0.5 * WALL or size[list(pair)].min() < MIN_REGION}
+        weak = {
+            pair: value for pair, value in known.items() if value < 0.5 * WALL or size[list(pair)].min() < MIN_REGION
+        }
         if not weak:
             return ranked(region.ravel()).reshape(region.shape)
         a, b = min(weak, key=weak.__getitem__)

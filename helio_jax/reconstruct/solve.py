@@ -188,7 +188,7 @@ def _known(fit: "Fit") -> dict[str, np.ndarray]:
 def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "tuple[Fit, np.ndarray]":
     """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit.
 
-    Return the fit, and where another level explains the images as well [y, x].
+    Return the fit, and where another level explains the images as well, or better but could not be fitted [y, x].
     """
     from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
@@ -217,12 +217,17 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
             is_undecided[left > 0] = np.isin(left, found.undecided)[left > 0]
             if found.moved:
                 is_moved = np.isin(left, found.moved)
-                levelled[is_moved] = levelled.max() + left[is_moved]
-                fit = fit_heights(*problem, found.surface, settings, predict, report, levelled, slow_axis)
+                is_undecided |= is_moved  # unless the fit goes on from there
+                trial = np.where(is_moved, levelled.max() + left, levelled)
+                fit = fit_heights(*problem, found.surface, settings, predict, report, trial, slow_axis)
+                levelled, is_undecided = trial, is_undecided & (~is_moved | np.isin(left, found.undecided))
             elif np.unique(left).size == np.unique(single).size:
                 break
         except KeyboardInterrupt:
             fit = replace(fit, status=f"interrupted in the search for plateaus; before that: {fit.status}")
+            break
+        except GuardError as e:
+            fit = replace(fit, status=f"{fit.status}; a plateau was found that could not be fitted: {e}")
             break
     return fit, is_undecided
 

@@ -1,14 +1,20 @@
 """Plateaus: found in images made up for the purpose, put to the level a made-up misfit asks for, and a real trench."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from helio_jax import pipeline
 from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
-from helio_jax.reconstruct.levels import GAIN, at_level, search_levels
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct import solve
+from helio_jax.reconstruct.levels import GAIN, Levels, at_level, search_levels
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
+from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.truth import true_height
 
 SHAPE = (40, 60)
@@ -210,6 +216,40 @@ def test_two_levels_that_explain_alike_are_undecided(worse, is_open):
     found, moved, undecided = search_levels(INSIDE.astype(int), ground, (10.0, 10.0), 500.0, misfit)
     assert moved == [1] and undecided == ([1] if is_open else [])
     assert np.median(found.height[INSIDE]) == pytest.approx(-250.0, abs=5.0)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What the search for plateaus reads of a fit: flat, the floor's data unexplained."""
+
+    surface: Surface
+    residuals: np.ndarray
+    values: Mapping[str, np.ndarray]
+    status: str = "first"
+    is_interrupted: bool = False
+
+
+def test_a_plateau_that_cannot_be_fitted_is_flagged(bshem, monkeypatch):
+    """The surface with the floor put down is too steep to go on from: the fit before it stays, the floor is undecided.
+
+    Catches an error that ends the whole reconstruction, and a floor that nobody doubts.
+    """
+    signal, variance = images([-0.5, 0.3, 0.2])
+    axis_y, axis_x = (20.0 * (np.arange(n) - 0.5 * (n - 1)) for n in SHAPE)
+    stack = MicrographStack(1e6 * signal, axis_x, axis_y, bshem, variance=1e12 * variance, n_rays=1e6)
+    start = Surface(*np.zeros((3, *SHAPE)))
+    fits = iter([_Fit(start, np.random.default_rng(1).normal(size=(3, *SHAPE)) + 3.0 * INSIDE, {})])
+
+    def fit_heights(*args, **kwargs):
+        for fit in fits:
+            return fit
+        raise GuardError("too steep")
+
+    monkeypatch.setattr("helio_jax.reconstruct.refine.fit_heights", fit_heights)
+    monkeypatch.setattr(solve, "search_levels", lambda region, surface, *args: Levels(surface, [1], []))
+    fit, is_undecided = solve._with_plateaus(stack, ReconstructSettings(), None, lambda n: None, None, start, None)
+    assert "too steep" in fit.status and fit.status.startswith("first")
+    assert np.mean(is_undecided == INSIDE) > 0.99
 
 
 @pytest.mark.slow
