@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import (
     binary_closing,
     binary_dilation,
+    find_objects,
     gaussian_filter,
     gaussian_filter1d,
     label,
@@ -206,21 +207,36 @@ def _mean_within(inside: np.ndarray, field: np.ndarray, side: int) -> np.ndarray
     return uniform_filter(inside * field, side, mode="constant", axes=(-2, -1)) / np.maximum(n, 1e-9)
 
 
-def _border_strength(first: np.ndarray, second: np.ndarray, data: np.ndarray, spread: np.ndarray) -> float:
-    """Return the change across the common border of two areas [y, x], averaged along it, each place up to `WALL`.
+def _border_strength(first: np.ndarray, second: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the change across the common border of two areas [y, x], up to `WALL`, for every pixel beside it [pixel].
 
-    Around every pixel at the border the parts of a square that lie in one and in the other area are compared, so that
-    it does not matter how the border runs, nor what is beyond its ends.
+    The parts of a square about the pixel that lie in one and in the other area are compared, so that it does not matter
+    how the border runs, nor what is beyond its ends.
     """
-    at_border = (first & binary_dilation(second)) | (second & binary_dilation(first))
-    room = tuple(slice(max(i.min() - _SIDE, 0), i.max() + _SIDE + 1) for i in np.nonzero(at_border))
+    at_border = (first & np.asarray(binary_dilation(second))) | (second & np.asarray(binary_dilation(first)))
     means, variances = [], []
-    for area in (first[room], second[room]):
+    for area in (first, second):
         n = _SIDE**2 * uniform_filter(area.astype(float), _SIDE, mode="constant")
-        means.append(_mean_within(area, data[:, *room], _SIDE))
-        variances.append(_mean_within(area, spread[:, *room], _SIDE) / np.maximum(n, 1e-9))
+        means.append(_mean_within(area, data, _SIDE))
+        variances.append(_mean_within(area, spread, _SIDE) / np.maximum(n, 1e-9))
     square = (means[1] - means[0]) ** 2 / np.maximum(variances[0] + variances[1], 1e-300)
-    return float(np.minimum(_without_strongest(square), WALL)[at_border[room]].mean())
+    return np.minimum(_without_strongest(square), WALL)[at_border]
+
+
+def _borders(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> dict[frozenset[int], np.ndarray]:
+    """Return the `_border_strength` of every two regions that touch [pixel], by their numbers."""
+    ends = [np.stack([end.ravel() for end in along(region, axis)]) for axis in (0, 1)]
+    pairs = np.unique(np.sort(np.concatenate(ends, 1), axis=0), axis=1).T
+    rooms = find_objects(region + 1)
+    found = {}
+    for a, b in pairs[pairs[:, 0] != pairs[:, 1]].tolist():
+        room = tuple(
+            slice(max(i.start, j.start, _SIDE) - _SIDE, min(i.stop, j.stop) + _SIDE)
+            for i, j in zip(rooms[a], rooms[b], strict=True)
+        )
+        part = region[room]
+        found[frozenset((a, b))] = _border_strength(part == a, part == b, data[:, *room], spread[:, *room])
+    return found
 
 
 def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -228,22 +244,19 @@ def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndar
 
     Averages along a wall reach beyond its end, up to the image's border, and would part the ground there.
     """
-    region, known = region.copy(), {}
+    border, size, into = _borders(region, data, spread), np.bincount(region.ravel()), np.arange(region.max() + 1)
     while True:
-        ends = [np.stack([end.ravel() for end in along(region, axis)]) for axis in (0, 1)]
-        pairs = np.unique(np.sort(np.concatenate(ends, 1), axis=0), axis=1).T
-        for a, b in pairs[pairs[:, 0] != pairs[:, 1]].tolist():
-            if (a, b) not in known:
-                known[a, b] = _border_strength(region == a, region == b, data, spread)
-        size = np.bincount(region.ravel())
-        weak = {
-            pair: value for pair, value in known.items() if value < 0.5 * WALL or size[list(pair)].min() < MIN_REGION
-        }
+        mean = {pair: float(found.mean()) for pair, found in border.items()}
+        weak = [pair for pair in border if mean[pair] < 0.5 * WALL or min(size[list(pair)]) < MIN_REGION]
         if not weak:
-            return ranked(region.ravel()).reshape(region.shape)
-        a, b = min(weak, key=weak.__getitem__)
-        region[region == b] = a
-        known = {pair: value for pair, value in known.items() if not {a, b} & set(pair)}
+            return ranked(into[region].ravel()).reshape(region.shape)
+        kept, gone = sorted(min(weak, key=mean.__getitem__))
+        into[into == gone] = kept
+        size[kept] += size[gone]
+        del border[frozenset((kept, gone))]
+        for pair in [pair for pair in border if gone in pair]:
+            other = pair - {gone} | {kept}
+            border[other] = np.concatenate([border.pop(pair), border.get(other, np.zeros(0))])
 
 
 def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
