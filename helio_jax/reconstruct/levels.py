@@ -28,6 +28,8 @@ _FACET = 7
 """Side of the square within which a wall is taken for plane [pixels]."""
 _LEVEL_STEPS = 8
 """Evaluations by which the best level is refined."""
+MOST = 8
+"""Regions that are searched at most, the largest: each takes about forty evaluations."""
 
 Misfit = Callable[[Surface], tuple[float, Surface]]
 """Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
@@ -137,7 +139,7 @@ def search_levels(
 ) -> Levels:
     """Return the surface with all regions at the levels that explain the images best.
 
-    A moved region starts flat; its own relief is the fit's matter.
+    A moved region starts flat; its own relief is the fit's matter. Beyond the `MOST` largest, regions are undecided.
 
     Args:
         region: number of the region of every pixel, 0: none [y, x].
@@ -149,8 +151,10 @@ def search_levels(
         report: called with what is tried next.
     """
     best, found = misfit(surface)
-    moved, undecided = [], []
-    for number in np.unique(region[region > 0]):
+    numbers, sizes = np.unique(region[region > 0], return_counts=True)
+    largest = numbers[np.argsort(-sizes, kind="stable")].tolist()
+    moved, undecided = [], largest[MOST:]
+    for number in largest[:MOST]:
         inside = region == number
         around = grown(inside) & ~inside
         ground = float(np.median(found.height[around]))
@@ -179,9 +183,9 @@ def search_levels(
         value, better = min(tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
-            moved.append(int(number))
+            moved.append(number)
         if any(_differ(found, other, inside, ground) for value, other in explanations if value < best + GAIN):
-            undecided.append(int(number))
+            undecided.append(number)
     return Levels(found, moved, undecided)
 
 

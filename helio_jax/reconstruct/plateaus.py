@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import (
     binary_closing,
     binary_dilation,
+    binary_erosion,
     find_objects,
     gaussian_filter,
     gaussian_filter1d,
@@ -260,7 +261,7 @@ def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndar
 
 
 def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Return the regions with 0 put for those whose images the fit explains [y, x].
+    """Return the regions with 0 put for those whose images the fit explains, and for thin rims [y, x].
 
     Args:
         region: from `find_plateaus` [y, x].
@@ -272,7 +273,8 @@ def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     for number in range(1, int(region.max()) + 1):
         inside = region == number
         band = grown(inside) & grown(~inside)
-        if max(square[inside].mean(), square[band].mean()) <= limit:
+        is_thin = not binary_erosion(inside, np.ones((2 * _BAND + 1,) * 2), border_value=1).any()
+        if is_thin or max(square[inside].mean(), square[band].mean()) <= limit:
             left[inside] = 0
     return left
 

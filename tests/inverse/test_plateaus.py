@@ -11,7 +11,7 @@ from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct import solve
-from helio_jax.reconstruct.levels import GAIN, Levels, at_level, search_levels
+from helio_jax.reconstruct.levels import GAIN, MOST, Levels, at_level, search_levels
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import ReconstructSettings
@@ -87,6 +87,32 @@ def test_only_unexplained_regions_are_moved():
     good = np.random.default_rng(1).normal(size=(3, *SHAPE))
     assert not unexplained(region, good).any()
     assert np.array_equal(unexplained(region, good + 2.0 * INSIDE), region)
+
+
+def test_thin_rims_are_not_searched():
+    """A rim six pixels wide that the fit explains ill stays where it is; one of eight does not."""
+    good = np.random.default_rng(1).normal(size=(3, *SHAPE))
+    for width, is_left in ((6, False), (8, True)):
+        rim = np.zeros(SHAPE, int)
+        rim[5:35, 10 : 10 + width] = 1
+        assert unexplained(rim, good + 3.0 * rim).any() == is_left
+
+
+def test_only_the_largest_regions_are_searched():
+    """Of more regions than are searched the smallest are undecided. Catches hours of search on a rough image."""
+    region = np.zeros(SHAPE, int)
+    for number in range(1, MOST + 3):
+        region[2 : 2 + 3 * number, 5 * number : 5 * number + 4] = number
+    calls = []
+
+    def misfit(surface):
+        calls.append(surface)
+        return float(np.sum((surface.height[region > 2] + 20.0) ** 2)), surface
+
+    found, moved, undecided = search_levels(region, Surface(*np.zeros((3, *SHAPE))), (10.0, 10.0), 500.0, misfit)
+    assert sorted(moved) == list(range(3, MOST + 3)) and set(undecided) >= {1, 2}
+    assert np.all(found.height[(region == 1) | (region == 2)] == 0.0)
+    assert len(calls) < 30 * MOST
 
 
 def test_regions_with_a_narrow_gap_are_one():
