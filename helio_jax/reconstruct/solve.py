@@ -7,7 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 START_THRIFT = 4
 """The same for the photometric solutions that the fit starts from, unless the image is small: it would save little."""
+
+RETREATS = 3
+"""How often a surface to start from is made calmer when nothing can be predicted of it."""
 
 GEOMETRY_DOUBT = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
@@ -163,6 +166,16 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     return Surface(limited(_level(height, settings, weight), stack), a, b)
 
 
+def _retreating(work: Callable[[Surface], Any], surface: Surface, calmer: Surface) -> Any:
+    """Return what is made of a surface; while it is too rough to predict anything of, go half-way to a calmer one."""
+    for _ in range(RETREATS):
+        try:
+            return work(surface)
+        except GuardError:
+            surface = Surface(*(0.5 * (rough + calm) for rough, calm in zip(surface, calmer, strict=True)))
+    return work(surface)
+
+
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     """Return by how many per cent the highest point moves per per cent of signal of each gain and offset.
 
@@ -185,8 +198,10 @@ def _known(fit: "Fit") -> dict[str, np.ndarray]:
     return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
 
 
-def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "tuple[Fit, np.ndarray]":
-    """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit.
+def _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict) -> "tuple[Fit, np.ndarray]":
+    """Fit the heights, from a start or one nearer to a calmer surface, then those of plateaus that stay unexplained.
+
+    They are put to better levels, at first those that touch as one, and all is fitted again.
 
     Return the fit, and where another level explains the images as well, or better but could not be fitted [y, x].
     """
@@ -195,7 +210,9 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
     slow_axis = 0 if stack.fast_axis == "x" else 1
-    fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
+    fit = _retreating(
+        lambda surface: fit_heights(*problem, surface, settings, predict, report, slow_axis=slow_axis), start, calmer
+    )
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     is_undecided = np.zeros(stack.shape[1:], bool)
     roughly = make_predict(max(settings.refine.paths(region.size) // SEARCH_THRIFT, 1000))
@@ -240,10 +257,18 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     n_paths, shift = settings.refine.paths(stack.counts[0].size), stack.instrument.beam_shift
     predict, roughly = make_predict(n_paths), make_predict(min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS)))
     height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
-    start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
+
+    def correct(surface: Surface) -> Surface:
+        return _corrected(stack, settings, geometry, surface.height, surface.normals(shift), roughly)
+
+    calmer = Surface(*np.zeros((3, *height.shape)))
+    try:
+        start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
+    except GuardError:
+        start = correct(calmer)
     for _ in range(settings.refine.photometric_rounds - 1):
-        start = _corrected(stack, settings, geometry, start.height, start.normals(shift), roughly)
-    fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+        start, calmer = _retreating(correct, start, calmer), start
+    fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict)
     from helio_jax.reconstruct.findings import describe_instrument
 
     posterior = fit.posterior

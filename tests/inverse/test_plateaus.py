@@ -273,7 +273,9 @@ def test_a_plateau_that_cannot_be_fitted_is_flagged(bshem, monkeypatch):
 
     monkeypatch.setattr("helio_jax.reconstruct.refine.fit_heights", fit_heights)
     monkeypatch.setattr(solve, "search_levels", lambda region, surface, *args: Levels(surface, [1], []))
-    fit, is_undecided = solve._with_plateaus(stack, ReconstructSettings(), None, lambda n: None, None, start, None)
+    fit, is_undecided = solve._with_plateaus(
+        stack, ReconstructSettings(), None, lambda n: None, None, start, start, None
+    )
     assert "too steep" in fit.status and fit.status.startswith("first")
     assert np.mean(is_undecided == INSIDE) > 0.99
 
