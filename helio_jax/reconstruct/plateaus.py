@@ -141,7 +141,8 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return the number of every pixel's region [y, x], 0 being the largest: the ground.
 
     Seeds are the connected areas without a strong change; they grow by a minimum spanning forest over the edges, so
-    that their borders lie on the strongest edges between them.
+    that their borders lie on the strongest edges between them. Then regions without a wall between them are merged, and
+    borders are straightened.
 
     Args:
         signal, variance: data [detector, y, x]; NaN where not observed.

@@ -166,14 +166,14 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     return Surface(limited(_level(height, settings, weight), stack), a, b)
 
 
-def _retreating(work: Callable[[Surface], Any], surface: Surface, calmer: Surface) -> Any:
-    """Return what is made of a surface; while it is too rough to predict anything of, go half-way to a calmer one."""
+def _retreating(work: Callable[[Surface], Any], surface: Surface, calmer: Surface) -> tuple[Any, Surface]:
+    """Return what is made of a surface, and that surface: half-way to a calmer one while nothing is predicted of it."""
     for _ in range(RETREATS):
         try:
-            return work(surface)
+            return work(surface), surface
         except GuardError:
             surface = Surface(*(0.5 * (rough + calm) for rough, calm in zip(surface, calmer, strict=True)))
-    return work(surface)
+    return work(surface), surface
 
 
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
@@ -210,7 +210,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, calme
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
     slow_axis = 0 if stack.fast_axis == "x" else 1
-    fit = _retreating(
+    fit, _ = _retreating(
         lambda surface: fit_heights(*problem, surface, settings, predict, report, slow_axis=slow_axis), start, calmer
     )
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
@@ -267,7 +267,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     except GuardError:
         start = correct(calmer)
     for _ in range(settings.refine.photometric_rounds - 1):
-        start, calmer = _retreating(correct, start, calmer), start
+        start, calmer = _retreating(correct, start, calmer)
     fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict)
     from helio_jax.reconstruct.findings import describe_instrument
 

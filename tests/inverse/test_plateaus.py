@@ -67,6 +67,14 @@ def test_a_mask_is_no_plateau():
     assert find_plateaus(*images([-0.7, 0.0, 0.0])).max() == 0
 
 
+def test_a_spot_is_no_plateau():
+    """42 pixels that two detectors see change. Rejects a search of levels for every grain."""
+    rng = np.random.default_rng(0)
+    signal = 1.0 + 0.04 * rng.normal(size=(3, *SHAPE))
+    signal[:, 15:21, 30:37] += np.array([-0.5, 0.3, 0.2])[:, None, None]
+    assert find_plateaus(signal, np.full(signal.shape, 0.04**2)).max() == 0
+
+
 def test_noise_and_tilted_planes_have_no_plateaus():
     for seed in range(20):
         signal, variance = images([0.0, 0.0, 0.0], seed)
@@ -278,6 +286,21 @@ def test_a_plateau_that_cannot_be_fitted_is_flagged(bshem, monkeypatch):
     )
     assert "too steep" in fit.status and fit.status.startswith("first")
     assert np.mean(is_undecided == INSIDE) > 0.99
+
+
+def test_a_start_too_rough_to_predict_is_calmed():
+    """Half-way to the calmer surface as often as needed, three times at most; then the error is the caller's."""
+
+    def work(surface, limit):
+        if surface.height.max() > limit:
+            raise GuardError("too rough")
+        return surface.height.max()
+
+    rough, calm = (Surface(*np.full((3, *SHAPE), value)) for value in (9.0, 1.0))
+    found, surface = solve._retreating(lambda surface: work(surface, 4.0), rough, calm)
+    assert found == surface.height.max() == 3.0
+    with pytest.raises(GuardError):
+        solve._retreating(lambda surface: work(surface, 1.5), rough, calm)
 
 
 @pytest.mark.slow
