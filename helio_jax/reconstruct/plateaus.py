@@ -262,7 +262,7 @@ def _merged(region: np.ndarray, data: np.ndarray, spread: np.ndarray) -> np.ndar
 
 
 def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Return the regions with 0 put for those whose images the fit explains, and for thin rims [y, x].
+    """Return the regions with 0 put for those whose images the fit explains, and for what makes but thin rims [y, x].
 
     Args:
         region: from `find_plateaus` [y, x].
@@ -274,10 +274,11 @@ def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
     for number in range(1, int(region.max()) + 1):
         inside = region == number
         band = grown(inside) & grown(~inside)
-        is_thin = not binary_erosion(inside, np.ones((2 * _BAND + 1,) * 2), border_value=1).any()
-        if is_thin or max(square[inside].mean(), square[band].mean()) <= limit:
+        if max(square[inside].mean(), square[band].mean()) <= limit:
             left[inside] = 0
-    return left
+    whole = joined(left)
+    is_thick = np.asarray(binary_erosion(whole > 0, np.ones((2 * _BAND + 1,) * 2), border_value=1), bool)
+    return np.where(np.isin(whole, whole[is_thick]), left, 0)
 
 
 def joined(region: np.ndarray) -> np.ndarray:

@@ -98,12 +98,13 @@ def test_only_unexplained_regions_are_moved():
 
 
 def test_thin_rims_are_not_searched():
-    """A rim six pixels wide that the fit explains ill stays where it is; one of eight does not."""
+    """A rim six pixels wide that the fit explains ill stays where it is; one of eight does not, nor do two together."""
     good = np.random.default_rng(1).normal(size=(3, *SHAPE))
-    for width, is_left in ((6, False), (8, True)):
+    for width, second, is_left in ((6, 0, False), (8, 0, True), (5, 5, True)):
         rim = np.zeros(SHAPE, int)
         rim[5:35, 10 : 10 + width] = 1
-        assert unexplained(rim, good + 3.0 * rim).any() == is_left
+        rim[5:35, 10 + width : 10 + width + second] = 2
+        assert unexplained(rim, good + 3.0 * (rim > 0)).any() == is_left
 
 
 def test_only_the_largest_regions_are_searched():
