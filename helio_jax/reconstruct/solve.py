@@ -22,7 +22,16 @@ from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
-from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
+from helio_jax.reconstruct.validity import (
+    TRUSTED,
+    depth_jumps,
+    floating,
+    ill_explained,
+    reasons_from_data,
+    reasons_from_fit,
+    regions,
+    telling,
+)
 from helio_jax.reconstruction import Reconstruction
 
 MAX_WIDTH = 0.125
@@ -284,7 +293,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     )
     is_moved = bool(fit.values["aim"].size or fit.values["distance"].size)
     n_telling = telling(fit.model_share, stack.is_observed)
-    reason = reasons_from_fit(reasons_from_data(stack), worst, n_telling, *jumps, is_floating)
+    is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
+    reason = reasons_from_fit(reasons_from_data(stack), is_explained, n_telling, *jumps, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,
