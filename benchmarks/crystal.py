@@ -142,7 +142,7 @@ def calibrated(known: Recorded, stage: str, method: str) -> MicrographStack:
     motions = find_motions(known.scans).motions if stage == "full" else known.motions
     stack = resample(known.scans, motions, "reference")
     if stage in ("full", "motions"):
-        return pipeline.calibrate_turned(stack, keeps_multiple=method == "refine")
+        return pipeline.calibrate_turned(stack, keeps_multiple=method != "linear")
     polar = math.degrees(math.atan2(3120.0, 3000.0))
     found = SelfCalibration(np.array(GAINS), SHARE, polar, 0.0, 0.0)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
@@ -226,7 +226,7 @@ def measured(shared: Path, method: str) -> MicrographStack:
     instrument = load_instrument(INSTRUMENT)
     scans = MicrographSet(tuple(import_micrographs(shared / "data" / f"{name}.mat", instrument) for name in SCANS))
     found = find_motions(scans, read_points(POINTS))
-    return pipeline.calibrate_turned(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
+    return pipeline.calibrate_turned(resample(scans, found.motions, "reference"), keeps_multiple=method != "linear")
 
 
 def main() -> None:

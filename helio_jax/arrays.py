@@ -13,6 +13,8 @@
 tests/unit/test_conventions.py pins each sentence.
 """
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -55,6 +57,22 @@ def check_axis(name: str, values: np.ndarray, error: type[HelioError]) -> None:
 def pitch(axis: np.ndarray) -> float:
     """Return the step of a regular axis [um]; 1 um for a single position."""
     return float((axis[-1] - axis[0]) / (axis.size - 1)) if axis.size > 1 else 1.0
+
+
+def as_json(value: Any) -> Any:
+    """Return nested mappings, sequences and arrays as JSON values; numbers that are not finite are None: not known."""
+    if isinstance(value, Mapping):
+        return {key: as_json(v) for key, v in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return as_json(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [as_json(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def undirected_deg(line: np.ndarray) -> float:
+    """Return the angle of a line along a vector (x, y) from +x, counter-clockwise, -90 (included) to 90 [deg]."""
+    return (math.degrees(math.atan2(line[1], line[0])) + 90.0) % 180.0 - 90.0
 
 
 def border_mask(shape: tuple[int, int], fraction: float) -> np.ndarray:

@@ -157,7 +157,7 @@ def _height(stack: MicrographStack, fit: Agreement, images: Images, lacking: np.
         counts=signal, variance=variance, background=None, n_rays=1.0, unit="detected per beam atom",
         instrument=images.instrument,
     )  # fmt: skip
-    rec = pipeline.reconstruct(clean, "nearfield", settings=scene.reconstruct)
+    rec = pipeline.reconstruct(clean, "nearfield", settings=scene.reconstruct, samples=0)
     away = np.abs(images.height - np.median(images.height))
     return float(np.median(rec.height[away >= np.quantile(away, TOP)]) - np.median(rec.height))
 

@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from helio_jax import pipeline
+from helio_jax.arrays import as_json
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
@@ -170,14 +171,13 @@ class Ranking:
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible record: what the winner is, how sure, and the best few."""
         instrument = self.stack.instrument
-        finite = lambda v: v if math.isfinite(v) else None  # noqa: E731
         best = [
-            {"quick": finite(e.quick), "full": finite(e.full), "ties": [c.as_dict(instrument) for c in e.ties]}
+            {"quick": e.quick, "full": e.full, "ties": [c.as_dict(instrument) for c in e.ties]}
             for e in self.entries[:6]
         ]
-        about = {"margin": finite(self.margin), "limit": self.limit, "problems": list(self.problems)}
+        about = {"margin": self.margin, "limit": self.limit, "problems": list(self.problems)}
         about |= {"notes": list(self.notes), "settings": self.settings.model_dump(mode="json")}
-        return {**self.winner.as_dict(instrument), **about, "best": best}
+        return as_json({**self.winner.as_dict(instrument), **about, "best": best})
 
     def applied(self) -> MicrographStack:
         """Return the stack put right, with this record in `provenance["orient"]`.

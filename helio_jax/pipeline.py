@@ -256,8 +256,8 @@ def reconstruct(
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()
     if one.noise == "measured" and one.n_rays is None:
-        is_fit = wanted.get("method", settings.method) == "refine"
-        one = calibrate_turned(one, keeps_multiple=is_fit) if "align" in one.provenance else calibrate(one)
+        keeps = settings.changed(**wanted).predicts
+        one = calibrate_turned(one, keeps_multiple=keeps) if "align" in one.provenance else calibrate(one)
     chosen = settings.changed(**_with_priors(settings, one, wanted))
     refine = chosen.refine
 

@@ -28,7 +28,7 @@ from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
-from helio_jax.trace.settings import TraceSettings
+from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 
 UNSEEN_SHARES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
 """Where the unseen side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
@@ -97,7 +97,7 @@ def make_predictor(
             return Prediction(radiosity(height, normals), hidden, response)
         calm, calm_normals = _without_noise(height, normals, CALM_PITCHES * min(dx, dy))
         sides = raster.sides(calm, calm_normals)
-        branches = max(1, round(n_rays / height.size / RAYS / len(sides)))
+        branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes = passes_for(RAYS * branches, SMOOTH_PATHS)
         traced = [smooth_along_surface(side.multiple(settings), calm_normals, passes) for side in sides]
@@ -196,5 +196,5 @@ class _Raster:
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
         """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0)[0], at[0])
+        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0), at)
         return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array, check_axis
+from helio_jax.arrays import as_float_array, check_axis, pitch
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 
@@ -116,6 +116,16 @@ class Reconstruction:
         """Sample-frame y of every surface point [y, x], um."""
         _, ty = self.instrument.beam_shift
         return self.raster_y[:, None] - self.height * ty
+
+    @property
+    def has_relief(self) -> np.ndarray:
+        """True where heights mean something beside one another: valid, or floating together [y, x]."""
+        return self.is_valid | (self.reason == REASONS.index("floating"))
+
+    def beam_positions(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the beam positions (x, y) [n, 2], um, of places in pixels (column, row) [n, 2]."""
+        first, step = zip(*((axis[0], pitch(axis)) for axis in (self.raster_x, self.raster_y)), strict=True)
+        return np.array(first) + pixels * step
 
     def replace(self, **changes: Any) -> "Reconstruction":
         """Return a copy with some fields changed (and checked again)."""

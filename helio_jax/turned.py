@@ -15,8 +15,9 @@ from helio_jax.predict import make_predictor
 from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrument, self_calibrate
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration
 from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.photometric import limited
 from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.solve import limited, reconstruct_stack
+from helio_jax.reconstruct.solve import reconstruct_stack
 
 _GROUND = 0.05
 """Quantile of the border's heights that is taken for level ground."""
@@ -35,7 +36,7 @@ def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> 
 
     Args:
         stack: aligned readings.
-        keeps_multiple: leave multiple scattering in the result, for a method that predicts it itself (`refine`).
+        keeps_multiple: leave multiple scattering in the result, for a method that predicts it itself.
     """
     first = _in_beam_units(stack, self_calibrate(stack))
     try:
@@ -46,7 +47,8 @@ def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> 
     scale = np.asarray(reading["gain"]) * (1.0 - reading["share"]) / flat_signal(first.instrument)
     without = stack.replace(counts=stack.counts - scale[:, None, None] * multiple)
     found = self_calibrate(without)
-    return _noted(_in_beam_units(stack if keeps_multiple else without, found), "multiple scattering predicted once")
+    calibrated = _in_beam_units(stack if keeps_multiple else without, found)
+    return _noted(calibrated, "multiple scattering predicted once", without_multiple=not keeps_multiple)
 
 
 def _in_beam_units(stack: MicrographStack, found: SelfCalibration) -> MicrographStack:
@@ -54,9 +56,9 @@ def _in_beam_units(stack: MicrographStack, found: SelfCalibration) -> Micrograph
     return apply_calibration(stack, found, flat_signal(instrument), instrument)
 
 
-def _noted(stack: MicrographStack, note: str) -> MicrographStack:
+def _noted(stack: MicrographStack, note: str, *, without_multiple: bool = False) -> MicrographStack:
     """Return a self-calibrated stack whose record says how multiple scattering was dealt with."""
-    record = stack.provenance["self_calibrate"] | {"multiple": note}
+    record = stack.provenance["self_calibrate"] | {"multiple": note, "without_multiple": without_multiple}
     return stack.replace(provenance={**stack.provenance, "self_calibrate": record})
 
 

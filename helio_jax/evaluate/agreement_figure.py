@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from helio_jax.evaluate.agreement import Agreement
-from helio_jax.evaluate.figures import COUNT_MAP, ERROR_MAP, save_figure
+from helio_jax.evaluate.figures import COUNT_MAP, ERROR_MAP, raster_style, save_figure
 from helio_jax.micrograph import MicrographStack
 
 RESIDUAL_LIMIT = 6.0
@@ -27,13 +27,13 @@ def save_agreement(stack: MicrographStack, found: Agreement, contrast: Mapping[s
     n = stack.shape[0]
     fig = Figure(figsize=(14.0, 3.3 * n + 0.8), layout="constrained")
     grid = fig.subplots(n, 4, squeeze=False, width_ratios=[1, 1, 1, 0.8])
-    extent = (stack.x[0], stack.x[-1], stack.y[0], stack.y[-1])
+    style = raster_style(stack.x, stack.y)
     for k, axes in enumerate(grid):
         low, high = np.nanpercentile(np.where(stack.is_observed[k], stack.counts[k], np.nan), (0.2, 99.8))
         pictures = (stack.counts[k], COUNT_MAP, low, high), (found.model[k], COUNT_MAP, low, high)
         pictures += ((found.residuals[k], ERROR_MAP, -RESIDUAL_LIMIT, RESIDUAL_LIMIT),)
         for ax, (image, colors, lo, hi) in zip(axes, pictures, strict=False):
-            drawn = ax.imshow(image, origin="lower", extent=extent, cmap=colors, vmin=lo, vmax=hi)
+            drawn = ax.imshow(image, cmap=colors, vmin=lo, vmax=hi, **style)
             fig.colorbar(drawn, ax=ax, shrink=0.8)
         causes = "\n".join(f"{name}: {100 * values[k]:.1f} %" for name, values in contrast.items())
         axes[0].set_title(f"{found.detectors[k]}: measured [{stack.unit}]")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from helio_jax.evaluate.figures import observed_counts, robust_range, save_figure
+from helio_jax.evaluate.figures import observed_counts, raster_style, robust_range, save_figure
 from helio_jax.micrograph import MicrographStack
 
 
@@ -22,7 +22,7 @@ def save_before_after(before: MicrographStack, after: MicrographStack, path: Pat
     read, left = observed_counts(before), observed_counts(after)
     fig = Figure(figsize=(15.0, 3.7 * len(read)), layout="constrained")
     axes = fig.subplots(len(read), 4, squeeze=False)
-    extent = (before.x[0], before.x[-1], before.y[0], before.y[-1])
+    style = raster_style(before.x, before.y)
     slow = 1 if before.fast_axis == "x" else 2
     for k, row in enumerate(axes):
         name = before.instrument.detector[k].name
@@ -31,9 +31,7 @@ def save_before_after(before: MicrographStack, after: MicrographStack, path: Pat
         titles = f"{name}: as read (counts)", "taken off (counts)", "left (flat's signal = 1)"
         for ax, image, title in zip(row, (read[k], taken, left[k] * record["gain"][k] / flat), titles, strict=False):
             low, high = robust_range(image)
-            shown = ax.imshow(
-                np.ma.masked_invalid(image), origin="lower", extent=extent, vmin=low, vmax=high, cmap="gray"
-            )
+            shown = ax.imshow(np.ma.masked_invalid(image), vmin=low, vmax=high, cmap="gray", **style)
             fig.colorbar(shown, ax=ax, shrink=0.8)
             ax.set_title(title, fontsize=10, loc="left")
         width = max(1, round(record["settings"]["border_fraction"] * read.shape[3 - slow]))

@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from helio_jax.arrays import pitch
 from helio_jax.evaluate.cracks import Cracks
-from helio_jax.evaluate.figures import robust_range
+from helio_jax.evaluate.figures import raster_style, robust_range
 from helio_jax.evaluate.lines import contrast_of
 from helio_jax.evaluate.walls import Walls
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +21,6 @@ _RANGE = 0.2
 """Signal over the flat's, minus 1, at which grey ends."""
 _COLORS = {"slit": "#ee3377", "groove": "#ee7733", "crease": "#33bbee", "step": "#009988", "line": "#ddcc00"}
 _DETERMINED, _OPEN = "#44dd44", "#ff9900"
-_FLOATING = REASONS.index("floating")
 
 
 def crack_panel(
@@ -45,17 +43,12 @@ def crack_panel(
     from matplotlib.lines import Line2D
 
     x, y = rec.raster_x, rec.raster_y
-    half = 0.5 * pitch(x), 0.5 * pitch(y)
-    style = {
-        "origin": "lower",
-        "interpolation": "nearest",
-        "extent": (x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1]),
-    }
+    style = raster_style(x, y)
     images = {} if stack is None else dict(zip(stack.instrument.detector_names, contrast_of(stack).values, strict=True))
     figure = Figure(figsize=((len(images) + 1) * _INCH, 2.1 * _INCH), facecolor="white", layout="constrained")
     axes = figure.subplots(2, len(images) + 1, squeeze=False, sharex=True, sharey=True)
     inside = np.any(regions, axis=0)
-    shown = np.ma.masked_array(rec.height, ~(rec.is_valid | (rec.reason == _FLOATING)))
+    shown = np.ma.masked_array(rec.height, ~(rec.has_relief))
     low, high = robust_range(shown.compressed(), 1.0)
     for row in axes:
         for ax, (name, image) in zip(row, images.items(), strict=False):

@@ -19,7 +19,7 @@ from helio_jax.evaluate.groove_depth import HeightProfile
 from helio_jax.evaluate.line_paths import Path
 from helio_jax.evaluate.lines import Contrast, LineSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 
 _SURE = 3.0
 """Deviations from which on a kink is sure, and a groove's two flanks are."""
@@ -59,17 +59,13 @@ def _across(path: Path, shape: tuple[int, ...], reach: float) -> tuple[np.ndarra
 
     Pixels beyond its ends are left out.
     """
-    steps = np.r_[0.0, np.cumsum(np.hypot(*np.diff(path.points, axis=0).T))]
-    at = np.linspace(0.0, steps[-1], max(int(10 * steps[-1]), 8))
-    fine = np.stack([np.interp(at, steps, c) for c in path.points.T], -1)
+    at, fine = path.sampled(max(int(10 * path.length), 8))
     y, x = np.mgrid[: shape[0], : shape[1]]
-    away, nearest = cKDTree(fine).query(np.stack([x.ravel(), y.ravel()], -1), distance_upper_bound=reach + 1.0)
-    tangent = np.gradient(fine, axis=0)
-    tangent /= np.hypot(*tangent.T)[:, None]
-    use = np.isfinite(away) & (nearest > 0) & (nearest < len(fine) - 1)
+    away, nearest = cKDTree(fine.points).query(np.stack([x.ravel(), y.ravel()], -1), distance_upper_bound=reach + 1.0)
+    use = np.isfinite(away) & (nearest > 0) & (nearest < at.size - 1)
     pixel, near = np.flatnonzero(use), nearest[use]
-    normal = np.stack([-tangent[near, 1], tangent[near, 0]], -1)
-    offset = np.stack([x.ravel()[pixel], y.ravel()[pixel]], -1) - fine[near]
+    normal = fine.normals[near]
+    offset = np.stack([x.ravel()[pixel], y.ravel()[pixel]], -1) - fine.points[near]
     t = np.sum(offset * normal, -1)
     close = np.abs(t) <= reach
     rows, columns = np.unravel_index(pixel[close], shape)
@@ -334,7 +330,7 @@ def _measure_kink(
     rows, columns, t, along, _ = _across(path, rec.height.shape, s.flank_px)
     n_pieces = max(1, round(path.length / s.piece_px))
     piece = np.minimum((along / path.length * n_pieces).astype(int), n_pieces - 1)
-    known = ((rec.is_valid | (rec.reason == REASONS.index("floating"))) & np.isfinite(rec.height))[rows, columns]
+    known = (rec.has_relief & np.isfinite(rec.height))[rows, columns]
     pieces = [
         HeightProfile.of(rec, rows[use], columns[use], t[use], s.flank_px)
         for use in ((piece == i) & known for i in range(n_pieces))

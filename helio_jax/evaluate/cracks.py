@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_json, pitch, undirected_deg
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.crack_profiles import CrackSettings, measure_line
 from helio_jax.evaluate.line_paths import Path, trace_lines
@@ -90,12 +90,7 @@ class Crack:
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible record; what is not known is None."""
-        plain = lambda v: None if isinstance(v, float) and not math.isfinite(v) else v  # noqa: E731
-        record = vars(self) | {"points": np.round(self.points, 1).tolist()}
-        return {
-            key: [plain(v) for v in value] if isinstance(value, tuple) else plain(value)
-            for key, value in record.items()
-        }
+        return as_json(vars(self) | {"points": np.round(self.points, 1)})
 
 
 @dataclass(frozen=True)
@@ -202,11 +197,8 @@ def _without_doubles(cracks: list[Crack], near: float) -> list[Crack]:
 
 def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, seen: dict[str, Any]) -> Crack:
     """Return a crack from its path [pixels] and what was measured across it."""
-    step = pitch(rec.raster_x)
-    points = np.array([rec.raster_x[0], rec.raster_y[0]]) + step * seen.pop("points")
-    chord = points[-1] - points[0]
-    direction = math.degrees(math.atan2(chord[1], chord[0]))
-    direction = (direction + 90.0) % 180.0 - 90.0
+    points = rec.beam_positions(seen.pop("points"))
+    direction = undirected_deg(points[-1] - points[0])
     unknown: dict[str, Any] = {
         "width_um": math.nan,
         "width_std_um": math.nan,

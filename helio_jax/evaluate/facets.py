@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_json, pitch
 from helio_jax.errors import GuardError
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.settings import Settings
@@ -105,13 +105,7 @@ class Facets:
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible record; unknown numbers are None."""
-        rows = {"facets": [vars(f) for f in self.facets], "edges": [vars(e) for e in self.edges]}
-        return {
-            key: [
-                {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in items
-            ]
-            for key, items in rows.items()
-        }
+        return as_json({"facets": [vars(f) for f in self.facets], "edges": [vars(e) for e in self.edges]})
 
 
 def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) -> Facets:

@@ -118,6 +118,13 @@ def profile_band(
     return tuple(np.concatenate([low[k][use], high[k][use][::-1]]) for k in (0, 1))  # type: ignore[return-value]
 
 
+def raster_style(x: np.ndarray, y: np.ndarray) -> dict[str, Any]:
+    """Return how `imshow` draws pixels [y, x] about their beam positions, um, unsmoothed, y upwards."""
+    half_x, half_y = 0.5 * pitch(x), 0.5 * pitch(y)
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    return {"origin": "lower", "interpolation": "nearest", "extent": extent}
+
+
 def _label_axes(ax: "Axes", title: str, xlabel: str, ylabel: str) -> None:
     ax.set_title(title, fontsize=10, loc="left")
     ax.set_xlabel(xlabel, fontsize=8.5)
@@ -129,17 +136,14 @@ def _draw_map(ax: "Axes", x: np.ndarray, y: np.ndarray, image: np.ndarray, title
     """Draw one image [y, x] over its beam positions, to scale, with a colour bar; missing pixels in pink."""
     from matplotlib import colormaps
 
-    half_x, half_y = 0.5 * pitch(x), 0.5 * pitch(y)
     low, high = style.get("limits") or robust_range(image)
     shown = ax.imshow(
         np.ma.masked_invalid(image),
-        origin="lower",
-        extent=(x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y),
         cmap=colormaps[style.get("cmap", COUNT_MAP)].with_extremes(bad=_MISSING),
         vmin=low,
         vmax=high,
-        interpolation="nearest",
         aspect="equal",
+        **raster_style(x, y),
     )
     finite = image[np.isfinite(image)]
     below, above = (finite.min() < low, finite.max() > high) if finite.size else (False, False)
@@ -207,12 +211,10 @@ def _draw_validity(ax: "Axes", rec: Reconstruction) -> None:
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    x, y = rec.raster_x, rec.raster_y
-    half_x, half_y = 0.5 * pitch(x), 0.5 * pitch(y)
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    style = raster_style(rec.raster_x, rec.raster_y)
     colors = ListedColormap(list(REASON_COLORS))
     low, high = -0.5, len(REASONS) - 0.5
-    ax.imshow(rec.reason, origin="lower", extent=extent, cmap=colors, interpolation="nearest", vmin=low, vmax=high)
+    ax.imshow(rec.reason, cmap=colors, vmin=low, vmax=high, **style)
     share = [float(np.mean(rec.reason == k)) for k in range(len(REASONS))]
     keys = [
         Patch(

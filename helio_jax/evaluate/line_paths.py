@@ -48,6 +48,18 @@ class Path:
         tangent = np.gradient(self.points, axis=0)
         return tangent / np.hypot(*tangent.T)[:, None]
 
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normals, to the left [n, 2]."""
+        tangent = self.tangents
+        return np.stack([-tangent[:, 1], tangent[:, 0]], -1)
+
+    def sampled(self, n: int, start: float = 0.0, end: float | None = None) -> tuple[np.ndarray, "Path"]:
+        """Return n places along the path in equal steps [pixels], and the path through the points there."""
+        places = self.places
+        at = np.linspace(start, places[-1] if end is None else end, n)
+        return at, Path(np.stack([np.interp(at, places, c) for c in self.points.T], -1), self.score)
+
     def extended(self, by: float) -> "Path":
         """Return the path with both ends continued straight on, in the directions of the last few pixels."""
         n = min(len(self.points) - 1, 5)
@@ -58,13 +70,12 @@ class Path:
 
     def between(self, start: float, end: float) -> "Path":
         """Return the piece between two places along the path [pixels], with points about a pixel apart."""
-        at = np.linspace(start, end, max(round(end - start), 2) + 1)
-        return Path(np.stack([np.interp(at, self.places, c) for c in self.points.T], -1), self.score)
+        return self.sampled(max(round(end - start), 2) + 1, start, end)[1]
 
     def within(self, inside: np.ndarray) -> "Path":
         """Return the piece about the middle whose pixels are all inside [y, x]."""
-        at = np.linspace(0.0, self.length, max(round(4.0 * self.length), 8))
-        x, y = (np.round(np.interp(at, self.places, c)).astype(int) for c in self.points.T)
+        at, fine = self.sampled(max(round(4.0 * self.length), 8))
+        x, y = np.round(fine.points.T).astype(int)
         on = (x >= 0) & (y >= 0) & (x < inside.shape[1]) & (y < inside.shape[0])
         on[on] = inside[y[on], x[on]]
         off, middle = np.flatnonzero(~on), at.size // 2
@@ -74,8 +85,7 @@ class Path:
 
     def moved(self, aside: float) -> "Path":
         """Return the path moved along its normals, to the left."""
-        tangent = self.tangents
-        return Path(self.points + aside * np.stack([-tangent[:, 1], tangent[:, 0]], -1), self.score)
+        return Path(self.points + aside * self.normals, self.score)
 
 
 def trace_lines(found: Found, s: LineSettings) -> list[Path]:

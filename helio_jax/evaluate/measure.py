@@ -1,11 +1,11 @@
 """What `helio measure` answers: facets, profile, step, roughness, ripple, cracks, edges, as JSON and lines of text."""
 
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from helio_jax.arrays import as_json
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.crack_figure import crack_panel
 from helio_jax.evaluate.crack_text import crack_lines, wall_lines
@@ -91,11 +91,9 @@ def measure_height_map(
     if wanted.profile:
         line = measure_profile(rec, wanted.profile[:2], wanted.profile[2:])
         found["profile"] = {
-            "distance_um": line.distance.tolist(),
-            "height_um": [None if math.isnan(h) else h for h in line.height],
-            "height_std_um": None
-            if line.height_std is None
-            else [None if math.isnan(h) else h for h in line.height_std],
+            "distance_um": line.distance,
+            "height_um": line.height,
+            "height_std_um": line.height_std,
         }
         if wanted.step:
             step = measure_step(line)
@@ -105,7 +103,7 @@ def measure_height_map(
             lines += [f"{d:10.2f} {h:10.3f}" for d, h in zip(line.distance, line.height, strict=True)]
     if wanted.roughness:
         numbers = vars(measure_roughness(rec, np.any(regions, axis=0) if regions else None))
-        found["roughness"] = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in numbers.items()}
+        found["roughness"] = numbers
         units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
         lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
     if wanted.ripple:
@@ -125,7 +123,7 @@ def measure_height_map(
             lines += wall_lines(walls)
         if figure:
             save_figure(crack_panel(rec, whole, stack, cracks, walls), figure)
-    return found, lines
+    return as_json(found), lines
 
 
 def _ripple(

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from helio_jax.arrays import pitch
-from helio_jax.evaluate.figures import robust_range, save_figure
+from helio_jax.evaluate.figures import raster_style, robust_range, save_figure
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -48,14 +47,13 @@ def overlay_panel(stack: MicrographStack, places: Mapping[str, tuple[float, floa
     total, count = np.where(known, edges, 0.0).sum(0), known.sum(0)
     rows = -(-(n + 1) // _COLUMNS)
     figure = Figure(figsize=(_COLUMNS * _INCH, rows * _INCH), facecolor="white", layout="constrained")
-    half_x, half_y = 0.5 * pitch(stack.x), 0.5 * pitch(stack.y)
-    extent = (stack.x[0] - half_x, stack.x[-1] + half_x, stack.y[0] - half_y, stack.y[-1] + half_y)
+    style = raster_style(stack.x, stack.y)
     for k, name in enumerate(stack.instrument.detector_names):
         ax = figure.add_subplot(rows, _COLUMNS, k + 1)
         values = stack.counts[k][stack.is_observed[k]]
         low, high = np.percentile(values, [0.5, 99.5]) if values.size else (0.0, 1.0)
         shown = np.ma.masked_array(stack.counts[k], ~stack.is_observed[k])
-        ax.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+        ax.imshow(shown, cmap="gray", vmin=low, vmax=high, **style)
         rest = (total - np.where(known[k], edges[k], 0.0)) / np.maximum(count - known[k], 1)
         level = np.quantile(rest[count > 1], _SHARE) if np.any(count > 1) else 0.0
         if level > 0:
@@ -66,7 +64,7 @@ def overlay_panel(stack: MicrographStack, places: Mapping[str, tuple[float, floa
         ax.set_title(name, fontsize=9, loc="left")
         ax.tick_params(labelsize=7)
     ax = figure.add_subplot(rows, _COLUMNS, n + 1)
-    shown = ax.imshow(stack.is_observed.sum(0), origin="lower", extent=extent, cmap="viridis", vmin=0, vmax=n)
+    shown = ax.imshow(stack.is_observed.sum(0), cmap="viridis", vmin=0, vmax=n, **style)
     figure.colorbar(shown, ax=ax, shrink=0.8)
     ax.set_title("images per pixel", fontsize=9, loc="left")
     ax.set_xlabel("x (µm)", fontsize=8)
@@ -86,17 +84,15 @@ def facet_map(rec: Reconstruction, labels: np.ndarray) -> "Figure":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2 * _INCH, _INCH), facecolor="white", layout="constrained")
-    half_x, half_y = 0.5 * pitch(rec.raster_x), 0.5 * pitch(rec.raster_y)
     x, y = rec.raster_x, rec.raster_y
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    style = raster_style(x, y)
     left, right = figure.subplots(1, 2)
     known = np.ma.masked_array(rec.height, ~rec.is_valid)
     low, high = robust_range(rec.height[rec.is_valid], 1.0)
-    style = {"cmap": "viridis", "interpolation": "nearest", "vmin": low, "vmax": high}
-    shown = left.imshow(known, origin="lower", extent=extent, **style)
+    shown = left.imshow(known, cmap="viridis", vmin=low, vmax=high, **style)
     figure.colorbar(shown, ax=left, shrink=0.8, label="height (µm)")
     colors = colormaps["tab20"].with_extremes(bad="#f2f2f2")
-    right.imshow(np.ma.masked_equal(labels % 20, 0), origin="lower", extent=extent, cmap=colors, vmin=0, vmax=19)
+    right.imshow(np.ma.masked_equal(labels % 20, 0), cmap=colors, vmin=0, vmax=19, **style)
     for number in range(1, int(labels.max()) + 1):
         row, column = np.argwhere(labels == number).mean(0)
         right.text(x[round(column)], y[round(row)], str(number), ha="center", va="center", fontsize=9)

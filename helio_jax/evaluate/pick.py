@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from helio_jax.errors import MissingDependencyError
+from helio_jax.evaluate.figures import raster_style
 from helio_jax.micrograph import MicrographSet
 
 Picks = dict[str, dict[str, tuple[float, float]]]
@@ -63,8 +64,7 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
     figure, axes = pyplot.subplots(1, len(scans.stacks), squeeze=False, figsize=(4.5 * len(scans.stacks), 5))
     view_of = {}
     for ax, stack in zip(axes[0], scans.stacks, strict=True):
-        extent = (stack.x[0], stack.x[-1], stack.y[0], stack.y[-1])
-        ax.imshow(stack.counts[0], origin="lower", extent=extent, cmap="gray", interpolation="nearest")
+        ax.imshow(stack.counts[0], cmap="gray", **raster_style(stack.x, stack.y))
         view_of[ax] = stack.name
     marks: list[Any] = []
 

@@ -27,7 +27,7 @@ from helio_jax.evaluate.spectrum import (
     without_trend,
 )
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 
 Pair = tuple[float, float]
 _SURE = 1e-3
@@ -93,7 +93,7 @@ def height_ripple(
     """
     settings = settings or RippleSettings()
     steps = pitch(rec.raster_x), pitch(rec.raster_y)
-    shown = rec.is_valid | (rec.reason == REASONS.index("floating"))
+    shown = rec.has_relief
     known = ndimage.binary_erosion(shown & np.isfinite(rec.height))
     rows, columns = np.gradient(np.where(np.isfinite(rec.height), rec.height, 0.0), steps[1], steps[0])
     inside = [known & region for region in regions]

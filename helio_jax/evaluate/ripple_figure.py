@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from helio_jax.arrays import pitch
-from helio_jax.evaluate.figures import robust_range, symmetric_range
+from helio_jax.evaluate.figures import raster_style, robust_range, symmetric_range
 from helio_jax.evaluate.ripple import Ripple
 from helio_jax.evaluate.spectrum import Spectrum
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,11 +41,9 @@ def ripple_panel(
     figure = Figure(figsize=(n * _INCH, 1.12 * _INCH), facecolor="white", layout="constrained")
     axes = figure.subplots(1, n)
     x, y = rec.raster_x, rec.raster_y
-    half_x, half_y = 0.5 * pitch(x), 0.5 * pitch(y)
-    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
-    style = {"origin": "lower", "extent": extent, "interpolation": "nearest"}
+    style = raster_style(x, y)
     inside = np.any(regions, axis=0)
-    shown = np.ma.masked_array(rec.height, ~(rec.is_valid | (rec.reason == REASONS.index("floating"))))
+    shown = np.ma.masked_array(rec.height, ~(rec.has_relief))
     low, high = robust_range(shown.compressed(), 1.0)
     axes[0].imshow(shown, cmap="viridis", vmin=low, vmax=high, **style)
     for region in regions:

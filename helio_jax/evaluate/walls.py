@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_json, pitch, undirected_deg
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.settings import Settings
 
@@ -73,7 +73,7 @@ class Wall:
 
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible record; what is not known is None."""
-        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in vars(self).items()}
+        return as_json(vars(self))
 
 
 @dataclass(frozen=True)
@@ -172,17 +172,16 @@ def _measure(
     length, width = float(np.ptp(u)) + 1.0, math.sqrt(12.0 * float(np.var(v)) + 1.0)
     if length < s.min_length_px or length < 1.5 * width:
         return None
-    ends = _places(rec, middle + np.outer([u.min(), u.max()], along))
+    ends = rec.beam_positions(middle + np.outer([u.min(), u.max()], along))
     value, std, is_determined, note = _difference(rec, middle, along, across, (u.min(), u.max()), (v.min(), v.max()), s)
     reason = rec.reason[region]
-    direction = math.degrees(math.atan2(along[1], along[0]))
     return Wall(
         number=0,
         start=(float(ends[0, 0]), float(ends[0, 1])),
         end=(float(ends[1, 0]), float(ends[1, 1])),
         length_um=length * step,
         length_std_um=step * math.sqrt(2.0),
-        direction_deg=(direction + 90.0) % 180.0 - 90.0,
+        direction_deg=undirected_deg(along),
         falls_deg=math.degrees(math.atan2(across[1], across[0])),
         width_um=width * step,
         step_um=value,
@@ -193,11 +192,6 @@ def _measure(
         n_masked=int(np.sum(reason == _MASKED)),
         n_rim=int(np.sum(rim[region])),
     )
-
-
-def _places(rec: Reconstruction, pixels: np.ndarray) -> np.ndarray:
-    """Return beam positions [n, 2], um, of places in pixels (column, row) [n, 2]."""
-    return np.array([rec.raster_x[0], rec.raster_y[0]]) + pixels * [pitch(rec.raster_x), pitch(rec.raster_y)]
 
 
 def _difference(
@@ -213,7 +207,7 @@ def _difference(
     y, x = np.mgrid[: rec.height.shape[0], : rec.height.shape[1]]
     offset = np.stack([x, y], -1) - middle
     u, v = offset @ along, offset @ across
-    known = np.isfinite(rec.height) & ((rec.reason == 0) | (rec.reason == _FLOATING))
+    known = np.isfinite(rec.height) & rec.has_relief
     near = (u >= extent[0]) & (u <= extent[1]) & known
     above = near & (v < thickness[0]) & (v >= thickness[0] - s.beside_px)
     below = near & (v > thickness[1]) & (v <= thickness[1] + s.beside_px)

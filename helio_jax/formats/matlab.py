@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from helio_jax.arrays import as_json
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
 from helio_jax.formats.matlab_reference import complete_instrument, read_counts
@@ -110,11 +111,11 @@ def _to_json(value: Any) -> Any:
     """Return metadata as JSON values: images left out, non-finite numbers None."""
     if isinstance(value, dict):
         return {k: _to_json(v) for k, v in value.items() if k not in _IMAGES}
-    if isinstance(value, np.ndarray):
-        return _to_json(value.tolist()) if value.size <= _SMALL else {"shape": list(value.shape)}
+    if isinstance(value, np.ndarray) and value.size > _SMALL:
+        return {"shape": list(value.shape)}
     if isinstance(value, list):
         return [_to_json(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return as_json(value)
 
 
 def _find_kind(path: str, tree: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_json, pitch
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.prepare.autoalign import Aligner, Match
@@ -87,33 +87,29 @@ class Alignment:
                     "name": name,
                     "rotation_deg": math.degrees(math.remainder(m.rotation, math.tau)),
                     "shift_um": list(m.shift),
-                    "std_um": std if math.isfinite(std) else None,
+                    "std_um": std,
                 }
                 for name, m, std in zip(self.names, self.motions, self.std_um, strict=True)
             ],
             "problems": list(self.problems),
         }
         if self.restoring is not None:
-            out["restoring"] = self.restoring if math.isfinite(self.restoring) else None
+            out["restoring"] = self.restoring
         if self.one_albedo is not None:
             names = ("albedo_spread", "share", "polar_deg")
             out["one_albedo"] = {name: getattr(self.one_albedo, name) for name in names}
         if self.matches is not None:
             for scan, match in zip(out["scans"], self.matches, strict=True):
-                scan["match"] = {k: v if math.isfinite(v) else None for k, v in asdict(match).items()}
+                scan["match"] = asdict(match)
         if self.points is not None:
-            finite = {
-                v: {p: None if math.isnan(e) else e for p, e in n.items()} for v, n in self.points.left_out.items()
-            }
-            std = self.points.std_um
             out["points"] = {
-                "std_um": std if math.isfinite(std) else None,
+                "std_um": self.points.std_um,
                 "residual_rms_um": rms(self.points.residuals),
                 "left_out_rms_um": rms(self.points.left_out),
                 "residuals_um": self.points.residuals,
-                "left_out_um": finite,
+                "left_out_um": self.points.left_out,
             }
-        return out
+        return as_json(out)
 
 
 def align_scans(

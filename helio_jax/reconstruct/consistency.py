@@ -17,8 +17,8 @@ from helio_jax.reconstruct.beamframe import unit_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of
 from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.photometric import limited, solve_nearfield
 from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.solve import limited, solve_nearfield
 
 UNKNOWNS = 2
 """Per pixel: height and albedo."""
@@ -48,7 +48,9 @@ def misfit(
 
     Source: own derivation, tests/unit/test_orient.py.
     """
-    height = limited(solve_nearfield(stack, settings, geometry, settings.rounds)[0], stack)
+    signal, variance = signal_of(stack)
+    steps = pitch(stack.x), pitch(stack.y)
+    height = limited(solve_nearfield(signal, variance, geometry, *steps, settings, settings.rounds)[0], geometry)
     down, along = np.gradient(height, pitch(stack.y), pitch(stack.x))
     normal = unit_normal(along, down, stack.instrument.beam_shift)
     phi, multiple = geometry.form_factor(height), 0.0
@@ -56,7 +58,6 @@ def misfit(
         found = predict(height, np.moveaxis(normal, 0, -1))
         phi, multiple = phi - found.hidden, found.multiple
     light = np.maximum(np.einsum("kiyx,iyx->kyx", phi, normal), 0.0) + multiple
-    signal, variance = signal_of(stack)
     is_used = np.isfinite(signal) & (stack.is_observed.sum(0) >= MIN_IMAGES)
     weight, data = np.where(is_used, 1.0 / variance, 0.0), np.where(is_used, signal, 0.0)
     power = (weight * light**2).sum(0)

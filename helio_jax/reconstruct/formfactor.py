@@ -89,7 +89,8 @@ class SpotGeometry:
     def form_factor(self, height: np.ndarray) -> np.ndarray:
         """Return Phi [detector, 3, ...] in float64 for NumPy heights [um]."""
         with jax.enable_x64(True):
-            return np.asarray(_jitted(self, jnp.asarray(height, jnp.float64)))
+            at = (jnp.asarray(x, jnp.float64) for x in self.position(np.asarray(height, np.float64)))
+            return np.asarray(_jitted(jnp.asarray(self.rims, jnp.float64), *at))
 
 
-_jitted = jax.jit(form_factor_of_height, static_argnums=0)
+_jitted = jax.jit(form_factor)

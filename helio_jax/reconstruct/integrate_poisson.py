@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from helio_jax.errors import GuardError
+from helio_jax.reconstruct.edges import along
 
 Image = Float[np.ndarray, "y x"]
 EdgesX = Float[np.ndarray, "y x-1"]
@@ -154,8 +155,9 @@ def solve_directly(problem: EdgeProblem) -> Image:
     """Solve an `EdgeProblem` by sparse factorisation: slower, needs memory, knows no bad condition; mean zero, um."""
     n_y, n_x = problem.weight_x.shape[0], problem.weight_y.shape[1]
     pixel = np.arange(n_y * n_x).reshape(n_y, n_x)
-    first = np.concatenate([pixel[:, :-1].ravel(), pixel[:-1].ravel()])
-    second = np.concatenate([pixel[:, 1:].ravel(), pixel[1:].ravel()])
+    first, second = (
+        np.concatenate([x.ravel(), y.ravel()]) for x, y in zip(along(pixel, 1), along(pixel, 0), strict=True)
+    )
     weight = np.concatenate([problem.weight_x.ravel() / problem.dx**2, problem.weight_y.ravel() / problem.dy**2])
     ends, others = np.concatenate([first, second]), np.concatenate([second, first])
     weight = np.concatenate([weight, weight])

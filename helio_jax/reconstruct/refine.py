@@ -229,8 +229,13 @@ def fit_heights(
                 is_interrupted = True
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         if posterior is not None:
-            posterior = posterior.also_off_by(left_to_go(changes) * last_change, seed=2)
+            posterior = posterior.also_off_by(left_to_go(changes) * last_change)
         return _finish(refiner, changes, is_interrupted, posterior)
+
+
+def contraction_of(changes: Sequence[float]) -> float | None:
+    """Return by what factor the last round's change is that of the round before, or None where there is none."""
+    return changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
 
 
 def left_to_go(changes: Sequence[float]) -> float:
@@ -238,8 +243,9 @@ def left_to_go(changes: Sequence[float]) -> float:
 
     The changes are continued as a geometric series; after a single round they are taken to halve.
     """
-    contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 0.5
-    return 1.0 / (1.0 - min(contraction, SLOWEST)) - 1.0
+    contraction = contraction_of(changes)
+    share = min(0.5 if contraction is None else contraction, SLOWEST)
+    return share / (1.0 - share)
 
 
 def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
@@ -259,14 +265,14 @@ def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool =
     if changes[-1] < tolerance:
         return f"converged: {last}"
     if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):
-        growth = f"{changes[-1] / changes[-2]:.2f} times the round before" if changes[-2] > 0 else "after none before"
+        contraction = contraction_of(changes)
+        growth = "after none before" if contraction is None else f"{contraction:.2f} times the round before"
         return f"diverging: {last}, {growth}; raise mask_error or use nearfield"
     return f"stopped: {last}; raise max_rounds for more"
 
 
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s = refiner.settings
-    contraction = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
     _, lagged = refiner.lag(s.robust_limits[-1], s.jump_limits[-1])
     values = Unknowns(*(None,) * 3, **{name: jnp.asarray(value) for name, value in refiner.values.items()})
     background = np.broadcast_to(refiner.model.background(values, lagged), refiner.signal.shape)
@@ -288,7 +294,7 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         intact_y=refiner.intact_y,
         posterior=posterior,
         changes=tuple(changes),
-        contraction=contraction,
+        contraction=contraction_of(changes),
         status=status_of(changes, s.tolerance_um, is_interrupted),
         is_interrupted=is_interrupted,
     )

@@ -101,4 +101,13 @@ class ReconstructSettings(Settings):
     """Width of that border, as a fraction of the image on each side."""
     border_std_um: float = Field(default=2.0, gt=0.0, le=1e4)
     """`refine`: how flat the border is known to be [um]."""
+    corrections: int = Field(default=1, ge=0, le=20)
+    """`nearfield`: how often predicted shadows and multiple scattering are taken off the data; 0: the plain method."""
+    samples: int = Field(default=16, ge=0, le=10_000)
+    """`linear`, `nearfield`: how often noise and calibration are drawn anew for the error bars; 0: no error bars."""
     refine: RefineSettings = RefineSettings()
+
+    @property
+    def predicts(self) -> bool:
+        """Whether the method itself takes multiple scattering into account."""
+        return self.method == "refine" or (self.method == "nearfield" and self.corrections > 0)

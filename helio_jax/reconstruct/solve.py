@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from helio_jax.arrays import border_mask, pitch
+from helio_jax.arrays import pitch
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.beamframe import slopes_of_normal
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.levels import search_levels
-from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_known_albedo, solve_linear
+from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.reconstruct.model import Surface
+from helio_jax.reconstruct.photometric import level, limited, photometric_heights, solve_nearfield
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import (
@@ -55,58 +55,6 @@ if TYPE_CHECKING:
     from helio_jax.reconstruct.refiner import Predict
 
 
-def _level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:
-    """Subtract the plane (flat border) or the median (free border) fitted to the border's known pixels."""
-    rows, columns = np.nonzero(border_mask(height.shape, settings.border_fraction) & (weight > 0))
-    if rows.size < 3:
-        return height - np.median(height)
-    if settings.border == "free":
-        return height - np.median(height[rows, columns])
-    basis = np.stack([np.ones(rows.size), rows / height.shape[0], columns / height.shape[1]], -1)
-    keep = np.ones(rows.size, bool)
-    for _ in range(3):
-        plane = np.linalg.lstsq(basis[keep], height[rows, columns][keep], rcond=None)[0]
-        misfit = np.abs(height[rows, columns] - basis @ plane)
-        keep = misfit <= 3.0 * max(1.4826 * np.median(misfit), 1e-9)
-    i, j = np.mgrid[: height.shape[0], : height.shape[1]]
-    return height - (plane[0] + plane[1] * i / height.shape[0] + plane[2] * j / height.shape[1])
-
-
-def _integrate(solution: PhotometricSolution, stack: MicrographStack, settings: ReconstructSettings) -> np.ndarray:
-    a, b, is_facing = slopes_of_normal(solution.normals, stack.instrument.beam_shift)
-    weight = solution.weight * np.where(is_facing, 1.0, 0.1)
-    if settings.integrator in ("dct_poisson", "harker_oleary"):
-        weight = (weight > 0).astype(float)
-    height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), settings.integrator, weight)
-    return _level(height, settings, weight)
-
-
-def solve_nearfield(
-    stack: MicrographStack, settings: ReconstructSettings, geometry: SpotGeometry, rounds: int
-) -> tuple[np.ndarray, PhotometricSolution]:
-    """Alternate between the photometric solution at the current height and its integration.
-
-    One round is the linear method: directions of the flat reference plane everywhere.
-    """
-    signal, variance = signal_of(stack)
-    height = np.zeros(stack.shape[1:])
-    for number in range(rounds):
-        phi = geometry.form_factor(limited(height, stack))
-        solution = solve_linear(signal, variance, phi)
-        new = _integrate(solution, stack, settings)
-        height = new if number == 0 else height + settings.damping * (new - height)
-    return height, solution
-
-
-def limited(height: np.ndarray, stack: MicrographStack) -> np.ndarray:
-    """Return heights kept between one and a half plate distances below and 90 % of it above the plane.
-
-    Only the directions are taken there, so that a wild intermediate height cannot pass through the plate.
-    """
-    d = stack.instrument.sample_distance
-    return np.clip(height, -0.5 * d, 0.9 * d)
-
-
 def reconstruct_stack(
     stack: MicrographStack,
     settings: ReconstructSettings,
@@ -134,31 +82,17 @@ def reconstruct_stack(
     if settings.method == "refine":
         result = _refined(stack, settings, geometry, make_predict, report)
     else:
-        rounds = 1 if settings.method == "linear" else settings.rounds
-        result = _from_solution(stack, settings, *solve_nearfield(stack, settings, geometry, rounds))
+        predict = None if make_predict is None else make_predict(start_paths(stack, settings))
+        result = photometric_heights(stack, settings, geometry, predict)
     if not np.all(np.isfinite(result.height)):
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
     return result
 
 
-def _from_solution(stack, settings, height, solution) -> Reconstruction:
-    reason = reasons_from_data(stack)
-    n_few = int(np.sum(stack.is_observed.sum(0) < MIN_IMAGES))
-    rounds = 1 if settings.method == "linear" else settings.rounds
-    return Reconstruction(
-        height=height,
-        raster_x=stack.x,
-        raster_y=stack.y,
-        instrument=stack.instrument,
-        method=settings.method,
-        normals=solution.normals,
-        albedo=np.where(np.isfinite(solution.albedo), solution.albedo, 0.0),
-        is_valid=reason == 0,
-        reason=reason,
-        residuals=solution.residuals,
-        status=f"solved in {rounds} round(s); {n_few} pixels in fewer than {MIN_IMAGES} images took the flat normal",
-        provenance={"stack": dict(stack.provenance), "reconstruct": settings.model_dump(mode="json")},
-    )
+def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
+    """Return the number of paths per prediction that a photometric solution is worth."""
+    n_paths = settings.refine.paths(stack.counts[0].size)
+    return min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS))
 
 
 def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
@@ -172,7 +106,7 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     (a, b), _ = solve_known_albedo(signal - near.multiple, variance + doubt**2, visible, normals, shift)
     weight = np.ones(stack.shape[1:])
     height = integrate_slopes(a, b, pitch(stack.x), pitch(stack.y), "weighted", weight)
-    return Surface(limited(_level(height, settings, weight), stack), a, b)
+    return Surface(limited(level(height, settings, weight), stack), a, b)
 
 
 def _retreating(work: Callable[[Surface], Any], surface: Surface, calmer: Surface) -> tuple[Any, Surface]:
@@ -263,9 +197,11 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    n_paths, shift = settings.refine.paths(stack.counts[0].size), stack.instrument.beam_shift
-    predict, roughly = make_predict(n_paths), make_predict(min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS)))
-    height, solution = solve_nearfield(stack, settings, geometry, settings.rounds)
+    shift = stack.instrument.beam_shift
+    predict = make_predict(settings.refine.paths(stack.counts[0].size))
+    roughly = make_predict(start_paths(stack, settings))
+    steps = pitch(stack.x), pitch(stack.y)
+    height, solution = solve_nearfield(*signal_of(stack), geometry, *steps, settings, settings.rounds)
 
     def correct(surface: Surface) -> Surface:
         return _corrected(stack, settings, geometry, surface.height, surface.normals(shift), roughly)

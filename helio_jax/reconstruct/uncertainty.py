@@ -111,9 +111,7 @@ class Posterior:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
 
-    def widened(
-        self, values: dict[str, np.ndarray], names: tuple[str, ...], least: float = 1.0, seed: int = 1
-    ) -> "Posterior":
+    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...], least: float = 1.0) -> "Posterior":
         """Return it with error bars that allow for a model that lacks something.
 
         Where the fitted `values` of the unknowns called `names` are farther from what was stated than prior and data
@@ -141,11 +139,15 @@ class Posterior:
             widening=factor * self.widening,
             bent=None if self.bent is None else factor * self.bent,
         )
-        return enlarged.also_off_by(bent, seed)
+        return enlarged.also_off_by(bent)
 
-    def also_off_by(self, error: np.ndarray, seed: int = 1) -> "Posterior":
-        """Return it with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um."""
-        how_far = np.random.default_rng(seed).standard_normal(len(self.samples))
+    def also_off_by(self, error: np.ndarray) -> "Posterior":
+        """Return it with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um.
+
+        The factors of several errors are drawn independently of one another.
+        """
+        n_before = 0 if self.bent is None else len(self.bent)
+        how_far = np.random.default_rng(1 + n_before).standard_normal(len(self.samples))
         how_far /= np.sqrt(np.mean(how_far**2))
         bent = error[None] if self.bent is None else np.concatenate([self.bent, error[None]])
         return replace(self, samples=self.samples + how_far[:, None, None] * error, bent=bent)

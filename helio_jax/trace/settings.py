@@ -6,6 +6,9 @@ from pydantic import Field, model_validator
 
 from helio_jax.settings import Settings
 
+MAX_BRANCHES = 1024
+"""Most paths from one first hit."""
+
 
 class TraceSettings(Settings):
     """How a scene is traced."""
@@ -20,7 +23,7 @@ class TraceSettings(Settings):
     counting this many beam atoms would tell (35000: the reference program's usual number)."""
     max_rays: int = Field(default=4096, ge=8, le=10_000_000)
     """Most beam rays per pixel where there is a target; dark pixels take as many, so a lower cap saves time."""
-    branches: int = Field(default=8, ge=1, le=1024)
+    branches: int = Field(default=8, ge=1, le=MAX_BRANCHES)
     """`expected`: paths followed from the first hit of every beam ray, for the multiple scattering."""
     estimator: Literal["expected", "analog"] = "expected"
     """`expected`: closed-form direct term and next-event estimation; `analog`: whole counts of detected rays."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from helio_jax.micrograph import MicrographStack
+from helio_jax.predict import make_predictor
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
@@ -15,6 +16,14 @@ def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():
     assert RefineSettings().paths(large) == PATHS_PER_PIXEL * large > 10_000_000
     assert RefineSettings().paths(100) == LEAST_PATHS
     assert RefineSettings(rays=20_000).paths(large) == 20_000
+
+
+def test_a_tiny_raster_takes_no_more_paths_than_the_tracer_has(bshem):
+    """Nine pixels: most paths per pixel, not an error of the tracer's settings."""
+    axis = 40.0 * np.arange(3.0)
+    stack = MicrographStack(np.ones((3, 3, 3)), axis, axis, bshem, n_rays=1.0)
+    found = make_predictor(stack, LEAST_PATHS, 2000.0)(np.zeros((3, 3)), np.broadcast_to([0.0, 0.0, 1.0], (3, 3, 3)))
+    assert not found.multiple.any()  # a flat sees itself nowhere
 
 
 def test_only_the_start_is_predicted_with_fewer_paths(bshem):

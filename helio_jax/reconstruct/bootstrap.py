@@ -1,0 +1,115 @@
+"""Error bars of the photometric methods, which have no likelihood: their answer to data and instruments drawn anew.
+
+Each sample is the method's change of the heights when noise, gains, offsets and the apertures' places are drawn from
+their deviations; drift and scan lines have been read at the border so well that they hardly count. To it comes one
+error of all heights together: what a further correction for shadows and multiple scattering would change, or, where
+nothing is corrected, what all that the method leaves out would do once more.
+
+Source: parametric bootstrap: Efron and Tibshirani, An Introduction to the Bootstrap (1993), ch. 6.5; of bias, ch. 10.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from helio_jax.arrays import border_mask
+from helio_jax.reconstruct.formfactor import SpotGeometry
+from helio_jax.reconstruct.linear import PhotometricSolution
+from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.settings import ReconstructSettings
+
+MAX_PIXELS = 10_000
+"""Larger rasters are thinned: every 2nd (4th, ...) row and column stands for the rest."""
+_SEED = 11
+
+Solve = Callable[[np.ndarray, np.ndarray, SpotGeometry, int], np.ndarray]
+"""(signal, variance [detector, y, x], geometry, pitches between pixels) -> heights [y, x], um."""
+
+
+def bootstrap_heights(
+    signal: np.ndarray,
+    variance: np.ndarray,
+    geometry: SpotGeometry,
+    settings: ReconstructSettings,
+    solve: Solve,
+) -> np.ndarray:
+    """Return what noise and calibration may do to the heights of a method [sample, y, x], um.
+
+    Where the border is flat, every drawn reading is brought to the signal of the flat there, as calibration does: gains
+    are not free. Of a thinned raster a pixel stands for stride^2 data, whose noise is less by the stride: heights along
+    a path then err as much as on the full one.
+
+    Args:
+        signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
+        geometry: of the stated instrument, whose uncertainty tells how far the apertures may be elsewhere.
+        settings: priors (table refine), border, number of samples.
+        solve: the method.
+    """
+    rng = np.random.default_rng(_SEED)
+    shape = signal.shape[1:]
+    stride = 1
+    while (shape[0] // stride) * (shape[1] // stride) > MAX_PIXELS:
+        stride *= 2
+    data, spread = (field[:, ::stride, ::stride] for field in (signal, variance))
+    height = solve(data, spread, geometry, stride)
+    drawn = []
+    for _ in range(settings.samples):
+        other = _drawn_geometry(geometry, rng)
+        reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
+        flat, told = (g.form_factor(np.zeros(1))[:, 2, 0] for g in (other, geometry))
+        reading = as_at_border(reading, data, settings)
+        drawn.append(solve(reading * (flat / told)[:, None, None], spread, other, stride) - height)
+    row, column = (np.minimum(np.arange(n) // stride, m - 1) for n, m in zip(shape, height.shape, strict=True))
+    return np.array(drawn)[:, row[:, None], column]
+
+
+def as_at_border(data: np.ndarray, told: np.ndarray, settings: ReconstructSettings) -> np.ndarray:
+    """Return data times what makes them those of the told at the image's border, if that is flat [detector, y, x]."""
+    if settings.border != "flat":
+        return data
+    frame = border_mask(data.shape[1:], settings.border_fraction)
+    flat, mine = (np.nanmedian(d[:, frame], axis=1) for d in (told, data))
+    return data * (flat / mine)[:, None, None]
+
+
+def _drawn_geometry(geometry: SpotGeometry, rng: np.random.Generator) -> SpotGeometry:
+    """Return the geometry of an instrument within its uncertainty."""
+    sure = geometry.instrument.uncertainty
+    aim = np.radians([sure.polar_deg, sure.azimuth_deg]) * rng.standard_normal((len(geometry.rims), 2))
+    distance = sure.sample_distance_um * float(rng.standard_normal())
+    return SpotGeometry(geometry.instrument.moved(aim, distance)) if aim.any() or distance else geometry
+
+
+def _drawn_reading(
+    data: np.ndarray, noise: np.ndarray, settings: ReconstructSettings, rng: np.random.Generator
+) -> np.ndarray:
+    """Return data [detector, y, x] as they might have been read, in the same units."""
+    s, n = settings.refine, len(data)
+    usual = np.nanmedian(data, axis=(1, 2))
+    offset = (usual * s.offset_std * rng.standard_normal(n))[:, None, None]
+    gain = np.exp(s.gain_std * rng.standard_normal(n))[:, None, None]
+    return gain * data + offset + noise * rng.standard_normal(data.shape)
+
+
+def what_is_left_out(
+    solution: PhotometricSolution, used: np.ndarray, near: np.ndarray, prediction: Prediction
+) -> np.ndarray:
+    """Return by how much the signal of a solution's own surface differs from what the method takes it for.
+
+    Args:
+        solution: normals and albedo of the method [y, x].
+        used, near: form factors that the method took, and at the heights that it found [detector, 3, y, x].
+        prediction: shadows and multiple scattering of that surface.
+
+    Returns:
+        Signal [detector, y, x], in units of the beam.
+    """
+    albedo = np.nan_to_num(solution.albedo)
+    change = np.einsum("kiyx,yxi->kyx", near - prediction.hidden - used, solution.normals)
+    return albedo * change + albedo * prediction.multiple
+
+
+def also_off_by(samples: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return samples with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um."""
+    factor = np.random.default_rng(_SEED + 1).standard_normal(len(samples))
+    return samples + (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * error
