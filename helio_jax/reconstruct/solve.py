@@ -7,7 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,16 @@ from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.photometric import level, limited, photometric_heights, solve_nearfield
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
-from helio_jax.reconstruct.validity import depth_jumps, floating, reasons_from_data, reasons_from_fit, regions, telling
+from helio_jax.reconstruct.validity import (
+    TRUSTED,
+    depth_jumps,
+    floating,
+    ill_explained,
+    reasons_from_data,
+    reasons_from_fit,
+    regions,
+    telling,
+)
 from helio_jax.reconstruction import Reconstruction
 
 MAX_WIDTH = 0.125
@@ -31,6 +40,9 @@ SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit."""
 START_THRIFT = 4
 """The same for the photometric solutions that the fit starts from, unless the image is small: it would save little."""
+
+RETREATS = 3
+"""How often a surface to start from is made calmer when nothing can be predicted of it."""
 
 GEOMETRY_DOUBT = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
@@ -97,6 +109,16 @@ def _corrected(stack, settings, geometry, height, normals, predict) -> Surface:
     return Surface(limited(level(height, settings, weight), stack), a, b)
 
 
+def _retreating(work: Callable[[Surface], Any], surface: Surface, calmer: Surface) -> tuple[Any, Surface]:
+    """Return what is made of a surface, and that surface: half-way to a calmer one while nothing is predicted of it."""
+    for _ in range(RETREATS):
+        try:
+            return work(surface), surface
+        except GuardError:
+            surface = Surface(*(0.5 * (rough + calm) for rough, calm in zip(surface, calmer, strict=True)))
+    return work(surface), surface
+
+
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     """Return by how many per cent the highest point moves per per cent of signal of each gain and offset.
 
@@ -119,17 +141,21 @@ def _known(fit: "Fit") -> dict[str, np.ndarray]:
     return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
 
 
-def _with_plateaus(stack, settings, geometry, make_predict, report, start, predict) -> "tuple[Fit, np.ndarray]":
-    """Fit the heights; put plateaus that stay unexplained to better levels, at first those that touch as one; refit.
+def _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict) -> "tuple[Fit, np.ndarray]":
+    """Fit the heights, from a start or one nearer to a calmer surface, then those of plateaus that stay unexplained.
 
-    Return the fit, and where another level explains the images as well [y, x].
+    They are put to better levels, at first those that touch as one, and all is fitted again.
+
+    Return the fit, and where another level explains the images as well, or better but could not be fitted [y, x].
     """
     from helio_jax.reconstruct.refine import fit_heights, misfit_on
 
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
     slow_axis = 0 if stack.fast_axis == "x" else 1
-    fit = fit_heights(*problem, start, settings, predict, report, slow_axis=slow_axis)
+    fit, _ = _retreating(
+        lambda surface: fit_heights(*problem, surface, settings, predict, report, slow_axis=slow_axis), start, calmer
+    )
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     is_undecided = np.zeros(stack.shape[1:], bool)
     roughly = make_predict(max(settings.refine.paths(region.size) // SEARCH_THRIFT, 1000))
@@ -151,12 +177,17 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, predi
             is_undecided[left > 0] = np.isin(left, found.undecided)[left > 0]
             if found.moved:
                 is_moved = np.isin(left, found.moved)
-                levelled[is_moved] = levelled.max() + left[is_moved]
-                fit = fit_heights(*problem, found.surface, settings, predict, report, levelled, slow_axis)
+                is_undecided |= is_moved  # unless the fit goes on from there
+                trial = np.where(is_moved, levelled.max() + left, levelled)
+                fit = fit_heights(*problem, found.surface, settings, predict, report, trial, slow_axis)
+                levelled, is_undecided = trial, is_undecided & (~is_moved | np.isin(left, found.undecided))
             elif np.unique(left).size == np.unique(single).size:
                 break
         except KeyboardInterrupt:
             fit = replace(fit, status=f"interrupted in the search for plateaus; before that: {fit.status}")
+            break
+        except GuardError as e:
+            fit = replace(fit, status=f"{fit.status}; a plateau was found that could not be fitted: {e}")
             break
     return fit, is_undecided
 
@@ -171,10 +202,18 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     roughly = make_predict(start_paths(stack, settings))
     steps = pitch(stack.x), pitch(stack.y)
     height, solution = solve_nearfield(*signal_of(stack), geometry, *steps, settings, settings.rounds)
-    start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
+
+    def correct(surface: Surface) -> Surface:
+        return _corrected(stack, settings, geometry, surface.height, surface.normals(shift), roughly)
+
+    calmer = Surface(*np.zeros((3, *height.shape)))
+    try:
+        start = _corrected(stack, settings, geometry, limited(height, stack), solution.normals, roughly)
+    except GuardError:
+        start = correct(calmer)
     for _ in range(settings.refine.photometric_rounds - 1):
-        start = _corrected(stack, settings, geometry, start.height, start.normals(shift), roughly)
-    fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, predict)
+        start, calmer = _retreating(correct, start, calmer)
+    fit, is_floating = _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict)
     from helio_jax.reconstruct.findings import describe_instrument
 
     posterior = fit.posterior
@@ -190,7 +229,8 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     )
     is_moved = bool(fit.values["aim"].size or fit.values["distance"].size)
     n_telling = telling(fit.model_share, stack.is_observed)
-    reason = reasons_from_fit(reasons_from_data(stack), worst, n_telling, *jumps, is_floating)
+    is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
+    reason = reasons_from_fit(reasons_from_data(stack), is_explained, n_telling, *jumps, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,

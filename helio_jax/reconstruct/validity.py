@@ -1,6 +1,7 @@
 """Why a height should not be trusted: too few images, masks, a depth jump, or a region whose level nothing fixes."""
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -17,6 +18,11 @@ SMALLEST_JUMP = 0.1
 """Misfit of a cut edge, in pitches, below which it is no depth jump: noise cuts one edge in some hundreds."""
 TRUSTED = 0.5
 """A pixel with a datum of less robust weight than this is not explained by the model."""
+EXPLAINED = 3.0
+"""Mean square residual of a pixel and its eight neighbours, in that of most pixels and at least 1, up to which the
+model explains them: noise alone reaches it in one pixel of a million."""
+_LARGEST = 25.0
+"""A datum counts with this square at most."""
 VEILED = 5.0
 """A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
 FLOATING = 0.2
@@ -91,6 +97,21 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch
     return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
 
 
+def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+    """Return True where the fit contradicts the images of a pixel and its neighbours together [y, x].
+
+    Heights that a wrong surface bends to, as beside a wall that nobody found, are stated as precise as others; no
+    datum need be far off alone. Data that were not observed, or lie outside, count as explained to one deviation.
+
+    Args:
+        residuals: of the fit, in standard deviations [detector, y, x].
+        is_observed: whether there is a datum [detector, y, x].
+    """
+    square = np.where(is_observed, np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST), 1.0).mean(0)
+    around = uniform_filter(square, 3, mode="constant", cval=1.0)
+    return around > EXPLAINED * max(1.0, float(np.median(around)))
+
+
 def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
     """Return how many data tell of every pixel's facet [y, x].
 
@@ -103,7 +124,7 @@ def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
 
 def reasons_from_fit(
     reason: np.ndarray,
-    weight: np.ndarray,
+    is_explained: np.ndarray,
     n_telling: np.ndarray,
     jump_x: np.ndarray,
     jump_y: np.ndarray,
@@ -115,7 +136,7 @@ def reasons_from_fit(
 
     Args:
         reason: from `reasons_from_data` [y, x].
-        weight: robust weight left of the worst datum [y, x].
+        is_explained: whether the model explains the pixel's data [y, x].
         n_telling: from `telling` [y, x].
         jump_x, jump_y: from `depth_jumps` [y, x - 1], [y - 1, x].
         is_floating: from `floating` [y, x].
@@ -125,7 +146,7 @@ def reasons_from_fit(
         for end in along(at_jump, axis):
             end |= jump
     out = reason.copy()
-    out[(out == 0) & (at_jump | (weight < TRUSTED))] = _JUMP
+    out[(out == 0) & (at_jump | ~is_explained)] = _JUMP
     out[(out == 0) & (n_telling < MIN_IMAGES - 1)] = _MASKED
     out[(out == 0) & is_floating] = _FLOATING
     return out
