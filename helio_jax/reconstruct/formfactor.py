@@ -7,6 +7,7 @@ Rushmeier, Winget, SIGGRAPH 1989 (Lambert's formula).
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +82,7 @@ class SpotGeometry:
     def __hash__(self) -> int:
         return hash(self._key)
 
-    def position(self, height: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def position(self, height: Any) -> tuple[Any, Any, Any]:
         """Return lab x, y and the depth below the plate [um]."""
         x, y, z = self.instrument.spot_position(height)
         return x, y, self.instrument.working_distance - z

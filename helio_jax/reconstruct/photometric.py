@@ -107,11 +107,11 @@ def photometric_heights(
     is_corrected = bool(stack.provenance.get("self_calibrate", {}).get("without_multiple"))
     rounds = 1 if settings.method == "linear" else settings.rounds
     n_corrections = 0 if is_corrected or settings.method == "linear" else settings.corrections
-    steps = pitch(stack.x), pitch(stack.y)
+    dx, dy = pitch(stack.x), pitch(stack.y)
     signal, variance = signal_of(stack)
 
     def solve(data, spread, geometry, stride=1):
-        return solve_nearfield(data, spread, geometry, *(stride * step for step in steps), settings, rounds)
+        return solve_nearfield(data, spread, geometry, stride * dx, stride * dy, settings, rounds)
 
     def left_out(height, solution, predict):
         near = limited(height, geometry)
@@ -135,7 +135,7 @@ def photometric_heights(
             again = as_at_border(data - rest if n_corrections else data + rest, signal, settings)
             samples = also_off_by(samples, solve(again, variance, geometry)[0] - height)
     except GuardError as error:
-        note = f"; not corrected for shadows and multiple scattering, no error bars: {error}"
+        note = f"; no error bars, for shadows and multiple scattering could not be predicted: {error}"
     reason = reasons_from_data(stack)
     n_few = int(np.sum(stack.is_observed.sum(0) < MIN_IMAGES))
     few = f"{n_few} pixels in fewer than {MIN_IMAGES} images took the flat normal"
