@@ -11,7 +11,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
 from helio_jax.errors import GuardError
@@ -24,12 +24,8 @@ _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 GAIN = 30.0
 """By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
 worse may be true as well."""
-_FACET = 7
-"""Side of the square within which a wall is taken for plane [pixels]."""
 _LEVEL_STEPS = 8
 """Evaluations by which the best level is refined."""
-MOST = 8
-"""Regions that are searched at most, the largest: each takes about forty evaluations."""
 
 Misfit = Callable[[Surface], tuple[float, Surface]]
 """Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
@@ -64,34 +60,6 @@ def _way_out(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, f
     return distance
 
 
-def _smooth_way_out(
-    distance: np.ndarray, is_wall: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the way out of a region, within a wall, without the steps of its border along the raster [y, x], um.
-
-    And how fast it changes across that way, to its left: 0 where the beam meets the wall head-on. Both are those of
-    local planes, which fall by the distance itself along the way, fitted to the neighbours on the wall.
-
-    Args:
-        distance: from `_way_out` [y, x], um.
-        is_wall: pixels of the wall [y, x].
-        way: unit vector (x, y).
-        pitch: dy, dx, um.
-    """
-    y, x = np.indices(is_wall.shape) * np.reshape(pitch, (2, 1, 1))
-    across, level = y * way[0] - x * way[1], distance + x * way[0] + y * way[1]
-
-    def mean(field: np.ndarray) -> np.ndarray:
-        return uniform_filter(np.where(is_wall, field, 0.0), _FACET, mode="constant")
-
-    n = np.maximum(mean(np.ones(is_wall.shape)), 1e-12)
-    at, rise = mean(across) / n, mean(level) / n
-    width = mean(across**2) / n - at**2
-    common = mean(across * level) / n - at * rise
-    turn = np.where(width > 0.1 * min(pitch) ** 2, common / np.maximum(width, 1e-12), 0.0)
-    return rise + turn * (across - at) - (level - distance), turn
-
-
 def at_level(
     inside: np.ndarray,
     surface: Surface,
@@ -103,8 +71,8 @@ def at_level(
     """Return a surface with a region flat at a level above the ground, and with the wall that the beam sees, if any.
 
     The beam sees the wall that faces it: at the far side of a hollow, at the near side of a plateau. In the beam frame
-    a vertical wall rises by the cotangent of the incidence along the beam, and, where it does not stand square to the
-    beam, across it, too. Deeper than the beam reaches, there is nothing but that wall.
+    a vertical wall rises by the cotangent of the incidence along the beam. Deeper than the beam reaches, there is
+    nothing but that wall.
 
     Args:
         inside: the region [y, x].
@@ -118,12 +86,9 @@ def at_level(
     if beam_shift is not None:
         along, sign = math.hypot(*beam_shift), np.sign(level)
         x, y = (-sign * shift / along for shift in beam_shift)
-        distance = _way_out(inside, (x, y), pitch)
-        is_wall = inside & (distance < abs(level) * along)
-        distance, turn = _smooth_way_out(distance, is_wall, (x, y), pitch)
-        height = distance / along
-        slopes = (sign * (-way + turn * aside) / along for way, aside in ((x, -y), (y, x)))
-        values = ground + sign * height, *slopes
+        height = _way_out(inside, (x, y), pitch) / along
+        is_wall = height < abs(level)
+        values = (ground + sign * height, -sign * x / along, -sign * y / along)
         flat = Surface(*(np.where(is_wall, wall, field) for wall, field in zip(values, flat, strict=True)))
     return Surface(*(np.where(inside, new, field) for new, field in zip(flat, surface, strict=True)))
 
@@ -139,7 +104,7 @@ def search_levels(
 ) -> Levels:
     """Return the surface with all regions at the levels that explain the images best.
 
-    A moved region starts flat; its own relief is the fit's matter. Beyond the `MOST` largest, regions are undecided.
+    A moved region starts flat; its own relief is the fit's matter.
 
     Args:
         region: number of the region of every pixel, 0: none [y, x].
@@ -151,10 +116,8 @@ def search_levels(
         report: called with what is tried next.
     """
     best, found = misfit(surface)
-    numbers, sizes = np.unique(region[region > 0], return_counts=True)
-    largest = numbers[np.argsort(-sizes, kind="stable")].tolist()
-    moved, undecided = [], largest[MOST:]
-    for number in largest[:MOST]:
+    moved, undecided = [], []
+    for number in np.unique(region[region > 0]):
         inside = region == number
         around = grown(inside) & ~inside
         ground = float(np.median(found.height[around]))
@@ -183,9 +146,9 @@ def search_levels(
         value, better = min(tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
-            moved.append(number)
+            moved.append(int(number))
         if any(_differ(found, other, inside, ground) for value, other in explanations if value < best + GAIN):
-            undecided.append(number)
+            undecided.append(int(number))
     return Levels(found, moved, undecided)
 
 

@@ -11,7 +11,7 @@ from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct import solve
-from helio_jax.reconstruct.levels import GAIN, MOST, Levels, at_level, search_levels
+from helio_jax.reconstruct.levels import GAIN, Levels, at_level, search_levels
 from helio_jax.reconstruct.model import Surface
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import ReconstructSettings
@@ -35,44 +35,9 @@ def test_a_floor_that_two_detectors_see_change_is_found():
     assert np.mean((region == 1) == INSIDE) > 0.995
 
 
-def test_an_oblique_weak_wall_is_found():
-    """A disc's rim runs in all directions; its floor differs by three deviations of a pixel in two detectors.
-
-    Averaged along rows and columns only, the seeds join and nothing is found: half of the image is right.
-    """
-    rng = np.random.default_rng(4)
-    y, x = np.indices((60, 60)) - 29.5
-    disc = np.hypot(y, x) < 20.0
-    signal = 1.0 + np.array([-0.12, 0.12, 0.09])[:, None, None] * disc + 0.04 * rng.normal(size=(3, 60, 60))
-    assert np.mean((find_plateaus(signal, np.full(signal.shape, 0.04**2)) == 1) == disc) > 0.98
-
-
-@pytest.mark.parametrize("turn", [30.0, 45.0, 70.0])
-def test_ground_about_an_oblique_slot_is_one_region(turn):
-    """A slot whose ends lie five pixels from the image's border. Rejects averages along its walls that, beyond their
-    ends, part the ground in two."""
-    y, x = np.indices((61, 61)) - 30.0
-    along, across = (np.cos(np.radians(turn)) * a + np.sin(np.radians(turn)) * b for a, b in ((x, y), (y, -x)))
-    reach = 25.0 / max(np.cos(np.radians(turn)), np.sin(np.radians(turn))) - 4.0
-    slot = (np.abs(along) < reach) & (np.abs(across) < 6.0)
-    signal = 1.0 + np.array([-0.5, 0.3, 0.2])[:, None, None] * slot
-    signal += 0.04 * np.random.default_rng(3).normal(size=signal.shape)
-    region = find_plateaus(signal, np.full(signal.shape, 0.04**2))
-    assert region.max() == 1
-    assert np.mean((region == 1) == slot) > 0.98
-
-
 def test_a_mask_is_no_plateau():
     """Only one detector changes. Rejects looking at the sum over all detectors."""
     assert find_plateaus(*images([-0.7, 0.0, 0.0])).max() == 0
-
-
-def test_a_spot_is_no_plateau():
-    """42 pixels that two detectors see change. Rejects a search of levels for every grain."""
-    rng = np.random.default_rng(0)
-    signal = 1.0 + 0.04 * rng.normal(size=(3, *SHAPE))
-    signal[:, 15:21, 30:37] += np.array([-0.5, 0.3, 0.2])[:, None, None]
-    assert find_plateaus(signal, np.full(signal.shape, 0.04**2)).max() == 0
 
 
 def test_noise_and_tilted_planes_have_no_plateaus():
@@ -95,33 +60,6 @@ def test_only_unexplained_regions_are_moved():
     good = np.random.default_rng(1).normal(size=(3, *SHAPE))
     assert not unexplained(region, good).any()
     assert np.array_equal(unexplained(region, good + 2.0 * INSIDE), region)
-
-
-def test_thin_rims_are_not_searched():
-    """A rim six pixels wide that the fit explains ill stays where it is; one of eight does not, nor do two together."""
-    good = np.random.default_rng(1).normal(size=(3, *SHAPE))
-    for width, second, is_left in ((6, 0, False), (8, 0, True), (5, 5, True)):
-        rim = np.zeros(SHAPE, int)
-        rim[5:35, 10 : 10 + width] = 1
-        rim[5:35, 10 + width : 10 + width + second] = 2
-        assert unexplained(rim, good + 3.0 * (rim > 0)).any() == is_left
-
-
-def test_only_the_largest_regions_are_searched():
-    """Of more regions than are searched the smallest are undecided. Catches hours of search on a rough image."""
-    region = np.zeros(SHAPE, int)
-    for number in range(1, MOST + 3):
-        region[2 : 2 + 3 * number, 5 * number : 5 * number + 4] = number
-    calls = []
-
-    def misfit(surface):
-        calls.append(surface)
-        return float(np.sum((surface.height[region > 2] + 20.0) ** 2)), surface
-
-    found, moved, undecided = search_levels(region, Surface(*np.zeros((3, *SHAPE))), (10.0, 10.0), 500.0, misfit)
-    assert sorted(moved) == list(range(3, MOST + 3)) and set(undecided) >= {1, 2}
-    assert np.all(found.height[(region == 1) | (region == 2)] == 0.0)
-    assert len(calls) < 30 * MOST
 
 
 def test_regions_with_a_narrow_gap_are_one():
@@ -190,32 +128,11 @@ def test_the_wall_that_the_beam_sees(way, axis, level):
     np.testing.assert_allclose(found.height[INSIDE], 5.0 + expected)
     slopes = found.slope_x, found.slope_y
     np.testing.assert_allclose(slopes[1 - axis][INSIDE], np.where(wall < abs(level), 1.0 / shift, 0.0))
-    np.testing.assert_allclose(slopes[axis][INSIDE], 0.0, atol=1e-9)
+    assert not slopes[axis][INSIDE].any()
     for field, before in zip(found, ground, strict=True):
         np.testing.assert_array_equal(field[~INSIDE], before[~INSIDE])
     undercut = at_level(INSIDE, ground, level, 5.0, (4.0, 4.0), None)
     assert np.all(undercut.height[INSIDE] == 5.0 + level) and not undercut.slope_x[INSIDE].any()
-
-
-@pytest.mark.parametrize("level", [-200.0, 200.0])
-@pytest.mark.parametrize("turn", [-40.0, 25.0])
-def test_the_oblique_wall_that_the_beam_sees(turn, level):
-    """A vertical wall n . (x, y) = c is, for the beam shift t, the plane z = (n . (X, Y) - c) / (n . t): its slopes are
-    n / (n . t). Rejects a wall that rises along the beam only, whose normal is off by up to the turn."""
-    shift, pitch = (0.6, 0.2), (4.0, 4.0)
-    angle = np.radians(turn) + np.arctan2(shift[1], shift[0])
-    normal = np.array([np.cos(angle), np.sin(angle)])
-    y, x = (4.0 * (i - 29.5) for i in np.indices((60, 60)))
-    across = normal[0] * x + normal[1] * y
-    inside = (np.abs(across) < 40.0) & (np.abs(normal[0] * y - normal[1] * x) < 1e3)
-    found = at_level(inside, Surface(*np.zeros((3, 60, 60))), level, 0.0, pitch, shift)
-    slope = normal / (normal @ shift)
-    rim = -np.sign(level) * 40.0
-    plane = (across - rim) / (normal @ shift)
-    middle = inside & (np.hypot(x, y) < 60.0) & (np.abs(plane) < 0.9 * abs(level))
-    assert middle.sum() > 100
-    for field, expected, off in zip(found, (plane, *slope), (8.0, 0.25, 0.25), strict=True):
-        assert np.quantile(np.abs(field - expected)[middle], 0.95) < off
 
 
 def test_a_region_at_the_border_has_no_wall_there():
@@ -305,16 +222,14 @@ def test_a_start_too_rough_to_predict_is_calmed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("azimuth", "nx", "ny"), [(90.0, 31, 61), (60.0, 46, 56)])
-def test_a_slot_across_the_beam_shows_its_far_wall(azimuth, nx, ny):
+def test_a_slot_across_the_beam_shows_its_far_wall():
     """A slot twice as deep as wide, of which the beam reaches the far wall only: it is taken for that wall.
 
     At most 5 % of its pixels are valid and wrong by more than 3 stated deviations and 5 % of the depth; half are valid.
-    Rejects a floor at some level that ends undercut (40 % wrong), for which multiple scattering makes the wall look,
-    and, oblique to the raster, walls that are looked for along rows and columns only (half is wrong).
+    Rejects a floor at some level that ends undercut (40 % wrong), for which multiple scattering makes the wall look.
     """
-    overrides = {"sample.width_um": 240.0, "sample.depth_um": 480.0, "sample.azimuth_deg": azimuth, "trace.rays": 256}
-    overrides |= {"scan.nx": nx, "scan.ny": ny, "scan.pixel_size_um": 20.0, "scan.center_um": [3.0, 4.0]}
+    overrides = {"sample.width_um": 240.0, "sample.depth_um": 480.0, "sample.azimuth_deg": 90.0, "trace.rays": 256}
+    overrides |= {"scan.nx": 31, "scan.ny": 61, "scan.pixel_size_um": 20.0, "scan.center_um": [3.0, 4.0]}
     scene = load_scene("scenes/trench.toml", overrides)
     stack = pipeline.record(scene, pipeline.simulate(scene, seed=5))
     rec = pipeline.reconstruct(stack, "refine", refine={"rays": 200_000, "substrate_um": 6000.0})
