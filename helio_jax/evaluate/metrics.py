@@ -365,7 +365,8 @@ def fit_center(
     grid = [(x0 + dx, y0 + dy) for dy in shifts for dx in shifts]
     first = np.array(min(grid, key=cost))
     simplex = first + 0.25 * reach_um * np.array([[0, 0], [1, 0], [0, 1]])
-    options = {"initial_simplex": simplex, "xatol": 0.01 * smallest, "fatol": 1e-9, "maxiter": 400}
+    # the place alone says when to stop: the cost jumps as pixels enter and leave the region
+    options = {"initial_simplex": simplex, "xatol": 0.01 * smallest, "fatol": np.inf, "maxiter": 400}
     best = minimize(cost, first, method="Nelder-Mead", options=options)
     moved = np.abs(best.x - start.center).max()
     if not best.success or moved > reach_um:
