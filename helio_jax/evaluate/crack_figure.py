@@ -48,7 +48,7 @@ def crack_panel(
     figure = Figure(figsize=((len(images) + 1) * _INCH, 2.1 * _INCH), facecolor="white", layout="constrained")
     axes = figure.subplots(2, len(images) + 1, squeeze=False, sharex=True, sharey=True)
     inside = np.any(regions, axis=0)
-    shown = np.ma.masked_array(rec.height, ~(rec.has_relief))
+    shown = np.ma.masked_array(rec.height, ~rec.has_relief)
     low, high = robust_range(shown.compressed(), 1.0)
     for row in axes:
         for ax, (name, image) in zip(row, images.items(), strict=False):

@@ -163,7 +163,7 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
     slope, misfit = _local_slopes(rec, use, s.window | 1)
     normal, known = _normal(slope), np.isfinite(misfit)
     labels = np.zeros(use.shape, int)
-    numbers: list[int] = []
+    n_facets = 0
     order = np.argsort(np.where(known, misfit, np.inf), axis=None)[: int(known.sum())]
     near = math.cos(math.radians(s.max_turn_deg))
     tried = np.zeros(use.shape, bool)
@@ -184,11 +184,10 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
             tried |= region
             inner = ndimage.binary_erosion(region, iterations=max(s.rim_pixels, 1))
             if region.sum() >= s.min_pixels and inner.sum() >= _LEAST_CORE * region.sum():
-                number = len(numbers) + 1
-                labels[region] = number
-                numbers.append(number)
+                n_facets += 1
+                labels[region] = n_facets
         tried[seed] = True
-    return _shared_out(rec, labels, numbers, use, s)
+    return _shared_out(rec, labels, use, s)
 
 
 def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
@@ -206,13 +205,14 @@ def _core(region: np.ndarray, rim: int) -> np.ndarray:
     return region
 
 
-def _shared_out(rec, labels, numbers, use, s: FacetSettings) -> np.ndarray:
+def _shared_out(rec, labels, use, s: FacetSettings) -> np.ndarray:
     """Give pixels within a window of facets to the facet whose plane there is nearest in height; one piece each.
 
     Borders are local: a flank that is bent by 2 degrees over its length makes its plane as a whole miss its edge by
     tens of um, and a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
     """
     out, best = labels.copy(), np.full(labels.shape, np.inf)
+    numbers = range(1, int(labels.max()) + 1)
     for number in numbers:
         region = labels == number
         away = np.abs(rec.height - _continued(rec, _core(region, s.rim_pixels), s.window | 1))
@@ -236,12 +236,13 @@ def _continued(rec: Reconstruction, core: np.ndarray, reach: float) -> np.ndarra
         reach: standard deviation of the weights [pixels]; beyond 5 of them from the core: infinite.
     """
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(np.where(core, values, 0.0), reach, mode="constant", truncate=5.0) / total
+    def weighed(values: np.ndarray | float) -> np.ndarray:
+        return ndimage.gaussian_filter(np.where(core, values, 0.0), reach, mode="constant", truncate=5.0)
 
-    total = np.maximum(
-        ndimage.gaussian_filter(core.astype(float), reach, mode="constant", truncate=5.0), np.finfo(float).tiny
-    )
+    def mean(values: np.ndarray) -> np.ndarray:
+        return weighed(values) / total
+
+    total = np.maximum(weighed(1.0), np.finfo(float).tiny)
     x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), rec.height
     at = np.stack([mean(x), mean(y)], -1)
     level = mean(z)

@@ -43,7 +43,7 @@ def ripple_panel(
     x, y = rec.raster_x, rec.raster_y
     style = raster_style(x, y)
     inside = np.any(regions, axis=0)
-    shown = np.ma.masked_array(rec.height, ~(rec.has_relief))
+    shown = np.ma.masked_array(rec.height, ~rec.has_relief)
     low, high = robust_range(shown.compressed(), 1.0)
     axes[0].imshow(shown, cmap="viridis", vmin=low, vmax=high, **style)
     for region in regions:

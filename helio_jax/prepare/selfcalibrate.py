@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
+from helio_jax.arrays import as_json
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
@@ -193,7 +194,6 @@ def apply(
     """
     time = scan_time(stack)
     scale = (flat_signal / found.signal)[:, None, None]
-    record = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in found._asdict().items()}
     return stack.replace(
         counts=(stack.counts - found.background(np.zeros(stack.shape) if time is None else time)) * scale,
         variance=None if stack.variance is None else stack.variance * scale**2,
@@ -201,7 +201,7 @@ def apply(
         n_rays=1.0,
         unit="detected per beam atom",
         instrument=instrument,
-        provenance={**stack.provenance, "self_calibrate": record},
+        provenance={**stack.provenance, "self_calibrate": as_json(found._asdict())},
     )
 
 

@@ -17,6 +17,7 @@ from helio_jax.arrays import border_mask
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import PhotometricSolution
 from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.samples import thinning
 from helio_jax.reconstruct.settings import ReconstructSettings
 
 MAX_PIXELS = 10_000
@@ -26,7 +27,8 @@ MOST_LEFT_OUT = 0.3
 trench multiple scattering comes near it."""
 _ALBEDO_PIXELS = 5
 """Side of the square over which the albedo's median is taken for it [pixels]."""
-_SEED = 11
+SEED = 11
+"""Of the drawn readings and instruments."""
 
 Solve = Callable[[np.ndarray, np.ndarray, SpotGeometry, int], np.ndarray]
 """(signal, variance [detector, y, x], geometry, pitches between pixels) -> heights [y, x], um."""
@@ -51,22 +53,25 @@ def bootstrap_heights(
         settings: priors (table refine), border, number of samples.
         solve: the method.
     """
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(SEED)
     shape = signal.shape[1:]
-    stride = 1
-    while (shape[0] // stride) * (shape[1] // stride) > MAX_PIXELS:
-        stride *= 2
+    stride = thinning(shape, MAX_PIXELS)
     data, spread = (field[:, ::stride, ::stride] for field in (signal, variance))
     height = solve(data, spread, geometry, stride)
+    told = _flat_signal(geometry)
     drawn = []
     for _ in range(settings.samples):
         other = _drawn_geometry(geometry, rng)
         reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
-        flat, told = (g.form_factor(np.zeros(1))[:, 2, 0] for g in (other, geometry))
-        reading = as_at_border(reading, data, settings)
-        drawn.append(solve(reading * (flat / told)[:, None, None], spread, other, stride) - height)
+        reading = as_at_border(reading, data, settings) * (_flat_signal(other) / told)[:, None, None]
+        drawn.append(solve(reading, spread, other, stride) - height)
     row, column = (np.minimum(np.arange(n) // stride, m - 1) for n, m in zip(shape, height.shape, strict=True))
     return np.array(drawn)[:, row[:, None], column]
+
+
+def _flat_signal(geometry: SpotGeometry) -> np.ndarray:
+    """Return the detection probability of the flat reference plane [detector]."""
+    return geometry.form_factor(np.zeros(1))[:, 2, 0]
 
 
 def as_at_border(data: np.ndarray, told: np.ndarray, settings: ReconstructSettings) -> np.ndarray:
@@ -117,9 +122,3 @@ def what_is_left_out(
     change = np.einsum("kiyx,yxi->kyx", near - prediction.hidden - used, solution.normals) + prediction.multiple
     most = MOST_LEFT_OUT * np.linalg.norm(used, axis=1)
     return albedo * np.clip(change, -most, most)
-
-
-def also_off_by(samples: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return samples with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um."""
-    factor = np.random.default_rng(_SEED + 1).standard_normal(len(samples))
-    return samples + (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * error

@@ -16,11 +16,12 @@ from helio_jax.arrays import border_mask, pitch
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
-from helio_jax.reconstruct.bootstrap import also_off_by, as_at_border, bootstrap_heights, what_is_left_out
+from helio_jax.reconstruct.bootstrap import SEED, as_at_border, bootstrap_heights, what_is_left_out
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
 from helio_jax.reconstruct.model import Prediction
+from helio_jax.reconstruct.samples import also_off_by
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.validity import reasons_from_data
 from helio_jax.reconstruction import Reconstruction
@@ -118,8 +119,9 @@ def photometric_heights(
         prediction = predict(near, solution.normals)
         if is_corrected:
             prediction = replace(prediction, multiple=settings.refine.multiple_error * prediction.multiple)
-        used = geometry.form_factor(np.zeros_like(near) if rounds == 1 else near)
-        return what_is_left_out(solution, used, geometry.form_factor(near), prediction)
+        phi = geometry.form_factor(near)
+        used = geometry.form_factor(np.zeros_like(near)) if rounds == 1 else phi
+        return what_is_left_out(solution, used, phi, prediction)
 
     data, taken_off = signal, np.zeros(signal.shape)
     height, solution = solve(data, variance, geometry)
@@ -130,10 +132,10 @@ def photometric_heights(
             data = as_at_border(signal - taken_off, signal, settings)
             height, solution = solve(data, variance, geometry)
         if predict and settings.samples:
-            samples = bootstrap_heights(data, variance, geometry, settings, lambda *about: solve(*about)[0])
             rest = left_out(height, solution, predict) - taken_off
             again = as_at_border(data - rest if n_corrections else data + rest, signal, settings)
-            samples = also_off_by(samples, solve(again, variance, geometry)[0] - height)
+            samples = bootstrap_heights(data, variance, geometry, settings, lambda *about: solve(*about)[0])
+            samples = also_off_by(samples, solve(again, variance, geometry)[0] - height, SEED + 1)
     except GuardError as error:
         note = f"; no error bars, for shadows and multiple scattering could not be predicted: {error}"
     reason = reasons_from_data(stack)

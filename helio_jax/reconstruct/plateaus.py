@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from helio_jax.reconstruct.edges import along, ranked
+from helio_jax.reconstruct.validity import squares
 
 WALL = 25.0
 """Change across an edge (chi-square without the detector that changes most) from which on it may be a wall: noise alone
@@ -22,8 +23,6 @@ MIN_REGION = 50
 """Smallest region that is looked for [pixels]."""
 UNEXPLAINED = 2.0
 """Mean square residual, within a region or along its border, in those of the ground, from which on levels are tried."""
-_LARGEST = 25.0
-"""A datum counts with this square at most."""
 _UNKNOWN = 1e6
 """Variance of data that were not observed, in those of the worst ones: finite, for running means."""
 _BAND = 3
@@ -115,7 +114,7 @@ def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         region: from `find_plateaus` [y, x].
         residuals: of the fit, in standard deviations [detector, y, x].
     """
-    square = np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST).mean(0)
+    square = squares(residuals).mean(0)
     limit = UNEXPLAINED * square[region == 0].mean()
     left = region.copy()
     for number in range(1, int(region.max()) + 1):

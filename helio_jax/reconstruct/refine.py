@@ -17,6 +17,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
+from helio_jax.reconstruct.samples import thinning
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 
@@ -83,14 +84,6 @@ class Fit:
         return (total / np.maximum(np.sum(self.weight**2, axis=(1, 2)), 1e-300)).tolist()
 
 
-def _thinning(shape: tuple[int, int]) -> int:
-    """Return the power of two by which rows and columns are thinned for the posterior."""
-    stride = 1
-    while (shape[0] // stride) * (shape[1] // stride) > MAX_PIXELS:
-        stride *= 2
-    return stride
-
-
 def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarray | None) -> Posterior | None:
     """Return the posterior at the fit, on a thinned raster where the full one is too large.
 
@@ -98,7 +91,7 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     an edge of the thinned raster doubts the trapezoid rule stride^1.5 times less than the same kink would let it.
     """
     s, m = refiner.settings, refiner.model
-    stride = _thinning(refiner.signal.shape[1:])
+    stride = thinning(refiner.signal.shape[1:], MAX_PIXELS)
     if s.samples == 0:
         return None
     thin = (slice(None, None, stride),) * 2

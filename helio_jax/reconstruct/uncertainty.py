@@ -25,6 +25,7 @@ from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
 from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Unknowns
+from helio_jax.reconstruct.samples import also_off_by
 
 MAX_PIXELS = 30_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -147,10 +148,8 @@ class Posterior:
         The factors of several errors are drawn independently of one another.
         """
         n_before = 0 if self.bent is None else len(self.bent)
-        how_far = np.random.default_rng(1 + n_before).standard_normal(len(self.samples))
-        how_far /= np.sqrt(np.mean(how_far**2))
         bent = error[None] if self.bent is None else np.concatenate([self.bent, error[None]])
-        return replace(self, samples=self.samples + how_far[:, None, None] * error, bent=bent)
+        return replace(self, samples=also_off_by(self.samples, error, 1 + n_before), bent=bent)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""

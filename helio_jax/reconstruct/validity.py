@@ -21,7 +21,7 @@ TRUSTED = 0.5
 EXPLAINED = 3.0
 """Mean square residual of a pixel and its eight neighbours, in that of most pixels and at least 1, up to which the
 model explains them: noise alone reaches it in one pixel of a million."""
-_LARGEST = 25.0
+LARGEST = 25.0
 """A datum counts with this square at most."""
 VEILED = 5.0
 """A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
@@ -97,6 +97,11 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch
     return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
 
 
+def squares(residuals: np.ndarray) -> np.ndarray:
+    """Return the squares of residuals, `LARGEST` at most, so that a few do not speak for all; 0 where there is none."""
+    return np.minimum(np.nan_to_num(residuals) ** 2, LARGEST)
+
+
 def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
     """Return True where the fit contradicts the images of a pixel and its neighbours together [y, x].
 
@@ -107,7 +112,7 @@ def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
         residuals: of the fit, in standard deviations [detector, y, x].
         is_observed: whether there is a datum [detector, y, x].
     """
-    square = np.where(is_observed, np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST), 1.0).mean(0)
+    square = np.where(is_observed, squares(residuals), 1.0).mean(0)
     around = uniform_filter(square, 3, mode="constant", cval=1.0)
     return around > EXPLAINED * max(1.0, float(np.median(around)))
 

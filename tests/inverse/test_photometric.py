@@ -10,11 +10,12 @@ from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Uncertainty
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.bootstrap import also_off_by, as_at_border, what_is_left_out
+from helio_jax.reconstruct.bootstrap import as_at_border, what_is_left_out
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import solve_linear
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.photometric import photometric_heights
+from helio_jax.reconstruct.samples import also_off_by
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.truth import true_height
 
@@ -154,7 +155,7 @@ def test_data_are_brought_to_the_flat_only_where_there_is_one(bshem):
 def test_an_error_of_all_heights_has_deviation_one():
     """Its mean square is the error's, in however few samples."""
     error = np.arange(12.0).reshape(3, 4)
-    np.testing.assert_allclose(np.sqrt(np.mean(also_off_by(np.zeros((3, 3, 4)), error) ** 2, axis=0)), error)
+    np.testing.assert_allclose(np.sqrt(np.mean(also_off_by(np.zeros((3, 3, 4)), error, 5) ** 2, axis=0)), error)
 
 
 def test_one_correction_nears_the_sphere():
@@ -185,3 +186,5 @@ def test_what_cannot_be_predicted_is_said(bshem):
     plain = photometric_heights(stack, ReconstructSettings(method="nearfield"), geometry)
     np.testing.assert_array_equal(rec.height, plain.height)
     assert rec.height_std is None and "too rough" in rec.status and plain.height_std is None
+    linear = photometric_heights(stack, ReconstructSettings(method="linear"), geometry, fails)
+    assert linear.height_std is None and "no error bars" in linear.status

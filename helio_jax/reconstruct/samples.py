@@ -1,0 +1,24 @@
+"""Samples of the heights, whatever their method: how far rasters are thinned for them, and errors of all as one."""
+
+import numpy as np
+
+
+def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
+    """Return the power of two by which rows and columns of a raster (y, x) are thinned to so many pixels at most."""
+    stride = 1
+    while (shape[0] // stride) * (shape[1] // stride) > max_pixels:
+        stride *= 2
+    return stride
+
+
+def also_off_by(samples: np.ndarray, error: np.ndarray, seed: int) -> np.ndarray:
+    """Return samples [sample, y, x] with one error more, of all heights together, known up to a factor of deviation 1.
+
+    Args:
+        samples: of the heights [sample, y, x], um.
+        error: [y, x], um.
+        seed: of the factors; errors that are independent of one another have different ones.
+    """
+    how_far = np.random.default_rng(seed).standard_normal(len(samples))
+    how_far /= np.sqrt(np.mean(how_far**2))
+    return samples + how_far[:, None, None] * error
