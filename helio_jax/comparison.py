@@ -240,6 +240,8 @@ def _explained(usual: Comparison, path: Path, here: Mapping[str, Any], progress:
             rows.append(Row(effect.name, note=str(e)))
             continue
         said = f"{effect.name}: {terms.lag:.2f} pixels" if terms.lag else effect.name
+        if fit.gain_drift.size:
+            said += f": {' '.join(f'{drift:+.0%}' for drift in fit.gain_drift[:, 0])} to the end"
         rows.append(_row(said, usual, fit, height))
     return tuple(rows)
 

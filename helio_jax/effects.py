@@ -116,6 +116,7 @@ EFFECTS = (
     Effect("offset: a constant background", terms=replace(BARE, offset=True)),
     Effect("slow drift of the background", terms=replace(BARE, offset=True, drift=3)),
     Effect("slope along the fast axis", terms=Terms()),
+    Effect("gain that drifts evenly", terms=Terms(gain_drift=1)),
     Effect(LAG),
     Effect("sample 10 % nearer to the plate", _distance(0.9), is_geometry=True),
     Effect("sample 10 % farther from the plate", _distance(1.1), is_geometry=True),

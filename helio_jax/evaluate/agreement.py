@@ -6,7 +6,7 @@ normalises and judges; does not simulate, and does not move the sample (but says
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import shift as shift_image
@@ -39,20 +39,23 @@ class Terms:
         drift: degree of the polynomial in scan time; 0: none.
         along: a slope along the fast axis.
         lag: response time of the detector in pixels (exponential, in scan order).
+        gain_drift: degree of the polynomial in scan time that the gain follows; 0: it is constant.
     """
 
     offset: bool = True
     drift: int = 3
     along: bool = True
     lag: float = 0.0
+    gain_drift: int = 0
 
-    def basis(self, shape: tuple[int, int], is_row_slow: bool) -> list[np.ndarray]:
-        """Return the images, but for the signal itself, whose sum is fitted, each [y, x]."""
-        time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in shape), indexing="ij")
+    def images(self, signal: np.ndarray, is_row_slow: bool) -> np.ndarray:
+        """Return the images whose sum is fitted, the signal, of gain 1, the first [term, y, x]."""
+        time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in signal.shape), indexing="ij")
         if not is_row_slow:
             time, along = along, time
-        drift = np.moveaxis(np.polynomial.legendre.legvander(time, self.drift), -1, 0)[1:]
-        return [*([np.ones(shape)] if self.offset else []), *drift, *([along] if self.along else [])]
+        degrees = np.moveaxis(np.polynomial.legendre.legvander(time, max(self.drift, self.gain_drift)), -1, 0)
+        background = [*degrees[: int(self.offset)], *degrees[1 : self.drift + 1], *([along] if self.along else [])]
+        return np.stack([signal, *background, *(signal * degrees[1 : self.gain_drift + 1])])
 
 
 def lagged(image: np.ndarray, pixels: float, is_row_slow: bool) -> np.ndarray:
@@ -81,6 +84,8 @@ class Agreement:
         residuals: (data - model) / standard error [detector, y, x], NaN where not observed.
         n_parameters: fitted numbers.
         shift: where the sample seems to be, relative to the scene (x, y) [um].
+        gain_drift: coefficients of the Legendre polynomials in scan time, from -1 to 1, that the gain follows, over the
+            mean gain [detector, degree].
     """
 
     detectors: tuple[str, ...]
@@ -90,6 +95,7 @@ class Agreement:
     residuals: np.ndarray
     n_parameters: int
     shift: tuple[float, float] = (0.0, 0.0)
+    gain_drift: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def is_flagged(self) -> np.ndarray:
@@ -187,11 +193,11 @@ def normalise(
     if stack.variance is None:
         raise GuardError(f"{stack.name}: the variance of its counts is not known, so nothing can be compared with it")
     is_row_slow = stack.fast_axis == "x"
-    basis = terms.basis(stack.shape[1:], is_row_slow)
     std = np.sqrt(np.maximum(stack.variance, 1e-300))
     model, gain, offset = np.empty(stack.shape), np.empty(stack.shape[0]), np.zeros(stack.shape[0])
+    gain_drift = np.empty((stack.shape[0], terms.gain_drift))
     for k, image in enumerate(probability):
-        images = np.stack([lagged(image, terms.lag, is_row_slow), *basis])
+        images = terms.images(lagged(image, terms.lag, is_row_slow), is_row_slow)
         found = _fit(stack.counts[k], std[k], stack.is_observed[k], images)
         if not found[0] > 0.0:
             raise GuardError(
@@ -200,10 +206,11 @@ def normalise(
             )
         model[k] = np.tensordot(found, images, 1)
         gain[k], offset[k] = found[0], found[1] if terms.offset else 0.0
+        gain_drift[k] = found[found.size - terms.gain_drift :] / found[0]
     std = np.sqrt(std**2 + gain[:, None, None] ** 2 * own_variance)
     residuals = np.where(stack.is_observed, (stack.counts - model) / std, np.nan)
-    n = stack.shape[0] * (1 + len(basis)) + (terms.lag > 0.0)
-    return Agreement(stack.instrument.detector_names, gain, offset, model, residuals, n, shift)
+    n = stack.shape[0] * len(images) + (terms.lag > 0.0)
+    return Agreement(stack.instrument.detector_names, gain, offset, model, residuals, n, shift, gain_drift)
 
 
 def find_shift(

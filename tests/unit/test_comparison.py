@@ -83,6 +83,23 @@ def test_normalise_recovers_gain_and_offset():
     assert found.bic < normalise(stack, signal, Terms(drift=0)).bic < normalise(stack, signal, Terms(offset=False)).bic
 
 
+def test_a_drifting_gain_is_told_from_a_drifting_background():
+    """A gain that falls by 30 % over the scan is found to 3 %, and leaves a chi-square of noise.
+
+    A drift of the background does not. Catches a drift along the fast axis, and parameters that are not counted.
+    """
+    signal, stack = blob_stack(np.random.default_rng(3))
+    time = np.linspace(-1.0, 1.0, 40)[:, None]
+    stack = stack.replace(counts=stack.counts - 0.15 * 4e5 * signal * time)
+    steady, drifting = normalise(stack, signal), normalise(stack, signal, Terms(gain_drift=1))
+    assert drifting.n_parameters == steady.n_parameters + 1
+    assert drifting.gain[0] == pytest.approx(4e5, rel=0.02)
+    assert drifting.gain_drift[0, 0] == pytest.approx(-0.15, abs=0.015)
+    assert drifting.bic < steady.bic - 10.0
+    total, dof = float(np.nansum(drifting.residuals**2)), drifting.n_data - drifting.n_parameters
+    assert_likely(2 * min(chi2_law.sf(total, dof), chi2_law.cdf(total, dof)), "chi-square with a drifting gain")
+
+
 def test_scratches_do_not_set_the_gain():
     """Three bright scratches change the gain by less than 1 % and are flagged; catches least squares."""
     signal, stack = blob_stack(np.random.default_rng(2))
@@ -164,7 +181,7 @@ def test_explain_names_the_effect(scene_path, tmp_path):
     found = compare(data, scene_path, explain=True)
     known = {row.name: row.d_bic for row in found.effects if not row.note}
     assert min(known, key=known.get).startswith("rough-diffuse") and min(known.values()) < -10
-    assert len(known) >= 14, [row for row in found.effects if row.note]
+    assert len(known) >= 15, [row for row in found.effects if row.note]
     assert all(path.is_file() for path in found.write(tmp_path))
 
 
