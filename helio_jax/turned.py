@@ -29,7 +29,7 @@ _GROUND = 0.05
 
 def flat_signal(instrument: Instrument) -> np.ndarray:
     """Return the detection probability of the flat reference plane [detector]."""
-    return SpotGeometry(instrument).form_factor(np.zeros(1))[:, 2, 0]
+    return SpotGeometry(instrument).flat_signal()
 
 
 def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> MicrographStack:

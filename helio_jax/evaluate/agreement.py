@@ -6,7 +6,7 @@ normalises and judges; does not simulate, and does not move the sample (but says
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import shift as shift_image
@@ -48,14 +48,14 @@ class Terms:
     lag: float = 0.0
     gain_drift: int = 0
 
-    def images(self, signal: np.ndarray, is_row_slow: bool) -> np.ndarray:
-        """Return the images whose sum is fitted, the signal, of gain 1, the first [term, y, x]."""
-        time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in signal.shape), indexing="ij")
+    def basis(self, shape: tuple[int, int], is_row_slow: bool) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return the images of the background whose sum is fitted, and what the gain is changed by [term, y, x]."""
+        time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in shape), indexing="ij")
         if not is_row_slow:
             time, along = along, time
         degrees = np.moveaxis(np.polynomial.legendre.legvander(time, max(self.drift, self.gain_drift)), -1, 0)
         background = [*degrees[: int(self.offset)], *degrees[1 : self.drift + 1], *([along] if self.along else [])]
-        return np.stack([signal, *background, *(signal * degrees[1 : self.gain_drift + 1])])
+        return background, degrees[1 : self.gain_drift + 1]
 
 
 def lagged(image: np.ndarray, pixels: float, is_row_slow: bool) -> np.ndarray:
@@ -94,8 +94,8 @@ class Agreement:
     model: np.ndarray
     residuals: np.ndarray
     n_parameters: int
-    shift: tuple[float, float] = (0.0, 0.0)
-    gain_drift: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    shift: tuple[float, float]
+    gain_drift: np.ndarray
 
     @property
     def is_flagged(self) -> np.ndarray:
@@ -193,11 +193,13 @@ def normalise(
     if stack.variance is None:
         raise GuardError(f"{stack.name}: the variance of its counts is not known, so nothing can be compared with it")
     is_row_slow = stack.fast_axis == "x"
+    background, gain_changes = terms.basis(stack.shape[1:], is_row_slow)
     std = np.sqrt(np.maximum(stack.variance, 1e-300))
     model, gain, offset = np.empty(stack.shape), np.empty(stack.shape[0]), np.zeros(stack.shape[0])
     gain_drift = np.empty((stack.shape[0], terms.gain_drift))
     for k, image in enumerate(probability):
-        images = terms.images(lagged(image, terms.lag, is_row_slow), is_row_slow)
+        signal = lagged(image, terms.lag, is_row_slow)
+        images = np.stack([signal, *background, *(signal * gain_changes)])
         found = _fit(stack.counts[k], std[k], stack.is_observed[k], images)
         if not found[0] > 0.0:
             raise GuardError(
@@ -209,7 +211,7 @@ def normalise(
         gain_drift[k] = found[found.size - terms.gain_drift :] / found[0]
     std = np.sqrt(std**2 + gain[:, None, None] ** 2 * own_variance)
     residuals = np.where(stack.is_observed, (stack.counts - model) / std, np.nan)
-    n = stack.shape[0] * len(images) + (terms.lag > 0.0)
+    n = stack.shape[0] * (1 + len(background) + terms.gain_drift) + (terms.lag > 0.0)
     return Agreement(stack.instrument.detector_names, gain, offset, model, residuals, n, shift, gain_drift)
 
 

@@ -58,20 +58,15 @@ def bootstrap_heights(
     stride = thinning(shape, MAX_PIXELS)
     data, spread = (field[:, ::stride, ::stride] for field in (signal, variance))
     height = solve(data, spread, geometry, stride)
-    told = _flat_signal(geometry)
+    told = geometry.flat_signal()
     drawn = []
     for _ in range(settings.samples):
         other = _drawn_geometry(geometry, rng)
         reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
-        reading = as_at_border(reading, data, settings) * (_flat_signal(other) / told)[:, None, None]
+        reading = as_at_border(reading, data, settings) * (other.flat_signal() / told)[:, None, None]
         drawn.append(solve(reading, spread, other, stride) - height)
     row, column = (np.minimum(np.arange(n) // stride, m - 1) for n, m in zip(shape, height.shape, strict=True))
     return np.array(drawn)[:, row[:, None], column]
-
-
-def _flat_signal(geometry: SpotGeometry) -> np.ndarray:
-    """Return the detection probability of the flat reference plane [detector]."""
-    return geometry.form_factor(np.zeros(1))[:, 2, 0]
 
 
 def as_at_border(data: np.ndarray, told: np.ndarray, settings: ReconstructSettings) -> np.ndarray:

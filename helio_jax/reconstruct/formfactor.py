@@ -93,5 +93,9 @@ class SpotGeometry:
             at = (jnp.asarray(x, jnp.float64) for x in self.position(np.asarray(height, np.float64)))
             return np.asarray(_jitted(jnp.asarray(self.rims, jnp.float64), *at))
 
+    def flat_signal(self) -> np.ndarray:
+        """Return the detection probability of the flat reference plane [detector]."""
+        return self.form_factor(np.zeros(1))[:, 2, 0]
+
 
 _jitted = jax.jit(form_factor)

@@ -21,7 +21,7 @@ TRUSTED = 0.5
 EXPLAINED = 3.0
 """Mean square residual of a pixel and its eight neighbours, in that of most pixels and at least 1, up to which the
 model explains them: noise alone reaches it in one pixel of a million."""
-LARGEST = 25.0
+_LARGEST = 25.0
 """A datum counts with this square at most."""
 VEILED = 5.0
 """A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
@@ -98,8 +98,8 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch
 
 
 def squares(residuals: np.ndarray) -> np.ndarray:
-    """Return the squares of residuals, `LARGEST` at most, so that a few do not speak for all; 0 where there is none."""
-    return np.minimum(np.nan_to_num(residuals) ** 2, LARGEST)
+    """Return the squares of residuals, limited, so that a few do not speak for all; 0 where there is none."""
+    return np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST)
 
 
 def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
