@@ -56,7 +56,8 @@ class Facet:
         projected_long_um, projected_short_um: the same seen along the plate normal.
         rms_um: of the heights about the plane.
         n_pixels: its size.
-        is_cut: it touches the border of the reconstructed field, so sides and areas are lower bounds.
+        is_cut: it touches the border of the reconstructed field (holes smaller than a facet are none), so sides and
+            areas are lower bounds.
     """
 
     number: int
@@ -309,7 +310,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
     sides, true_sides = (_sides(p, projected, step) for p in (flat, flat + flat @ lift))
     rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
     edge_std = step * _roughness_of_rim(region)
-    lower = ndimage.binary_dilation(region) & ~use
+    lower = ndimage.binary_dilation(region) & _outside(use, s.min_pixels)
     border = np.zeros_like(region)
     border[[0, -1]], border[:, [0, -1]] = True, True
     return Facet(
@@ -332,6 +333,12 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
         n_pixels=int(region.sum()),
         is_cut=bool(np.any(region & border) or lower.sum() > 0.1 * rim.sum()),
     )
+
+
+def _outside(use: np.ndarray, min_pixels: int) -> np.ndarray:
+    """Return what is not reconstructed [y, x] but for holes smaller than a facet: these are not the field's border."""
+    pieces, _ = _pieces(~use)
+    return ~use & (np.bincount(pieces.ravel())[pieces] >= min_pixels)
 
 
 def _sides(points: np.ndarray, projected: float, step: float) -> tuple[float, float]:
