@@ -114,6 +114,15 @@ class MicrographStack:
         """Counts of order 2 and above [detector, y, x], where the orders are known."""
         return None if self.by_order is None else self.by_order[1:].sum(0)
 
+    @property
+    def scan_time(self) -> np.ndarray | None:
+        """Time of its own scan at which every pixel was recorded, -1 to 1 [detector, y, x], of aligned scans."""
+        told = self.provenance.get("scan_time")
+        if told is None:
+            return None
+        x, y = np.meshgrid(self.x, self.y)
+        return np.stack([a * x + b * y + c for a, b, c in told])
+
     def shares(self) -> dict[str, float]:
         """Return what share of all counts (without background) scattered more than once, and met the plate.
 

@@ -207,7 +207,8 @@ def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> Micr
 def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
     """Return changes of the settings, those added that the stack's calibration asks for and nobody has given."""
     given = dict(changes.get("refine", {}))
-    priors = stack.provenance.get("calibrate", {}).get("priors", {})
+    calibration = stack.provenance.get("calibrate") or stack.provenance.get("self_calibrate", {})
+    priors = calibration.get("priors", {})
     asked = {key: value for key, value in priors.items() if key not in settings.refine.model_fields_set}
     if not asked and not given:
         return changes

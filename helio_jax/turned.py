@@ -8,12 +8,18 @@ came out a fifth too low, and flanks of 55 degrees at 32, without it (benchmarks
 import numpy as np
 from scipy import ndimage
 
-from helio_jax.arrays import border_mask
+from helio_jax.arrays import as_json, border_mask
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.predict import make_predictor
-from helio_jax.prepare.selfcalibrate import Relief, SelfCalibration, effective_instrument, self_calibrate
+from helio_jax.prepare.selfcalibrate import (
+    Relief,
+    SelfCalibration,
+    distance_std,
+    effective_instrument,
+    self_calibrate,
+)
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.photometric import limited
@@ -23,6 +29,11 @@ from helio_jax.reconstruct.solve import reconstruct_stack
 _ROUNDS, _SETTLED = 8, (0.01, 0.5)
 """The surface is found anew until share and polar angle [deg] change by less than this, or so often (flanks of 55 deg
 are 40 by the first calibration of a tall crystal, and 52, 55 by the next ones)."""
+_PRIORS = {"gain_std": 0.05, "offset_std": 0.1, "max_rounds": 8}
+_DRIFT_PRIORS = {"drift_std": 0.1, "drift_degrees": (3, 3)}
+"""What the self-calibration leaves open, handed on to the fit: how far gains, backgrounds and their drift, over level
+ground's signal, were off on the synthetic samples of benchmarks/crystal.py (1 to 2 % of the reading), and its rounds.
+Drift that is held bends the heights of those by 20 to 30 um."""
 _GROUND = 0.05
 """Quantile of the border's heights that is taken for level ground."""
 
@@ -37,6 +48,9 @@ def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> 
 
     Done several times: the surface found with one calibration tells the next one how far away each point is and what
     is scattered several times, which is taken off in the share that the readings ask for.
+
+    What stays open is handed on to the fit (provenance, `self_calibrate.priors`): gains, backgrounds, their drift, and
+    by how much the polar angle makes the distance, and with it the level that the fit keeps, uncertain.
 
     Args:
         stack: aligned readings.
@@ -67,7 +81,11 @@ def _in_beam_units(stack: MicrographStack, found: SelfCalibration) -> Micrograph
 
 def _noted(stack: MicrographStack, note: str, without_multiple: bool) -> MicrographStack:
     """Return a self-calibrated stack whose record says how multiple scattering was dealt with."""
-    record = stack.provenance["self_calibrate"] | {"note": note, "without_multiple": without_multiple}
+    record = stack.provenance["self_calibrate"]
+    priors = _PRIORS | ({} if stack.scan_time is None else _DRIFT_PRIORS)
+    priors |= {"level_std_um": distance_std(stack.instrument, record["spread_deg"])}
+    record = record | {"note": note, "without_multiple": without_multiple}
+    record["priors"] = as_json(priors)
     return stack.replace(provenance={**stack.provenance, "self_calibrate": record})
 
 

@@ -93,15 +93,6 @@ class SelfCalibration(NamedTuple):
         return self.gain[:, None, None] * np.einsum("kj,kyxj->kyx", level, terms)
 
 
-def scan_time(stack: MicrographStack) -> np.ndarray | None:
-    """Return the time of its own scan at which every pixel was recorded, -1 to 1 [image, y, x]; None: not told."""
-    told = stack.provenance.get("scan_time")
-    if told is None:
-        return None
-    x, y = np.meshgrid(stack.x, stack.y)
-    return np.stack([a * x + b * y + c for a, b, c in told])
-
-
 def self_calibrate(
     stack: MicrographStack,
     settings: SelfCalibrateSettings = SelfCalibrateSettings(),
@@ -156,7 +147,7 @@ def _readings(stack, settings, relief, inside, chosen, aperture) -> tuple[Readin
         ndimage.median_filter(np.where(known, image, np.median(image[known])), _WINDOW)
         for image, known in zip(stack.counts, stack.is_observed, strict=True)
     ]
-    k, time = len(calm), scan_time(stack)
+    k, time = len(calm), stack.scan_time
     value, known = (np.stack([np.asarray(image).ravel()[chosen] for image in images]) for images in (calm, inside))
     unit = np.array([np.median(v[seen]) for v, seen in zip(value, known, strict=True)])
     when = np.zeros(value.shape) if time is None else time.reshape(k, -1)[:, chosen]
@@ -192,7 +183,7 @@ def apply(
         flat_signal: detection probability of level ground by the effective instrument [detector].
         instrument: from `effective_instrument`.
     """
-    time = scan_time(stack)
+    time = stack.scan_time
     scale = (flat_signal / found.signal)[:, None, None]
     return stack.replace(
         counts=(stack.counts - found.background(np.zeros(stack.shape) if time is None else time)) * scale,
@@ -213,3 +204,9 @@ def effective_instrument(instrument: Instrument, polar_deg: float) -> Instrument
     radius = np.mean([math.hypot(*a.center) for a in instrument.apertures()])
     distance = float(radius / math.tan(math.radians(polar_deg)))
     return instrument.model_copy(update={"plate": instrument.plate.model_copy(update={"sample_distance_um": distance})})
+
+
+def distance_std(instrument: Instrument, spread_deg: float) -> float:
+    """Return how far off the distance of an effective instrument is [um] where its polar angle is off by so much."""
+    radius = np.mean([math.hypot(*a.center) for a in instrument.apertures()])
+    return float((radius + instrument.sample_distance**2 / radius) * math.radians(spread_deg))

@@ -106,11 +106,15 @@ class Lagged(NamedTuple):
 
     What is hidden follows the levels of the plateaus: `plateau` [plateau, y, x] are the weights whose sum over the
     heights is a plateau's level above the ground, `level` [plateau] its value at the prediction and `level_response`
-    [plateau, detector, 3, y, x] the change of `hidden` per um of it. `noise_change` is
-    from `Model.noise_change`. What is hidden also follows the geometry: `hidden_moves` [move, detector, 3, y, x] is its
-    change per unit of a move (distance, polar angle, azimuth; um, rad), from where it was predicted, `predicted_moves`
-    [move, detector]; both have no moves where the geometry is known. `drift` [mode, y, x] are the shapes of the slow
-    drift, and `across` (x, y) [2, y, x] the positions [um] by which a tilt raises the border.
+    [plateau, detector, 3, y, x] the change of `hidden` per um of it. All that is lagged follows the modes of the
+    relief: `mode` [mode, y, x] are the weights whose sum over the heights is a mode's amplitude, `amplitude` [mode] its
+    value at the prediction and `mode_response` [mode, detector, y, x] the change of the data per unit of it.
+    `noise_change` is from `Model.noise_change`. What is hidden also follows the geometry: `hidden_moves`
+    [move, detector, 3, y, x] is its change per unit of a move (distance, polar angle, azimuth; um, rad), from where it
+    was predicted, `predicted_moves` [move, detector]; both have no moves where the geometry is known. `drift`
+    [detector or 1, mode, y, x] are the shapes of the slow drift, and `across` (x, y) [2, y, x] the positions [um] by
+    which a tilt raises the border. `level_weight` [y, x] are the weights whose sum over the heights is to be
+    `held_level`, both over its deviation; 0 where the level is not held.
     """
 
     data: Any
@@ -122,6 +126,9 @@ class Lagged(NamedTuple):
     plateau: Any
     level: Any
     level_response: Any
+    mode: Any
+    amplitude: Any
+    mode_response: Any
     hidden_moves: Any
     predicted_moves: Any
     drift: Any
@@ -133,6 +140,8 @@ class Lagged(NamedTuple):
     bend_x: Any
     bend_y: Any
     border: Any
+    level_weight: Any
+    held_level: Any
     whitening: Any
     slope_scale_x: Any
     slope_scale_y: Any
@@ -248,13 +257,14 @@ class Model(eqx.Module):
         multiple = lagged.multiple * jnp.exp(lagged.multiple_std * unknowns.log_multiple)[:, None, None]
         single = single - lagged.noise_change
         read = gain * (albedo * single + multiple + unknowns.unseen * lagged.unseen)
-        return read + self.background(unknowns, lagged)
+        followed = jnp.einsum("ryx,yx->r", lagged.mode, surface.height) - lagged.amplitude
+        return read + jnp.tensordot(followed, lagged.mode_response, 1) + self.background(unknowns, lagged)
 
     def background(self, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
         """Return what the detectors read without signal: offset, slow drift, scan lines ([detector, y, x] or less)."""
         offset = (lagged.offset_std * unknowns.offset)[:, None, None]
         if unknowns.drift.size:
-            offset = offset + jnp.tensordot(lagged.drift_std * unknowns.drift, lagged.drift, 1)
+            offset = offset + jnp.sum((lagged.drift_std * unknowns.drift)[:, :, None, None] * lagged.drift, 1)
         if unknowns.lines.size:
             offset = offset + jnp.expand_dims(lagged.lines_std[:, None] * unknowns.lines, 2 - self.slow_axis)
         return offset
@@ -366,6 +376,7 @@ class Model(eqx.Module):
             "edge_x": edge_x,
             "edge_y": edge_y,
             "border": self.border_residuals(surface, unknowns, lagged),
+            "level": jnp.sum(lagged.level_weight * surface.height) - lagged.held_level,
             "slope_x": surface.slope_x / SLOPE_STD,
             "slope_y": surface.slope_y / SLOPE_STD,
             **{name: getattr(unknowns, name) for name in INSTRUMENT},

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.instrument import Instrument
+from helio_jax.reconstruct.background import ScanOrder
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.noisebias import noise_bias
@@ -28,6 +29,9 @@ GAINS, OFF_BY_FAR = ("log_gain", "offset"), 2.0
 
 SLOWEST = 0.9
 """Contraction per round that a fit is credited with at least: what does not converge is off by nine last changes."""
+
+LEAST_RELAXATION = 0.1
+"""Share of a round's change that the next prediction is made on at least."""
 
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
@@ -104,14 +108,16 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
         Surface(*(field[thin] for field in refiner.surface)),
         settings,
         None if region is None else region[thin],
-        m.slow_axis,
+        refiner.order.thinned(thin),
     )
     part.values = refiner.values | {"lines": refiner.values["lines"][:, ::stride]}
-    part.drift = refiner.drift[:, *thin]
+    part.drift = refiner.drift[:, :, *thin]
     part.residuals = refiner.residuals[:, *thin]
     predicted_on = Surface(*(field[thin] for field in refiner.predicted_on))
     part.adopt(refiner.prediction.thinned(thin), predicted_on)
     part.level_response = refiner.level_response[..., *thin]
+    part.mode = refiner.mode[:, *thin] * stride**2
+    part.mode_response = refiner.mode_response[..., *thin]
     unknowns, lagged = part.lag(s.robust_limits[-1], s.jump_limits[-1])
     lagged = lagged._replace(
         inverse_sigma=lagged.inverse_sigma * stride,
@@ -122,6 +128,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
     found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
+    if refiner.is_level_held and s.level_std_um:
+        found = found.also_off_by(s.level_std_um * found.level_response)
     return found.on_raster(refiner.signal.shape[1:], stride)
 
 
@@ -134,7 +142,7 @@ def misfit_on(
     surface: Surface,
     settings: ReconstructSettings,
     predict: Predict,
-    slow_axis: int = 0,
+    order: ScanOrder = ScanOrder(),
     values: dict[str, np.ndarray] | None = None,
 ) -> tuple[float, Surface]:
     """Return half the robust chi-square that is left when a surface's relief is fitted to the data, and that surface.
@@ -144,7 +152,7 @@ def misfit_on(
     """
     s = settings.refine
     with jax.enable_x64(True):
-        refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings, None, slow_axis)
+        refiner = Refiner(signal, variance, geometry, dx, dy, surface, settings, None, order)
         refiner.values |= values or {}
         refiner.predict(predict)
         for _ in range(s.reweightings):
@@ -163,7 +171,7 @@ def fit_heights(
     predict: Predict,
     report: Report | None = None,
     region: np.ndarray | None = None,
-    slow_axis: int = 0,
+    order: ScanOrder = ScanOrder(),
 ) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
 
@@ -178,15 +186,16 @@ def fit_heights(
         predict: multiple scattering and hidden form factor on a surface.
         report: called before each outer round.
         region: plateaus, from `find_plateaus` [y, x], whose masks are to follow their levels.
-        slow_axis: along which the scan moves slowly, 0 (y) or 1 (x).
+        order: in which the pixels were recorded.
 
     Source: own derivation; Levenberg-Marquardt of optimistix; lagged robust weights (Geman and McClure, 1987).
     """
     s = settings.refine
     with jax.enable_x64(True):
-        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, slow_axis)
+        refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, order)
         changes: list[float] = []
         last_change = np.zeros(start.height.shape)
+        relaxation = 1.0
         is_interrupted = False
         said = "start"
         n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
@@ -196,6 +205,8 @@ def fit_heights(
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
+                if refiner.is_level_free:
+                    refiner.follow_modes(predict)
                 if number == n_fixed:
                     refiner.tear()
                 stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
@@ -207,13 +218,17 @@ def fit_heights(
                 refiner.surface, is_interrupted = before, True
                 break
             refiner.torn = None
-            last_change = np.asarray(refiner.surface.height - before.height)
+            change_before, last_change = last_change, np.asarray(refiner.surface.height - before.height)
             changes.append(float(np.sqrt(np.mean(last_change**2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if changes[-1] < s.tolerance_um and number >= n_fixed:
                 break
-        if settings.border == "free" and s.bias_pairs and not is_interrupted:
+            if number > n_fixed + 1:
+                relaxation = relaxed(relaxation, change_before, last_change)
+            if number + 1 < s.max_rounds:
+                refiner.relax(before, relaxation)
+        if refiner.is_level_free and s.bias_pairs and not is_interrupted:
             try:
                 if report:
                     report(len(changes) - 1, s.max_rounds, f"{said}; simulating the bias by noise")
@@ -224,6 +239,23 @@ def fit_heights(
         if posterior is not None:
             posterior = posterior.also_off_by(left_to_go(changes) * last_change)
         return _finish(refiner, changes, is_interrupted, posterior)
+
+
+def relaxed(before: float, change_before: np.ndarray, change: np.ndarray) -> float:
+    """Return what share of a round's change to take, so that a fit that swings about its result comes to rest.
+
+    A wall's shadow that is predicted too wide raises what lies in it, and the next one is predicted too narrow.
+
+    Args:
+        before: share that was taken of the change before.
+        change_before, change: of the heights in the last two rounds.
+
+    Source: Aitken's Delta^2 for vectors: Irons and Tuck, Int. J. Numer. Meth. Eng. 1 (1969) 275; Kuettler and Wall,
+        Comput. Mech. 43 (2008) 61, eq. 44. No share is above 1, for the changes are as noisy as the predictions.
+    """
+    apart = change - change_before
+    share = -before * float(np.sum(change_before * apart) / np.maximum(np.sum(apart**2), 1e-300))
+    return float(np.clip(share, LEAST_RELAXATION, 1.0))
 
 
 def contraction_of(changes: Sequence[float]) -> float | None:

@@ -16,16 +16,22 @@ import numpy as np
 from scipy.fft import dctn
 
 from helio_jax.arrays import border_mask
+from helio_jax.errors import GuardError
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.aiming import aimed_slopes
-from helio_jax.reconstruct.background import drift_modes
+from helio_jax.reconstruct.background import ScanOrder, drift_modes
 from helio_jax.reconstruct.edges import Edges, bend_of, find_edges, geman_mcclure, one_sided, to_pixels
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.leastsquares import Solution, solve, whitened_instrument
+from helio_jax.reconstruct.linear import MIN_IMAGES
 from helio_jax.reconstruct.model import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.shadows import shadow_edges
 
+LEVEL_STEP, SCALE_STEP, TILT_STEP = 0.02, 0.05, 0.03
+"""How far a relief is lowered (share of the distance), flattened (share of itself) and tilted to see what follows."""
+LEVEL_STD = 0.1
+"""How firmly a level is held [um]."""
 _NOISY = 3.0
 """Deviation that slopes are credited with at most, in those of a pixel with median noise."""
 _HELD = 1e-5
@@ -49,6 +55,33 @@ def _plateau_weights(region: np.ndarray) -> np.ndarray:
     numbers = np.unique(region[region > 0])[:, None, None]
     ground, plateau = ((region == n).astype(float) for n in (0, numbers))
     return plateau / plateau.sum((1, 2), keepdims=True) - ground / ground.sum()
+
+
+def _modes(surface: Surface, is_told: np.ndarray, across: np.ndarray, distance: float) -> list[Surface]:
+    """Return small changes of a relief that leave its shape: lower, flatter, tilted about y, tilted about x.
+
+    Args:
+        surface: the relief.
+        is_told: where the data tell of it [y, x].
+        across: positions (x, y) [2, y, x], um.
+        distance: of the sample from the plate, um.
+    """
+    none = np.zeros(is_told.shape)
+    mean = np.mean(surface.height[is_told])
+    flatter = (-SCALE_STEP * field for field in (surface.height - mean, surface.slope_x, surface.slope_y))
+    return [
+        Surface(none - LEVEL_STEP * distance, none, none),
+        Surface(*flatter),
+        Surface(TILT_STEP * across[0], none + TILT_STEP, none),
+        Surface(TILT_STEP * across[1], none, none + TILT_STEP),
+    ]
+
+
+def _amplitudes(modes: list[Surface], is_told: np.ndarray) -> np.ndarray:
+    """Return the weights [mode, y, x] whose sums over changes of the heights tell how often the modes are in them."""
+    weights = np.zeros((len(modes), *is_told.shape))
+    weights[:, is_told] = np.linalg.pinv(np.stack([mode.height[is_told] for mode in modes], 1))
+    return weights
 
 
 def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
@@ -93,11 +126,11 @@ class Refiner:
         start: Surface,
         settings: ReconstructSettings,
         region=None,
-        slow_axis=0,
+        order=ScanOrder(),
     ) -> None:
         s = settings.refine
-        self.signal, self.variance, self.settings = signal, variance, s
-        self.model = Model(geometry, dx, dy, s.albedo_std, slow_axis)
+        self.signal, self.variance, self.settings, self.order = signal, variance, s, order
+        self.model = Model(geometry, dx, dy, s.albedo_std, order.slow_axis)
         self.shift = geometry.instrument.beam_shift
         self.observed = np.isfinite(signal)
         self.data = np.where(self.observed, signal, 0.0)
@@ -109,19 +142,33 @@ class Refiner:
         shape = start.height.shape
         self.whitening = _whitening(shape, dx, dy, self.slope_noise)
         self.border = _border_weight(shape, settings)
-        self.is_level_free = settings.border == "free"
+        self.is_level_held = settings.border == "free" and s.level_std_um is not None
+        self.is_level_free = settings.border == "free" and not self.is_level_held
         self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
         self.surface = Surface(*map(np.asarray, start))
-        self.drift = drift_modes(shape, slow_axis, s.drift_degrees) if s.drift_std else np.zeros((0, *shape))
+        self.level_weight = self._level_weight()
+        self.held_level = float(np.sum(self.level_weight * self.surface.height))
+        self.drift = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
         sides = (d * (np.arange(n) - 0.5 * (n - 1)) for d, n in ((dx, shape[1]), (dy, shape[0])))
         self.across = np.stack(np.meshgrid(*sides))
         self.values = self._at_prior_means(geometry.instrument)
         nothing = np.zeros(signal.shape)
         self.adopt(Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface)
         self.level_response = np.zeros((len(self.plateau), len(signal), 3, *shape))
+        self.mode = np.zeros((0, *shape))
+        self.mode_response = np.zeros((0, *signal.shape))
         self.torn: tuple[np.ndarray, np.ndarray] | None = None
         self.residuals = np.zeros(signal.shape)
         self.weight = np.ones(signal.shape)
+
+    @property
+    def is_told(self) -> np.ndarray:
+        """Where the data tell of the surface [y, x]."""
+        return self.observed.sum(0) >= MIN_IMAGES
+
+    def _level_weight(self) -> np.ndarray:
+        """Return the weights [y, x] of the mean height over its deviation, or 0 where nothing holds it."""
+        return self.is_level_held * self.is_told / np.maximum(self.is_told.sum(), 1) / LEVEL_STD
 
     def _at_prior_means(self, instrument: Instrument) -> dict[str, np.ndarray]:
         """Return the unknowns of the instrument, all 0; those that are known have no entries."""
@@ -129,7 +176,7 @@ class Refiner:
         k, n = self.signal.shape[0], s.albedo_modes
         lines = self.signal.shape[1 + self.model.slow_axis] if s.line_std else 0
         shapes = {"log_gain": k, "offset": k, "log_multiple": k, "unseen": (), "albedo": (n, n)}
-        shapes |= {"drift": (k, len(self.drift)), "lines": (k, lines), "law": 1 if s.law_std else 0}
+        shapes |= {"drift": (k, self.drift.shape[1]), "lines": (k, lines), "law": 1 if s.law_std else 0}
         is_aimed = s.geometry and (sure.polar_deg or sure.azimuth_deg)
         shapes["distance"] = 1 if s.geometry and sure.sample_distance_um else 0
         shapes |= {"tilt": 2 if s.geometry and sure.tilt_deg else 0, "aim": (k, 2) if is_aimed else 0}
@@ -159,11 +206,39 @@ class Refiner:
 
     def predict(self, predict: Predict) -> None:
         """Predict masks and multiple scattering on the current surface, and how masks follow the plateaus' levels."""
-        about = () if self.moves is None else (self.instrument,)
-        self.adopt(predict(self.surface.height, self.surface.normals(self.shift), *about), self.surface)
+        self.adopt(self._predicted(predict), self.surface)
         if self.prediction.response is not None:
             for i, weights in enumerate(self.plateau):
                 self.level_response[i] = self.prediction.response((weights > 0).astype(float))
+
+    def _predicted(self, predict: Predict) -> Prediction:
+        """Return the prediction on the current surface, by the instrument found so far."""
+        about = () if self.moves is None else (self.instrument,)
+        return predict(self.surface.height, self.surface.normals(self.shift), *about)
+
+    def follow_modes(self, predict: Predict) -> None:
+        """Find how what is lagged follows level, scale and tilt of the relief, by predictions on changed surfaces.
+
+        With a free level these are known so little better than by the priors that rounds that hold what is scattered
+        several times would run away along them, or come to rest where the misfit is not least. What cannot be
+        predicted on a changed surface does not follow.
+        """
+        limits = self.settings.robust_limits[-1], self.settings.jump_limits[-1]
+        is_told = self.is_told
+        modes = _modes(self.surface, is_told, self.across, self.model.geometry.instrument.sample_distance)
+        self.mode, self.mode_response = _amplitudes(modes, is_told), np.zeros((len(modes), *self.signal.shape))
+        noise_change = self.lag(*limits)[1].noise_change
+        for i, change in enumerate(modes):
+            twin = copy.copy(self)
+            twin.mode_response = np.zeros_like(self.mode_response)
+            twin.surface = Surface(*(now + by for now, by in zip(self.surface, change, strict=True)))
+            unknowns, held = twin.lag(*limits)
+            before = _counts(self.model, unknowns, held._replace(noise_change=noise_change))
+            try:
+                twin.adopt(twin._predicted(predict), twin.surface)
+            except GuardError:
+                continue
+            self.mode_response[i] = np.asarray(_counts(self.model, *twin.lag(*limits)) - before)
 
     def adopt(self, prediction: Prediction, surface: Surface) -> None:
         """Take a prediction, made on a surface, for all solves until the next one."""
@@ -207,7 +282,7 @@ class Refiner:
     @property
     def is_unknown(self) -> bool:
         """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""
-        return self.moves is not None or len(self.drift) > 0
+        return self.moves is not None or self.drift.shape[1] > 0
 
     def _mixing(self, problem: tuple[Model, Unknowns, Lagged], is_instrument_free: bool) -> jax.Array | np.ndarray:
         """Return the instruments and levels that are fitted: as they are where they are held or little is unknown."""
@@ -255,6 +330,9 @@ class Refiner:
             level_response=self.level_response,
             hidden_moves=self.hidden_moves,
             predicted_moves=self.predicted_moves,
+            mode=self.mode,
+            amplitude=np.einsum("ryx,yx->r", self.mode, self.predicted_on.height),
+            mode_response=self.mode_response,
             drift=self.drift,
             across=self.across,
             intact_x=edges_x.intact,
@@ -264,6 +342,8 @@ class Refiner:
             bend_x=bend_of(edges_x.intact, slope_x, self.slope_noise, 1),
             bend_y=bend_of(edges_y.intact, slope_y, self.slope_noise, 0),
             border=self.border,
+            level_weight=self.level_weight,
+            held_level=self.held_level,
             whitening=self.whitening,
             slope_scale_x=scale_x,
             slope_scale_y=scale_y,
@@ -299,6 +379,10 @@ class Refiner:
         self.values = {name: np.asarray(getattr(found.unknowns, name)) for name in INSTRUMENT}
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found
+
+    def relax(self, before: Surface, share: float) -> None:
+        """Go back to a share of the way from the surface before; what is next is predicted, and begins, there."""
+        self.surface = Surface(*(b + share * (now - b) for b, now in zip(before, self.surface, strict=True)))
 
     def simulated(self) -> "Refiner":
         """Return a fit that starts from its own truth: this surface, the instrument at its prior means, no noise."""

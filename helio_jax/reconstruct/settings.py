@@ -32,6 +32,9 @@ class RefineSettings(Settings):
     """Prior deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
     geometry: bool = True
     """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
+    level_std_um: float | None = Field(default=None, gt=0.0, le=1e5)
+    """With a free border: how wrong the mean height may be that the fit starts from and then keeps [um]; it counts in
+    the error bars, for with the distance to the plate the relief's scale goes. Default: the mean height is unknown."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)

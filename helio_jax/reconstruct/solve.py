@@ -14,6 +14,7 @@ import numpy as np
 from helio_jax.arrays import pitch
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruct.background import ScanOrder
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.integrate import integrate_slopes
 from helio_jax.reconstruct.levels import search_levels
@@ -141,6 +142,11 @@ def _known(fit: "Fit") -> dict[str, np.ndarray]:
     return {name: value for name, value in fit.values.items() if name not in ("log_multiple", "unseen")}
 
 
+def scan_order(stack: MicrographStack) -> ScanOrder:
+    """Return in which order a stack's pixels were recorded."""
+    return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
+
+
 def _with_plateaus(stack, settings, geometry, make_predict, report, start, calmer, predict) -> "tuple[Fit, np.ndarray]":
     """Fit the heights, from a start or one nearer to a calmer surface, then those of plateaus that stay unexplained.
 
@@ -152,9 +158,9 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, calme
 
     signal, variance = signal_of(stack)
     problem = signal, variance, geometry, pitch(stack.x), pitch(stack.y)
-    slow_axis = 0 if stack.fast_axis == "x" else 1
+    order = scan_order(stack)
     fit, _ = _retreating(
-        lambda surface: fit_heights(*problem, surface, settings, predict, report, slow_axis=slow_axis), start, calmer
+        lambda surface: fit_heights(*problem, surface, settings, predict, report, order=order), start, calmer
     )
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     is_undecided = np.zeros(stack.shape[1:], bool)
@@ -170,7 +176,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, calme
                 fit.surface,
                 (pitch(stack.y), pitch(stack.x)),
                 MAX_WIDTH * stack.instrument.sample_distance,
-                lambda surface, fit=fit: misfit_on(*problem, surface, settings, roughly, slow_axis, _known(fit)),
+                lambda surface, fit=fit: misfit_on(*problem, surface, settings, roughly, order, _known(fit)),
                 stack.instrument.beam_shift,
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
@@ -179,7 +185,7 @@ def _with_plateaus(stack, settings, geometry, make_predict, report, start, calme
                 is_moved = np.isin(left, found.moved)
                 is_undecided |= is_moved  # unless the fit goes on from there
                 trial = np.where(is_moved, levelled.max() + left, levelled)
-                fit = fit_heights(*problem, found.surface, settings, predict, report, trial, slow_axis)
+                fit = fit_heights(*problem, found.surface, settings, predict, report, trial, order)
                 levelled, is_undecided = trial, is_undecided & (~is_moved | np.isin(left, found.undecided))
             elif np.unique(left).size == np.unique(single).size:
                 break

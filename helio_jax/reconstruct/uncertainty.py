@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
-from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Unknowns
+from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Surface, Unknowns
 from helio_jax.reconstruct.samples import also_off_by
 
 MAX_PIXELS = 30_000
@@ -38,11 +38,13 @@ class Linearised:
     Attributes:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
-        far: derivative with respect to the levels of the plateaus through what they hide and, as the last, to the mean
-            height through what the edges count [residual, plateau + 1], per um; it adds far @ plateau.T to `surface`.
-        plateau: derivative of the levels and of the mean height with respect to the surface [3 * pixel, plateau + 1].
+        far: derivative with respect to what all heights have in common [residual, common]: the levels of the plateaus
+            through what they hide, the modes through the prediction, the level that is held and, as the last, the mean
+            height through what the edges count; it adds far @ plateau.T to `surface`.
+        plateau: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
         shape: of the raster (y, x).
+        level_row: number of the residual that holds the level.
     """
 
     surface: sparse.csr_matrix
@@ -51,6 +53,7 @@ class Linearised:
     plateau: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
+    level_row: int
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
@@ -85,6 +88,7 @@ class Posterior:
         samples: deviations of the heights [sample, y, x], um.
         instrument_samples: of the instrument parameters, in prior deviations [sample, parameter].
         response: what the heights do when a parameter is forced by one prior deviation [parameter, y, x], um.
+        level_response: what they do, over the level itself, when a level that is held is raised by 1 um [y, x].
         instrument_covariance: in prior deviations [parameter, parameter].
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
@@ -96,6 +100,7 @@ class Posterior:
     samples: np.ndarray
     instrument_samples: np.ndarray
     response: np.ndarray
+    level_response: np.ndarray
     instrument_covariance: np.ndarray
     names: tuple[str, ...]
     stride: int = 1
@@ -161,7 +166,9 @@ class Posterior:
         ]
         full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
         bent = None if self.bent is None else full(self.bent)
-        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
+        level = full(self.level_response[None])[0]
+        thin = replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
+        return replace(thin, level_response=level)
 
 
 @dataclass(frozen=True)
@@ -255,16 +262,26 @@ def _derivatives(model: Model, unknowns: Unknowns, lagged: Lagged):
     def derivative(function, direction):
         return jax.jvp(function, (surface,), (direction,))[1]
 
-    data = [derivative(lambda s: model.data_residuals(s, unknowns, lagged), d) for d in directions]
+    def own(changed: Surface) -> jax.Array:  # while levels and modes, which are of many pixels, stay as they are
+        level, amplitude = (
+            at + jnp.einsum("ryx,yx->r", weights, changed.height - surface.height)
+            for at, weights in ((lagged.level, lagged.plateau), (lagged.amplitude, lagged.mode))
+        )
+        return model.data_residuals(changed, unknowns, lagged._replace(level=level, amplitude=amplitude))
+
+    data = [derivative(own, d) for d in directions]
     free = {name: getattr(unknowns, name) for name in model.instrument_fields(unknowns)}
     instrument, edges, border = (
         jax.jacfwd(lambda v, f=f: f(surface, unknowns._replace(**v), lagged))(free)
         for f in (model.data_residuals, model.edge_residuals, model.border_residuals)
     )
-    rise = jnp.zeros_like(lagged.level)  # all heights raised by the same, as above, raise no plateau above the ground
-    levels = jax.jacfwd(lambda r: model.data_residuals(surface, unknowns, lagged._replace(level=lagged.level - r)))(
-        rise
-    )
+
+    def followed(rise: jax.Array, grown: jax.Array) -> jax.Array:
+        raised = lagged._replace(level=lagged.level - rise, amplitude=lagged.amplitude - grown)
+        return model.data_residuals(surface, unknowns, raised)
+
+    still = jnp.zeros_like(lagged.level), jnp.zeros_like(lagged.amplitude)
+    levels = jnp.concatenate(jax.jacfwd(followed, (0, 1))(*still), -1)
     raised = jax.jvp(lambda s: model.edge_residuals(s, unknowns, lagged), (surface,), (directions[0],))[1]
     return data, instrument, (*edges, border), levels, raised, model.edge_scale(surface, unknowns, lagged)
 
@@ -298,6 +315,7 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     rows.add((pixel, 0, np.asarray(lagged.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
+    n_rows = rows.n_rows  # below: the held level, which is of all heights, and the priors of the instrument
     names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
 
     def of_instrument(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
@@ -306,18 +324,19 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     of_x, of_y, of_border = of_edges
     parts = (instrument, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size), (of_border, pixel.size)
     columns = np.concatenate([of_instrument(blocks, n) for blocks, n in parts])
-    matrix = rows.stack(n_more=len(names))
-    by_instrument = np.zeros((rows.n_rows + len(names), len(names)))
+    matrix = rows.stack(n_more=1 + len(names))
+    by_instrument = np.zeros((n_rows + 1 + len(names), len(names)))
     by_instrument[: len(columns)] = columns
     by_instrument[-len(names) :] = np.eye(len(names))
-    plateau = np.asarray(lagged.plateau)
-    n_far = len(plateau) + 1
+    weights = np.concatenate([lagged.plateau, lagged.mode])
+    n_far = len(weights) + 2
     far, of_surface = np.zeros((len(by_instrument), n_far)), np.zeros((3 * pixel.size, n_far))
-    far[:n_data, :-1] = levels.reshape(n_data, len(plateau))
-    of_surface[::3, :-1] = plateau.reshape(len(plateau), pixel.size).T
+    far[:n_data, :-2] = levels.reshape(n_data, len(weights))
+    of_surface[::3, :-2] = weights.reshape(len(weights), pixel.size).T
+    far[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(lagged.level_weight)
     edges = np.concatenate([part.ravel() for part in raised])
     far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
-    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape)
+    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape, n_rows)
 
 
 def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
@@ -349,10 +368,17 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
         noise[:n_data] = error.draw(rng, noise[:n_data])
         covariance = error.covariance(influence[:n_data])
     covariance = covariance + influence[n_data:].T @ influence[n_data:]
+    level_weight = linear.plateau[::3, -2]
+    raised = np.zeros((len(noise), 1))
+    raised[linear.level_row] = level_weight.sum()
+    noise = np.hstack([noise, raised])
     instrument = influence.T @ noise
     surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
-    return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
+    *samples, level = to_height(surface)
+    samples, instrument = np.array(samples).reshape(-1, *linear.shape), instrument.T[:-1]
+    level = level - level_weight @ level.ravel() / (level_weight.sum() or 1.0)
+    return Posterior(samples, instrument, -to_height(answer), level, covariance, linear.names)
 
 
 def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:

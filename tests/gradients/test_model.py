@@ -1,11 +1,14 @@
 """Derivatives of the fit's residuals: Taylor remainder, adjoint, cost; and the sparse Jacobian of the posterior."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from helio_jax.instrument import Uncertainty
+from helio_jax.reconstruct.background import ScanOrder
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import INSTRUMENT, Prediction, Surface
 from helio_jax.reconstruct.refiner import Refiner
@@ -16,10 +19,11 @@ from tests.derivatives import adjoint_products, taylor_remainders
 SHAPE, PITCH = (9, 11), 30.0
 
 
-def make_problem(instrument, **settings):
+def make_problem(instrument, order=ScanOrder(1), border="flat", **settings):
     """A rough surface with a kink, a jump, two plateaus, hidden parts, multiple scattering and free albedo.
 
-    What is unknown of the instrument is away from its prior mean, where masks were predicted.
+    What is unknown of the instrument is away from its prior mean, where masks were predicted. With a free border the
+    multiple scattering follows the modes of the relief.
     """
     rng = np.random.default_rng(3)
     geometry = SpotGeometry(instrument)
@@ -29,12 +33,12 @@ def make_problem(instrument, **settings):
     slopes[0, 4:] += 1.5
     signal = geometry.form_factor(height)[:, 2] * rng.uniform(0.7, 1.1, (3, *SHAPE))
     signal[1, 2, 3] = np.nan
-    chosen = ReconstructSettings(refine=RefineSettings(albedo_std=0.05, albedo_modes=3, **settings))
+    chosen = ReconstructSettings(border=border, refine=RefineSettings(albedo_std=0.05, albedo_modes=3, **settings))
     surface = Surface(height, *slopes)
     variance = (0.03 * np.nan_to_num(signal, nan=1.0)) ** 2
     region = np.zeros(SHAPE, int)
     region[2:5, 2:5], region[6:8, 5:9] = 1, 3
-    refiner = Refiner(signal, variance, geometry, PITCH, PITCH, surface, chosen, region, 1)
+    refiner = Refiner(signal, variance, geometry, PITCH, PITCH, surface, chosen, region, order)
     with jax.enable_x64(True):
         hidden = rng.uniform(0, 0.1, (3, 3, *SHAPE)) * geometry.form_factor(height)
         response = rng.normal(scale=1e-4, size=hidden.shape)
@@ -43,6 +47,8 @@ def make_problem(instrument, **settings):
         refiner.predict(lambda height, normals, instrument=None: prediction)
         if settings:
             refiner.values |= {name: 0.5 * rng.normal(size=v.shape) for name, v in refiner.values.items()}
+        if border == "free":
+            refiner.follow_modes(lambda h, normals, *about: replace(prediction, multiple=multiple * (1.0 + 1e-3 * h)))
         return refiner.model, *refiner.lag(8.0, 3.0)
 
 
@@ -59,9 +65,25 @@ def unknown(bshem):
     return make_problem(bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law_std=0.1)
 
 
-@pytest.fixture(params=["stated", "unknown"])
+@pytest.fixture(scope="module")
+def turned(bshem):
+    """Aligned scans with a free border: each drifts in its own time, predictions follow the relief."""
+    time = np.random.default_rng(5).uniform(-1.0, 1.0, (3, *SHAPE))
+    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
+    about = {
+        "order": ScanOrder(1, time),
+        "border": "free",
+        "level_std_um": 200.0,
+        "drift_std": 0.2,
+        "line_std": 0.02,
+        "law_std": 0.1,
+    }
+    return make_problem(bshem.model_copy(update={"uncertainty": sure}), **about)
+
+
+@pytest.fixture(params=["stated", "unknown", "turned"])
 def problem(request):
-    """Both."""
+    """All of them."""
     return request.getfixturevalue(request.param)
 
 
@@ -105,12 +127,13 @@ def test_gradient_is_cheap(stated):
         assert operations(jax.grad(cost)) <= 4.0 * operations(cost)
 
 
-def test_sparse_jacobian_is_the_automatic_one(unknown):
+@pytest.mark.parametrize(("name", "n_far"), [("unknown", 4), ("turned", 8)])
+def test_sparse_jacobian_is_the_automatic_one(request, name, n_far):
     """J of the posterior times a change of surface and instrument = jvp of the residuals, for every kind of residual.
 
     The two are written apart. Catches a missing weight, a sign, a wrong neighbour or a lost column.
     """
-    model, unknowns, lagged = unknown
+    model, unknowns, lagged = request.getfixturevalue(name)
     with jax.enable_x64(True):
         linear = linearise(model, unknowns, lagged)
         direction = random_direction(unknowns, 4)._replace(lines=jnp.zeros_like(unknowns.lines))
@@ -121,10 +144,11 @@ def test_sparse_jacobian_is_the_automatic_one(unknown):
     instrument = np.concatenate([np.asarray(getattr(direction, n)).ravel() for n in names])
     levels = linear.plateau.T @ surface
     assert (
-        linear.far.shape[1] == 3 and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
+        linear.far.shape[1] == n_far
+        and np.abs(linear.far @ levels).max() > 1e-3 * np.abs(linear.surface @ surface).max()
     )
     ours = linear.surface @ surface + linear.far @ levels + linear.instrument @ instrument
-    order = ["data", "edge_x", "edge_y", "border", "slope_x", "slope_y", *names]
+    order = ["data", "edge_x", "edge_y", "border", "slope_x", "slope_y", "level", *names]
     assert set(names) == set(INSTRUMENT) - {"lines"}
     theirs = np.concatenate([np.asarray(slope[name]).ravel() for name in order])
     assert set(order) == set(value) - {"lines"}

@@ -33,7 +33,7 @@ def random_problem(shape=(4, 5), n_parameters=3, n_plateaus=2, seed=0) -> Linear
     names = tuple(f"p[{i}]" for i in range(n_parameters))
     far = 0.3 * rng.normal(size=(5 * n + n_parameters, n_plateaus))
     plateau = rng.normal(size=(n, n_plateaus))
-    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), far, plateau, names, shape)
+    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), far, plateau, names, shape, 0)
 
 
 def test_samples_have_the_dense_covariance():

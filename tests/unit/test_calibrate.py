@@ -8,7 +8,7 @@ from helio_jax.errors import SceneError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.pipeline import calibrate
 from helio_jax.prepare.faults import estimate_noise, find_spikes, line_noise
-from helio_jax.reconstruct.background import drift_modes
+from helio_jax.reconstruct.background import ScanOrder, drift_modes
 
 
 def measured(bshem, counts, fast_axis="x", **fields) -> MicrographStack:
@@ -67,12 +67,23 @@ def test_line_noise(bshem, fast_axis):
 
 def test_drift_modes_are_what_they_say():
     """No constant, root mean square 1 / degree, slow along the slow axis. Catches exchanged axes."""
-    modes = drift_modes((400, 300), 0, (4, 3))
+    modes = drift_modes((400, 300), ScanOrder(0), (4, 3))[0]
     assert len(modes) == 10
     assert np.abs(modes.mean((1, 2))).max() < 0.02
     assert modes[0] == pytest.approx(np.broadcast_to(modes[0][:1], (400, 300)))  # degree 1 along x, the fast axis
     assert np.sqrt((modes[0] ** 2).mean()) == pytest.approx(1.0, rel=0.01)
-    assert drift_modes((300, 400), 1, (4, 3)) == pytest.approx(modes.swapaxes(1, 2))
+    assert drift_modes((300, 400), ScanOrder(1), (4, 3))[0] == pytest.approx(modes.swapaxes(1, 2))
+
+
+def test_drift_modes_of_aligned_scans():
+    """Of every scan those of its own time, whatever the raster's axes: degree 1 is the time. Catches raster rows."""
+    across = np.linspace(-1.0, 1.0, 401)
+    time = np.stack([np.broadcast_to(across, (3, 401)), np.broadcast_to(-across, (3, 401))])
+    modes = drift_modes((3, 401), ScanOrder(0, time), (3, 2))
+    assert modes.shape == (2, 3, 3, 401)
+    assert modes[:, 0] == pytest.approx(np.sqrt(3.0) * time)
+    assert np.sqrt((modes**2).mean((2, 3))) == pytest.approx(np.tile(1.0 / np.arange(1, 4), (2, 1)), rel=0.01)
+    assert modes[1, 1] == pytest.approx(modes[0, 1]) and modes[1, 2] == pytest.approx(-modes[0, 2])
 
 
 def test_a_known_beam_is_not_calibrated_again(bshem):

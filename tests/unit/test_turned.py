@@ -7,14 +7,14 @@ import pytest
 
 from benchmarks.alignment import INSTRUMENT
 from benchmarks.crystal import DRIFTS, FIELD_UM, GAINS, SHARE, Sample, make_sample, record, true_normals
-from helio_jax import turned
+from helio_jax import reconstruct, turned
 from helio_jax.config import load_instrument
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector
 from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.resample import resample, scan_times
 from helio_jax.prepare.rigid import Rigid
-from helio_jax.prepare.selfcalibrate import Relief, SelfCalibrateSettings, scan_time, self_calibrate
+from helio_jax.prepare.selfcalibrate import Relief, SelfCalibrateSettings, self_calibrate
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,22 @@ def test_multiple_scattering_stays_for_a_fit(calibrated):
     flat = turned.flat_signal(kept.instrument)[:, None, None]
     taken = np.where(kept.is_observed, (kept.counts - without.counts) / flat, 0.0)
     assert taken.min() > -1e-9 and 0.05 < taken.max() < 1.0
+
+
+def test_what_stays_open_is_handed_to_the_fit(calibrated):
+    """Gains, backgrounds and their drift as unknowns, the level held, more rounds: in the fit's own record.
+
+    A setting that is given wins. Catches a fit that takes the calibration for exact.
+    """
+    kept, _ = calibrated
+    spread = kept.provenance["self_calibrate"]["spread_deg"]
+    given = {"max_rounds": 1, "photometric_rounds": 1, "samples": 0, "rays": 20_000}
+    rec = reconstruct(kept, "refine", border="free", refine=given)
+    asked = rec.provenance["reconstruct"]["refine"]
+    assert asked["max_rounds"] == 1 and asked["drift_std"] == 0.1 and asked["gain_std"] == 0.05
+    radius, distance = 3120.0, kept.instrument.sample_distance
+    per_degree = (radius**2 + distance**2) / radius * math.radians(1.0)  # distance = radius / tan(polar angle)
+    assert asked["level_std_um"] == pytest.approx(spread * per_degree, rel=0.02)
 
 
 def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
@@ -108,7 +124,7 @@ def test_drift_of_each_background_is_found():
     assert found.share == pytest.approx(SHARE, abs=0.03)
     steady = self_calibrate(stack, SelfCalibrateSettings(drift_degree=0))
     still = self_calibrate(pyramids())
-    time = scan_time(stack)
+    time = stack.scan_time
     rest = [(stack.counts - f.background(time)) / f.signal[:, None, None] for f in (found, steady)]
     signal = (pyramids().counts - still.background(time)) / still.signal[:, None, None]
     errors = [float(np.std(r - signal)) for r in rest]
