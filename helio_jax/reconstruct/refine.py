@@ -5,7 +5,7 @@ pipeline supplies, so this stage knows no tracer), decide which edges are smooth
 robust weights, then a few Levenberg-Marquardt steps (`refiner`). All of that is lagged: constant during a step.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -18,6 +18,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
+from helio_jax.reconstruct.rounds import aitken, contraction_of, left_to_go, relaxed, status_of
 from helio_jax.reconstruct.samples import thinning
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
@@ -26,12 +27,6 @@ GEOMETRY = "distance", "tilt", "aim"
 """Unknowns that tell of a model that lacks something where they come out farther off than stated: error bars widen."""
 GAINS, OFF_BY_FAR = ("log_gain", "offset"), 2.0
 """The same, but only where they are off by more than this factor: it is they that usually differ by chance."""
-
-SLOWEST = 0.9
-"""Contraction per round that a fit is credited with at least: what does not converge is off by nine last changes."""
-
-LEAST_RELAXATION = 0.1
-"""Share of a round's change that the next prediction is made on at least."""
 
 Report = Callable[[int, int, str], None]
 """Called with (round, rounds in all, what is known so far)."""
@@ -126,7 +121,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     )
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
-    found = sample_posterior(linearise(m.thinned(stride), unknowns, lagged), s.samples, error=error)
+    linear = linearise(m.thinned(stride), unknowns, lagged)
+    found = sample_posterior(linear, s.samples, error=error, is_lagging=refiner.is_level_held)
     found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
     if refiner.is_level_held and s.level_std_um:
         found = found.also_off_by(s.level_std_um * found.level_response)
@@ -195,7 +191,7 @@ def fit_heights(
         refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, order)
         changes: list[float] = []
         last_change = np.zeros(start.height.shape)
-        relaxation = 1.0
+        relaxation, ahead = 1.0, 1.0
         is_interrupted = False
         said = "start"
         n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
@@ -222,10 +218,12 @@ def fit_heights(
             changes.append(float(np.sqrt(np.mean(last_change**2))))
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
+            if number:
+                ahead = aitken(relaxation, change_before, last_change)
             if changes[-1] < s.tolerance_um and number >= n_fixed:
                 break
             if number > n_fixed + 1:
-                relaxation = relaxed(relaxation, change_before, last_change)
+                relaxation = relaxed(ahead)
             if number + 1 < s.max_rounds:
                 refiner.relax(before, relaxation)
         if refiner.is_level_free and s.bias_pairs and not is_interrupted:
@@ -235,65 +233,12 @@ def fit_heights(
                 refiner.move_back(*noise_bias(refiner, s.bias_pairs))
             except KeyboardInterrupt:
                 is_interrupted = True
+        if refiner.is_level_held and s.samples and not is_interrupted:
+            refiner.follow_modes(predict)  # for the error bars: the rounds hold what follows
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         if posterior is not None:
-            posterior = posterior.also_off_by(left_to_go(changes) * last_change)
+            posterior = posterior.also_off_by(left_to_go(changes, ahead) * last_change)
         return _finish(refiner, changes, is_interrupted, posterior)
-
-
-def relaxed(before: float, change_before: np.ndarray, change: np.ndarray) -> float:
-    """Return what share of a round's change to take, so that a fit that swings about its result comes to rest.
-
-    A wall's shadow that is predicted too wide raises what lies in it, and the next one is predicted too narrow.
-
-    Args:
-        before: share that was taken of the change before.
-        change_before, change: of the heights in the last two rounds.
-
-    Source: Aitken's Delta^2 for vectors: Irons and Tuck, Int. J. Numer. Meth. Eng. 1 (1969) 275; Kuettler and Wall,
-        Comput. Mech. 43 (2008) 61, eq. 44. No share is above 1, for the changes are as noisy as the predictions.
-    """
-    apart = change - change_before
-    share = -before * float(np.sum(change_before * apart) / np.maximum(np.sum(apart**2), 1e-300))
-    return float(np.clip(share, LEAST_RELAXATION, 1.0))
-
-
-def contraction_of(changes: Sequence[float]) -> float | None:
-    """Return by what factor the last round's change is that of the round before, or None where there is none."""
-    return changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
-
-
-def left_to_go(changes: Sequence[float]) -> float:
-    """Return how far the heights are from where further rounds would take them, in changes of the last one.
-
-    The changes are continued as a geometric series; after a single round they are taken to halve.
-    """
-    contraction = contraction_of(changes)
-    share = min(0.5 if contraction is None else contraction, SLOWEST)
-    return share / (1.0 - share)
-
-
-def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
-    """Return how a fit ended, in a sentence.
-
-    A last change that is larger than the one before is a jitter about the result unless it is also more than half of
-    the largest one: then the fit diverges.
-
-    Args:
-        changes: of the heights in every round, um.
-        tolerance: below which a change counts as none, um.
-        is_interrupted: whether the user stopped it.
-    """
-    last = f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
-    if is_interrupted:
-        return f"interrupted: best so far; {last}"
-    if changes[-1] < tolerance:
-        return f"converged: {last}"
-    if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):
-        contraction = contraction_of(changes)
-        growth = "after none before" if contraction is None else f"{contraction:.2f} times the round before"
-        return f"diverging: {last}, {growth}; raise mask_error or use nearfield"
-    return f"stopped: {last}; raise max_rounds for more"
 
 
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
