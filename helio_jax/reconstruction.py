@@ -16,7 +16,7 @@ from helio_jax.instrument import Instrument
 
 REASONS = (
     "valid",
-    "fewer than 3 images",
+    "too few images",
     "masked in too many detectors",
     "depth jump",
     "outside the data",

@@ -24,6 +24,7 @@ from helio_jax.reconstruct.photometric import level, limited, photometric_height
 from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
 from helio_jax.reconstruct.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.reconstruct.validity import (
+    FACET_IMAGES,
     TRUSTED,
     depth_jumps,
     floating,
@@ -236,7 +237,7 @@ def _refined(stack, settings, geometry, make_predict, report) -> Reconstruction:
     is_moved = bool(fit.values["aim"].size or fit.values["distance"].size)
     n_telling = telling(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
-    reason = reasons_from_fit(reasons_from_data(stack), is_explained, n_telling, *jumps, is_floating)
+    reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, n_telling, *jumps, is_floating)
     return Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,

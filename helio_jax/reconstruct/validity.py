@@ -10,6 +10,8 @@ from helio_jax.reconstruct.edges import along, ranked, trapezoid_gap
 from helio_jax.reconstruct.linear import MIN_IMAGES, signal_of
 from helio_jax.reconstruction import REASONS
 
+FACET_IMAGES = 2
+"""Data that fix the two slopes of a facet of known albedo."""
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked."""
 INTACT = 0.25
@@ -32,15 +34,20 @@ MIN_REGION = 16
 _FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))
 
 
-def reasons_from_data(stack: MicrographStack) -> np.ndarray:
-    """Return why a pixel is not valid, from the data alone (index into REASONS) [y, x]."""
+def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> np.ndarray:
+    """Return why a pixel is not valid, from the data alone (index into REASONS) [y, x].
+
+    Args:
+        stack: the images.
+        min_images: of a pixel that is solved: one for each of its unknowns.
+    """
     reason = np.zeros(stack.shape[1:], np.uint8)
     signal, _ = signal_of(stack)
     flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
     n_images = stack.is_observed.sum(0)
     n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
-    reason[n_images - n_dark < MIN_IMAGES - 1] = _MASKED
-    reason[n_images < MIN_IMAGES] = _FEW
+    reason[n_images - n_dark < FACET_IMAGES] = _MASKED
+    reason[n_images < min_images] = _FEW
     return reason
 
 
@@ -152,6 +159,6 @@ def reasons_from_fit(
             end |= jump
     out = reason.copy()
     out[(out == 0) & (at_jump | ~is_explained)] = _JUMP
-    out[(out == 0) & (n_telling < MIN_IMAGES - 1)] = _MASKED
+    out[(out == 0) & (n_telling < FACET_IMAGES)] = _MASKED
     out[(out == 0) & is_floating] = _FLOATING
     return out
