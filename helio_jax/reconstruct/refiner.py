@@ -225,13 +225,15 @@ class Refiner:
         """
         limits = self.settings.robust_limits[-1], self.settings.jump_limits[-1]
         is_told = self.is_told
-        modes = _modes(self.surface, is_told, self.across, self.model.geometry.instrument.sample_distance)
+        modes = _modes(self.predicted_on, is_told, self.across, self.model.geometry.instrument.sample_distance)
         self.mode, self.mode_response = _amplitudes(modes, is_told), np.zeros((len(modes), *self.signal.shape))
-        noise_change = self.lag(*limits)[1].noise_change
+        at_prediction = copy.copy(self)
+        at_prediction.surface = self.predicted_on
+        noise_change = at_prediction.lag(*limits)[1].noise_change
         for i, change in enumerate(modes):
             twin = copy.copy(self)
             twin.mode_response = np.zeros_like(self.mode_response)
-            twin.surface = Surface(*(now + by for now, by in zip(self.surface, change, strict=True)))
+            twin.surface = Surface(*(now + by for now, by in zip(self.predicted_on, change, strict=True)))
             unknowns, held = twin.lag(*limits)
             before = _counts(self.model, unknowns, held._replace(noise_change=noise_change))
             try:

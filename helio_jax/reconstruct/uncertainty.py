@@ -45,6 +45,7 @@ class Linearised:
         names: of the instrument parameters.
         shape: of the raster (y, x).
         level_row: number of the residual that holds the level.
+        n_modes: number of modes.
     """
 
     surface: sparse.csr_matrix
@@ -54,6 +55,18 @@ class Linearised:
     names: tuple[str, ...]
     shape: tuple[int, int]
     level_row: int
+    n_modes: int = 0
+
+    @property
+    def modes(self) -> slice:
+        """Which of `far` are those of the modes."""
+        end = self.far.shape[1] - 2
+        return slice(end - self.n_modes, end)
+
+    def without_modes(self) -> "Linearised":
+        """Return it as a fit takes it that holds what follows the modes constant during a round."""
+        far, plateau = (np.delete(a, self.modes, 1) for a in (self.far, self.plateau))
+        return replace(self, far=far, plateau=plateau, n_modes=0)
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
@@ -336,29 +349,46 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     far[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(lagged.level_weight)
     edges = np.concatenate([part.ravel() for part in raised])
     far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
-    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape, n_rows)
+    n_modes = len(lagged.mode)
+    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape, n_rows, n_modes)
 
 
-def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
+def sample_posterior(
+    linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None, is_lagging: bool = False
+) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
     With a `ModelError` the fit is still the one that takes all errors of the data for independent, as it was done; its
-    spread is that of data whose errors are not.
+    spread is that of data whose errors are not. One that `is_lagging` comes to rest where the heights answer the data
+    less what is lagged at these heights: data that raise them by dh raise what follows the modes, F P' dh, and the fit
+    answers that, too.
 
     Args:
         linear: residuals at the fit, from `linearise`, those of the data first.
         n_samples: samples.
         seed: of the noise.
         error: what is assumed of the predicted data.
+        is_lagging: whether what follows the modes was constant during each round, and renewed between them.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
         takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
     """
+    follows, weights = linear.far[:, linear.modes], linear.plateau[:, linear.modes]
+    if is_lagging:
+        linear = linear.without_modes()
     jc, solve = linear.instrument, linear.solver()
     border = linear.transposed(jc)
     answer = solve(border)
     influence = (jc - linear.apply(answer)) @ np.linalg.inv(jc.T @ jc - border.T @ answer)
+    response = -answer
+    by_modes = np.zeros((len(jc), follows.shape[1]))  # amplitudes that answer residuals, once all is at rest
+    if is_lagging:
+        forced = solve(linear.transposed(follows))
+        response = response - forced @ np.linalg.solve(_one_and(weights.T @ forced), weights.T @ response)
+        at_once = linear.apply(solve(weights)) - influence @ (answer.T @ weights)
+        by_modes = at_once @ np.linalg.inv(_one_and(follows.T @ at_once))
+        influence = influence - by_modes @ (follows.T @ influence)
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((jc.shape[0], n_samples))
     n_data = 0
@@ -373,12 +403,16 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
     raised[linear.level_row] = level_weight.sum()
     noise = np.hstack([noise, raised])
     instrument = influence.T @ noise
-    surface = solve(linear.transposed(noise)) - answer @ instrument
+    surface = solve(linear.transposed(noise - follows @ (by_modes.T @ noise))) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
     *samples, level = to_height(surface)
     samples, instrument = np.array(samples).reshape(-1, *linear.shape), instrument.T[:-1]
     level = level - level_weight @ level.ravel() / (level_weight.sum() or 1.0)
-    return Posterior(samples, instrument, -to_height(answer), level, covariance, linear.names)
+    return Posterior(samples, instrument, to_height(response), level, covariance, linear.names)
+
+
+def _one_and(matrix: np.ndarray) -> np.ndarray:
+    return np.eye(len(matrix)) + matrix
 
 
 def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:
