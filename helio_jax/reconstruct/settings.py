@@ -40,7 +40,8 @@ class RefineSettings(Settings):
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
-    """Side of the flat that scatters around the image [um]; default: as far beyond each border as the plate is away."""
+    """Side of the flat that scatters around the image [um]; default: as far beyond each border as the outermost aperture
+    reaches, and once more the plate's distance."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)
