@@ -264,6 +264,10 @@ class Instrument(Settings):
         plate = self.plate.model_copy(update={"sample_distance_um": self.sample_distance + distance})
         return Instrument(beam=self.beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
 
+    def at_distance(self, distance: float) -> "Instrument":
+        """Return the instrument with its plate, as it was drilled, so far [um] from the sample's reference plane."""
+        return self.model_copy(update={"plate": self.plate.model_copy(update={"sample_distance_um": distance})})
+
     def spot_position(self, height: Any) -> tuple[Any, Any, Any]:
         """Return the lab position (x, y, z) [um] of the point at `height` above the reference plane.
 

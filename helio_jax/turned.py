@@ -15,6 +15,7 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.selfcalibrate import (
     Relief,
+    SelfCalibrateSettings,
     SelfCalibration,
     distance_std,
     effective_instrument,
@@ -50,7 +51,8 @@ def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> 
     is scattered several times, which is taken off in the share that the readings ask for.
 
     What stays open is handed on to the fit (provenance, `self_calibrate.priors`): gains, backgrounds, their drift, and
-    by how much the polar angle makes the distance, and with it the level that the fit keeps, uncertain.
+    the distance: the fit finds it anew, from the same readings by a surface that is known better. So its prior is as
+    wide as the calibration's own was.
 
     Args:
         stack: aligned readings.
@@ -83,7 +85,7 @@ def _noted(stack: MicrographStack, note: str, without_multiple: bool) -> Microgr
     """Return a self-calibrated stack whose record says how multiple scattering was dealt with."""
     record = stack.provenance["self_calibrate"]
     priors = _PRIORS | ({} if stack.scan_time is None else _DRIFT_PRIORS)
-    priors |= {"level_std_um": distance_std(stack.instrument, record["spread_deg"])}
+    priors |= {"level_std_um": distance_std(stack.instrument, SelfCalibrateSettings().polar_std_deg)}
     record = record | {"note": note, "without_multiple": without_multiple}
     record["priors"] = as_json(priors)
     return stack.replace(provenance={**stack.provenance, "self_calibrate": record})
@@ -101,8 +103,7 @@ def _relief_of(stack: MicrographStack) -> Relief:
     height = limited(rec.height[tuple(near)], stack)  # type: ignore[arg-type]
     normals = np.where(rec.is_valid[..., None], rec.normals, np.array([0.0, 0.0, 1.0]))
     ground = float(np.quantile(height[border_mask(height.shape, settings.border_fraction)], _GROUND))
-    plate = stack.instrument.plate.model_copy(update={"sample_distance_um": stack.instrument.sample_distance - ground})
-    above = stack.replace(instrument=stack.instrument.model_copy(update={"plate": plate}))
+    above = stack.replace(instrument=stack.instrument.at_distance(stack.instrument.sample_distance - ground))
     predict = make_predictor(above, settings.refine.paths(height.size))
     multiple = predict(np.maximum(height - ground, 0.0), normals).multiple
     return Relief(height, multiple / flat_signal(stack.instrument)[:, None, None])

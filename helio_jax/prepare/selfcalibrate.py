@@ -203,7 +203,7 @@ def effective_instrument(instrument: Instrument, polar_deg: float) -> Instrument
     """
     radius = np.mean([math.hypot(*a.center) for a in instrument.apertures()])
     distance = float(radius / math.tan(math.radians(polar_deg)))
-    return instrument.model_copy(update={"plate": instrument.plate.model_copy(update={"sample_distance_um": distance})})
+    return instrument.at_distance(distance)
 
 
 def distance_std(instrument: Instrument, spread_deg: float) -> float:

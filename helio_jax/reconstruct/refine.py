@@ -122,10 +122,8 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     linear = linearise(m.thinned(stride), unknowns, lagged)
-    found = sample_posterior(linear, s.samples, error=error, is_lagging=refiner.is_level_held)
+    found = sample_posterior(linear, s.samples, error=error)
     found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
-    if refiner.is_level_held and s.level_std_um:
-        found = found.also_off_by(s.level_std_um * found.level_response)
     return found.on_raster(refiner.signal.shape[1:], stride)
 
 
@@ -201,7 +199,7 @@ def fit_heights(
                 if report:
                     report(number, s.max_rounds, said)
                 refiner.predict(predict)
-                if refiner.is_level_free:
+                if settings.border == "free":
                     refiner.follow_modes(predict)
                 if number == n_fixed:
                     refiner.tear()
@@ -233,8 +231,6 @@ def fit_heights(
                 refiner.move_back(*noise_bias(refiner, s.bias_pairs))
             except KeyboardInterrupt:
                 is_interrupted = True
-        if refiner.is_level_held and s.samples and not is_interrupted:
-            refiner.follow_modes(predict)  # for the error bars: the rounds hold what follows
         posterior = None if is_interrupted else _posterior(refiner, settings, region)
         if posterior is not None:
             posterior = posterior.also_off_by(left_to_go(changes, ahead) * last_change)

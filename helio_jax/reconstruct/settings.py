@@ -33,15 +33,15 @@ class RefineSettings(Settings):
     geometry: bool = True
     """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
     level_std_um: float | None = Field(default=None, gt=0.0, le=1e5)
-    """With a free border: how wrong the mean height may be that the fit starts from and then keeps [um]; it counts in
-    the error bars, for with the distance to the plate the relief's scale goes. Default: the mean height is unknown."""
+    """With a free border: the mean height stays where the fit starts, and the distance from there to the plate is an
+    unknown of this prior deviation [um]; the relief's scale goes with it. Default: the mean height is unknown."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
-    """Side of the flat that scatters around the image [um]; default: as far beyond each border as the outermost aperture
-    reaches, and once more the plate's distance."""
+    """Side of the flat that scatters around the image [um]; default: as far beyond each border as the outermost
+    aperture reaches, and once more the plate's distance."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
     """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)

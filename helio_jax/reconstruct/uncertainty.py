@@ -44,8 +44,6 @@ class Linearised:
         plateau: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
         shape: of the raster (y, x).
-        level_row: number of the residual that holds the level.
-        n_modes: number of modes.
     """
 
     surface: sparse.csr_matrix
@@ -54,19 +52,6 @@ class Linearised:
     plateau: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
-    level_row: int
-    n_modes: int = 0
-
-    @property
-    def modes(self) -> slice:
-        """Which of `far` are those of the modes."""
-        end = self.far.shape[1] - 2
-        return slice(end - self.n_modes, end)
-
-    def without_modes(self) -> "Linearised":
-        """Return it as a fit takes it that holds what follows the modes constant during a round."""
-        far, plateau = (np.delete(a, self.modes, 1) for a in (self.far, self.plateau))
-        return replace(self, far=far, plateau=plateau, n_modes=0)
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
@@ -101,7 +86,6 @@ class Posterior:
         samples: deviations of the heights [sample, y, x], um.
         instrument_samples: of the instrument parameters, in prior deviations [sample, parameter].
         response: what the heights do when a parameter is forced by one prior deviation [parameter, y, x], um.
-        level_response: what they do, over the level itself, when a level that is held is raised by 1 um [y, x].
         instrument_covariance: in prior deviations [parameter, parameter].
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
@@ -113,7 +97,6 @@ class Posterior:
     samples: np.ndarray
     instrument_samples: np.ndarray
     response: np.ndarray
-    level_response: np.ndarray
     instrument_covariance: np.ndarray
     names: tuple[str, ...]
     stride: int = 1
@@ -179,9 +162,7 @@ class Posterior:
         ]
         full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
         bent = None if self.bent is None else full(self.bent)
-        level = full(self.level_response[None])[0]
-        thin = replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
-        return replace(thin, level_response=level)
+        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
 
 
 @dataclass(frozen=True)
@@ -349,46 +330,29 @@ def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
     far[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(lagged.level_weight)
     edges = np.concatenate([part.ravel() for part in raised])
     far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
-    n_modes = len(lagged.mode)
-    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape, n_rows, n_modes)
+    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape)
 
 
-def sample_posterior(
-    linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None, is_lagging: bool = False
-) -> Posterior:
+def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
     With a `ModelError` the fit is still the one that takes all errors of the data for independent, as it was done; its
-    spread is that of data whose errors are not. One that `is_lagging` comes to rest where the heights answer the data
-    less what is lagged at these heights: data that raise them by dh raise what follows the modes, F P' dh, and the fit
-    answers that, too.
+    spread is that of data whose errors are not.
 
     Args:
         linear: residuals at the fit, from `linearise`, those of the data first.
         n_samples: samples.
         seed: of the noise.
         error: what is assumed of the predicted data.
-        is_lagging: whether what follows the modes was constant during each round, and renewed between them.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
         takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
     """
-    follows, weights = linear.far[:, linear.modes], linear.plateau[:, linear.modes]
-    if is_lagging:
-        linear = linear.without_modes()
     jc, solve = linear.instrument, linear.solver()
     border = linear.transposed(jc)
     answer = solve(border)
     influence = (jc - linear.apply(answer)) @ np.linalg.inv(jc.T @ jc - border.T @ answer)
-    response = -answer
-    by_modes = np.zeros((len(jc), follows.shape[1]))  # amplitudes that answer residuals, once all is at rest
-    if is_lagging:
-        forced = solve(linear.transposed(follows))
-        response = response - forced @ np.linalg.solve(_one_and(weights.T @ forced), weights.T @ response)
-        at_once = linear.apply(solve(weights)) - influence @ (answer.T @ weights)
-        by_modes = at_once @ np.linalg.inv(_one_and(follows.T @ at_once))
-        influence = influence - by_modes @ (follows.T @ influence)
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((jc.shape[0], n_samples))
     n_data = 0
@@ -398,21 +362,10 @@ def sample_posterior(
         noise[:n_data] = error.draw(rng, noise[:n_data])
         covariance = error.covariance(influence[:n_data])
     covariance = covariance + influence[n_data:].T @ influence[n_data:]
-    level_weight = linear.plateau[::3, -2]
-    raised = np.zeros((len(noise), 1))
-    raised[linear.level_row] = level_weight.sum()
-    noise = np.hstack([noise, raised])
     instrument = influence.T @ noise
-    surface = solve(linear.transposed(noise - follows @ (by_modes.T @ noise))) - answer @ instrument
+    surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
-    *samples, level = to_height(surface)
-    samples, instrument = np.array(samples).reshape(-1, *linear.shape), instrument.T[:-1]
-    level = level - level_weight @ level.ravel() / (level_weight.sum() or 1.0)
-    return Posterior(samples, instrument, to_height(response), level, covariance, linear.names)
-
-
-def _one_and(matrix: np.ndarray) -> np.ndarray:
-    return np.eye(len(matrix)) + matrix
+    return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
 
 
 def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:

@@ -77,9 +77,7 @@ def _view(scan: Scan, instrument: Instrument, angle_deg: float | None, distance:
     if distance is not None:
         words.append(f"{distance:g} um")
         about["sample_distance_um"] = distance
-        instrument = instrument.model_copy(
-            update={"plate": instrument.plate.model_copy(update={"sample_distance_um": distance})}
-        )
+        instrument = instrument.at_distance(distance)
     return View(", ".join(words), instrument, turn, scan.axis_um, rotation, about)
 
 

@@ -150,17 +150,15 @@ def nothing_more(height, normals, *about):
     return Prediction(np.zeros((3, *SHAPE)), np.zeros((3, 3, *SHAPE)))
 
 
-def fitted(bshem, drift=0.0, order=ScanOrder(), start=None, border="flat", noise=0.01, predict=nothing_more, **refine):
-    """Fit what a bump scatters once, and several times by a prediction, and a drift of its background."""
+def fitted(bshem, drift=0.0, order=ScanOrder(), border="flat", noise=0.01, stated=None, **refine):
+    """Fit what a bump scatters once, and a drift of its background, by the instrument or as it is stated to be."""
     surface, _ = bump()
-    geometry = SpotGeometry(bshem)
-    signal = np.asarray(single_scattering(geometry, surface)) + predict(surface.height, None).multiple
+    signal = np.asarray(single_scattering(SpotGeometry(bshem), surface))
     variance = (noise * signal.mean()) ** 2 * np.ones_like(signal)
     settings = ReconstructSettings(border=border, refine=RefineSettings(**{"samples": 64, "bias_pairs": 0} | refine))
     data = signal + drift * signal.mean()
-    return fit_heights(
-        data, variance, geometry, PITCH, PITCH, surface if start is None else start, settings, predict, order=order
-    )
+    geometry = SpotGeometry(stated or bshem)
+    return fit_heights(data, variance, geometry, PITCH, PITCH, surface, settings, nothing_more, order=order)
 
 
 def single_scattering(geometry, surface):
@@ -186,41 +184,21 @@ def test_each_scan_drifts_in_its_own_time(bshem):
     assert own < 0.5 and other > 5.0 * own, (own, other)
 
 
-def test_a_held_level_stays_and_counts_in_the_error_bars(bshem):
-    """A start 300 um too high, held: its mean stays, the relief is that of a plane so near, and error bars say so.
+def test_the_distance_to_a_held_level_is_found(bshem):
+    """A plate stated 150 um too far away, the mean height held: it stays, and distance and relief are found.
 
-    About the mean height, the heights' error is within twice what the held level's deviation of 300 um adds, and more
-    than a quarter of it. Catches a level that is not held, and one that is taken for known: 3 times smaller bars.
+    The distance to 4 of its standard deviations, of which noise leaves less than 15 um, the relief to 0.5 um. Catches a
+    level that is not held, a distance that is taken for known (the relief is then off by 2 um), and one whose
+    prior deviation is not the one given.
     """
     surface, _ = bump()
-    start = surface._replace(height=surface.height + 300.0)
-    told = {"border": "free", "noise": 1e-3, "max_rounds": 3, "gain_std": 0.2, "offset_std": 0.01}
-    held, known = (fitted(bshem, start=start, level_std_um=std, **told) for std in (300.0, 1e-3))
-    assert held.surface.height.mean() == pytest.approx(start.height.mean(), abs=0.5)
-    ratio = np.std(held.surface.height - surface.height) / np.std(300.0 * held.posterior.level_response)
-    assert 0.25 < ratio < 2.0, ratio
-    assert held.posterior.height_std.max() > 3.0 * known.posterior.height_std.max()
-
-
-def test_error_bars_of_a_held_level_know_what_follows_it(bshem):
-    """What fits held 50 um higher and lower come to, against `level_response`: to 30 %, for they move by 12 um.
-
-    Multiple scattering follows level and relief. Catches one taken for constant, as in every round: 15 times less.
-    """
-    geometry, (surface, (x, _)) = SpotGeometry(bshem), bump()
-    flat = np.asarray(single_scattering(geometry, Surface(*np.zeros((3, *SHAPE)))))
-    across = np.array([1.0, -0.5, 0.3])[:, None, None] * x / x.max()
-    shape = (surface.height - surface.height.mean()) / np.sum((surface.height - surface.height.mean()) ** 2)
-
-    def predict(height, normals):
-        level, relief = height.mean(), np.sum(shape * height)
-        return Prediction(flat * (0.2 + 1e-3 * level * across + 0.1 * relief * across**2), np.zeros((3, 3, *SHAPE)))
-
-    told = {"border": "free", "noise": 1e-3, "max_rounds": 10, "tolerance_um": 1e-3, "lm_steps": 10, "cg_steps": 200}
-    high, middle, low = (
-        fitted(bshem, start=surface._replace(height=surface.height + by), level_std_um=50.0, predict=predict, **told)
-        for by in (50.0, 0.0, -50.0)
-    )
-    moved = 0.5 * (high.surface.height - low.surface.height) - 50.0
-    stated = 50.0 * middle.posterior.level_response
-    assert np.std(moved) > 5.0 and np.std(moved - stated) < 0.3 * np.std(moved)
+    told = {"border": "free", "noise": 1e-3, "max_rounds": 6, "gain_std": 0.02, "offset_std": 0.01}
+    stated = bshem.at_distance(bshem.sample_distance + 150.0)
+    found, known = (fitted(bshem, stated=stated, level_std_um=std, **told) for std in (300.0, 1e-3))
+    assert found.surface.height.mean() == pytest.approx(surface.height.mean(), abs=0.5)
+    column = found.posterior.names.index("distance[0]")
+    std = 300.0 * np.sqrt(found.posterior.instrument_covariance[column, column])
+    assert std < 15.0
+    assert found.instrument.sample_distance == pytest.approx(bshem.sample_distance, abs=4.0 * std)
+    off, kept = (np.std(fit.surface.height - surface.height) for fit in (found, known))
+    assert off < 0.5 and kept > 1.5, (off, kept)

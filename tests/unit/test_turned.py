@@ -54,19 +54,18 @@ def test_multiple_scattering_stays_for_a_fit(calibrated):
 
 
 def test_what_stays_open_is_handed_to_the_fit(calibrated):
-    """Gains, backgrounds and their drift as unknowns, the level held, more rounds: in the fit's own record.
+    """Gains, backgrounds and their drift as unknowns, and the distance as far as 5 deg make it; more rounds.
 
     A setting that is given wins. Catches a fit that takes the calibration for exact.
     """
     kept, _ = calibrated
-    spread = kept.provenance["self_calibrate"]["spread_deg"]
     given = {"max_rounds": 1, "photometric_rounds": 1, "samples": 0, "rays": 20_000}
     rec = reconstruct(kept, "refine", border="free", refine=given)
     asked = rec.provenance["reconstruct"]["refine"]
     assert asked["max_rounds"] == 1 and asked["drift_std"] == 0.1 and asked["gain_std"] == 0.05
     radius, distance = 3120.0, kept.instrument.sample_distance
     per_degree = (radius**2 + distance**2) / radius * math.radians(1.0)  # distance = radius / tan(polar angle)
-    assert asked["level_std_um"] == pytest.approx(spread * per_degree, rel=0.02)
+    assert asked["level_std_um"] == pytest.approx(5.0 * per_degree, rel=0.02)
 
 
 def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
