@@ -17,7 +17,7 @@ def posterior(n_samples: int = 4000) -> Posterior:
     response = np.zeros((3, *SHAPE))
     response[0, 0, 0], response[1, 1, 1], response[2, 2, 2] = 8.0, 10.0, -20.0
     samples = 2.0 * rng.standard_normal((n_samples, *SHAPE))
-    return Posterior(samples, np.zeros((n_samples, 3)), response, np.zeros(response.shape[1:]), spread, NAMES)
+    return Posterior(samples, np.zeros((n_samples, 3)), response, spread, NAMES)
 
 
 def test_geometry_that_moved_too_far_adds_what_it_did_to_the_heights():
