@@ -23,6 +23,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.indirect import Radiosity
 from helio_jax.reconstruct.model import Prediction
 from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
+from helio_jax.scene.runout import ground_level, run_out
 from helio_jax.scene.surfaces import behind_rims, hollowed, surface_body
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
@@ -60,8 +61,8 @@ def make_predictor(
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
 
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
-    with a `flat` border by the flat z = 0, with a `free` one by the heights at the border, which go on outwards (in
-    radiosity by the flat in either case).
+    with a `flat` border by the flat z = 0, with a `free` one by what leads from the border to level ground (`run_out`;
+    in radiosity by the flat in either case).
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
     what is traced, by the cosine law.
 
@@ -172,7 +173,7 @@ class _Side:
 @dataclass(frozen=True)
 class _Raster:
     """Beam positions [y, x], how far off the surface points are put, half the side of what is around [um], and whether
-    that is the flat z = 0; else the heights at the border go on."""
+    that is the flat z = 0; else it is level ground, to which the border leads."""
 
     instrument: Instrument
     x: np.ndarray
@@ -190,19 +191,11 @@ class _Raster:
             body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
             body = hollowed(body, at, behind)
         else:
-            around, behind = self._continued(*at), self._continued(*behind)
+            ground = ground_level(height)
+            around, behind = (run_out(*points, ground, self.reach) for points in (at, behind))
             body = hollowed(surface_body(*around), around, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
         return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
-
-    def _continued(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return points of the grid with a ring more, as far out as the surface reaches, as high as the border."""
-        x, y, z = (np.pad(field, 1, mode="edge") for field in (x, y, z))
-        x[:, 0] -= self.reach + self.x.min()
-        x[:, -1] += self.reach - self.x.max()
-        y[0] -= self.reach + self.y.min()
-        y[-1] += self.reach - self.y.max()
-        return x, y, z
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
         """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""

@@ -18,7 +18,7 @@ from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
 from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
-from helio_jax.reconstruct.rounds import aitken, contraction_of, left_to_go, relaxed, status_of
+from helio_jax.reconstruct.rounds import aitken, contraction_of, left_to_go, status_of
 from helio_jax.reconstruct.samples import thinning
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.reconstruct.uncertainty import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
@@ -189,7 +189,7 @@ def fit_heights(
         refiner = Refiner(signal, variance, geometry, dx, dy, start, settings, region, order)
         changes: list[float] = []
         last_change = np.zeros(start.height.shape)
-        relaxation, ahead = 1.0, 1.0
+        ahead = 1.0
         is_interrupted = False
         said = "start"
         n_fixed = 0 if refiner.is_unknown else s.fixed_rounds
@@ -217,13 +217,9 @@ def fit_heights(
             cost = sum(map(float, found.cost.values()))
             said = f"cost {cost:.4g}, height change {changes[-1]:.2f} um"
             if number:
-                ahead = aitken(relaxation, change_before, last_change)
+                ahead = aitken(change_before, last_change)
             if changes[-1] < s.tolerance_um and number >= n_fixed:
                 break
-            if number > n_fixed + 1:
-                relaxation = relaxed(ahead)
-            if number + 1 < s.max_rounds:
-                refiner.relax(before, relaxation)
         if refiner.is_level_free and s.bias_pairs and not is_interrupted:
             try:
                 if report:

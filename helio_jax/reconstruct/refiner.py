@@ -388,10 +388,6 @@ class Refiner:
         self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
         return found
 
-    def relax(self, before: Surface, share: float) -> None:
-        """Go back to a share of the way from the surface before; what is next is predicted, and begins, there."""
-        self.surface = Surface(*(b + share * (now - b) for b, now in zip(before, self.surface, strict=True)))
-
     def simulated(self) -> "Refiner":
         """Return a fit that starts from its own truth: this surface, the instrument at its prior means, no noise."""
         twin = copy.copy(self)

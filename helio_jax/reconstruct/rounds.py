@@ -1,4 +1,4 @@
-"""How the rounds of a fit come to rest: what share of a change they go, how far there is left, how it ended."""
+"""How the rounds of a fit come to rest: how far there is left to go, how it ended."""
 
 from collections.abc import Sequence
 
@@ -7,31 +7,19 @@ import numpy as np
 SLOWEST = 0.9
 """Contraction per round that a fit is credited with at least: what does not converge is off by nine last changes."""
 
-LEAST_RELAXATION = 0.1
-"""Share of a round's change that the next prediction is made on at least."""
 
-
-def aitken(before: float, change_before: np.ndarray, change: np.ndarray) -> float:
-    """Return after what share of a round's change, by this and the one before, the rounds would be at rest.
+def aitken(change_before: np.ndarray, change: np.ndarray) -> float:
+    """Return after how many times the last change of the heights, by it and the one before, rounds would be at rest.
 
     It is above 1 where changes creep, below where they swing: a wall's shadow that is predicted too wide raises what
     lies in it, and the next one is predicted too narrow. Changes that agree, or grow, give infinity, or less than 0.
-
-    Args:
-        before: share that was taken of the change before.
-        change_before, change: of the heights in the last two rounds.
 
     Source: Aitken's Delta^2 for vectors: Irons and Tuck, Int. J. Numer. Meth. Eng. 1 (1969) 275; Kuettler and Wall,
         Comput. Mech. 43 (2008) 61, eq. 44.
     """
     apart = change_before - change
     square = float(np.sum(apart**2))
-    return before * float(np.sum(change_before * apart)) / square if square else np.inf
-
-
-def relaxed(ahead: float) -> float:
-    """Return what share of a round's change to take: that of `aitken`, but at most all, for changes are noisy."""
-    return float(np.clip(ahead, LEAST_RELAXATION, 1.0))
+    return float(np.sum(change_before * apart)) / square if square else np.inf
 
 
 def contraction_of(changes: Sequence[float]) -> float | None:

@@ -10,52 +10,22 @@ from helio_jax.reconstruct.model import Prediction, Surface
 from helio_jax.reconstruct.refine import fit_heights
 from helio_jax.reconstruct.refiner import LEVEL_STEP, SCALE_STEP, TILT_STEP, Refiner
 from helio_jax.reconstruct.render import render_single
-from helio_jax.reconstruct.rounds import LEAST_RELAXATION, aitken, left_to_go, relaxed
+from helio_jax.reconstruct.rounds import aitken, left_to_go
 from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
 
 SHAPE, PITCH = (24, 20), 30.0
 
 
-@pytest.mark.parametrize("factor", [-0.95, -1.0, -2.0])
-def test_rounds_that_swing_come_to_rest(factor):
-    """A round that answers a surface x by factor x: 0 after the third change, where without relaxation it never is.
-
-    Catches a share that is not Aitken's: half steps would leave factors other than -1 swinging, if ever less.
-    """
-    direction = np.random.default_rng(1).normal(size=SHAPE)
-    x, share, changes = direction, 1.0, []
-    for _ in range(4):
-        changes.append((factor - 1.0) * x)
-        if len(changes) > 1:
-            share = relaxed(aitken(share, changes[-2], changes[-1]))
-        x = x + share * changes[-1]
-    assert np.abs(x).max() < 1e-9 * np.abs(direction).max()
-
-
-def test_rounds_that_creep_are_not_pushed():
-    """No share above 1, for changes are as noisy as predictions, and none below the least one."""
-    change = np.random.default_rng(1).normal(size=SHAPE)
-    assert relaxed(aitken(1.0, change, 0.7 * change)) == 1.0
-    assert relaxed(aitken(1.0, change, -50.0 * change)) == LEAST_RELAXATION
-    assert relaxed(aitken(1.0, 0.0 * change, 0.0 * change)) == 1.0  # nothing moves
-
-
-@pytest.mark.parametrize("share", [1.0, 0.4])
 @pytest.mark.parametrize("factor", [0.3, 0.6, 0.85])
-def test_how_far_rounds_that_creep_have_to_go(factor, share):
-    """What is left of a geometric series, whatever share of a change was taken.
-
-    Catches a factor read from the sizes of changes: of a share of them, it says that the rounds are slower than they
-    are (0.6 by shares of 0.4: 5.3 changes to go for 1.5).
-    """
+def test_how_far_rounds_that_creep_have_to_go(factor):
+    """What is left of a geometric series. Catches the last change taken for what is left (0.85: 5.7 changes to go)."""
     x = np.random.default_rng(1).normal(size=SHAPE)
     before = (factor - 1.0) * x
-    x = x + share * before
+    x = x + before
     change = (factor - 1.0) * x
-    left = left_to_go([np.std(before), np.std(change)], aitken(share, before, change))
-    to_go = factor / (1.0 - factor)
-    assert left == pytest.approx(to_go if share == 1.0 else max(1.0, to_go))
-    assert left > to_go or np.allclose(x + (1.0 + left) * change, 0.0, atol=1e-9)
+    left = left_to_go([np.std(before), np.std(change)], aitken(before, change))
+    assert left == pytest.approx(factor / (1.0 - factor))
+    assert np.allclose(x + (1.0 + left) * change, 0.0, atol=1e-9)
 
 
 def test_rounds_that_tremble_are_a_change_off():
@@ -66,7 +36,7 @@ def test_rounds_that_tremble_are_a_change_off():
     """
     fits = np.random.default_rng(1).normal(size=(3, 100, 200))
     before, change = np.diff(fits, axis=0)
-    left = left_to_go([np.std(before), np.std(change)], aitken(1.0, before, change))
+    left = left_to_go([np.std(before), np.std(change)], aitken(before, change))
     assert left == 1.0
     assert np.std(left * change) == pytest.approx(np.sqrt(2.0) * np.std(fits[-1]), rel=0.05)
 

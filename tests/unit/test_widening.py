@@ -83,7 +83,7 @@ def test_what_is_left_of_a_fit_that_converges_geometrically(contraction):
     """
     height = 100.0 * (1.0 - contraction ** np.arange(4))
     changes = np.diff(height)
-    assert left_to_go(list(changes), aitken(1.0, changes[-2], changes[-1])) * changes[-1] == pytest.approx(
+    assert left_to_go(list(changes), aitken(changes[-2], changes[-1])) * changes[-1] == pytest.approx(
         100.0 - height[-1]
     )
 
@@ -92,8 +92,8 @@ def test_what_is_left_of_other_fits():
     """A single round, none left, two that diverge, the last by swinging. Catches infinite and negative error bars."""
     assert left_to_go([7.0], 1.0) == 1.0
     assert left_to_go([0.0, 0.0], np.inf) == 1.0
-    assert left_to_go([1.0, 3.0], aitken(1.0, 1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
-    assert left_to_go([1.0, 3.0], aitken(1.0, 1.0, -3.0)) == 1.0
+    assert left_to_go([1.0, 3.0], aitken(1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
+    assert left_to_go([1.0, 3.0], aitken(1.0, -3.0)) == 1.0
 
 
 def test_an_error_of_all_heights_is_added_in_squares():
