@@ -239,7 +239,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=ROOT.parent / "shared")
     parser.add_argument("--sample", default="crystal", choices=("crystal", "tall", *SMOOTH, "measured"))
     parser.add_argument("--size", type=int, default=101)
-    parser.add_argument("--rays", type=int, default=32)
+    parser.add_argument("--rays", type=int, default=128)
     parser.add_argument("--seed", type=int, default=4)
     parser.add_argument("--stages", default=",".join(STAGES))
     parser.add_argument("--methods", default="linear,nearfield")
