@@ -31,17 +31,18 @@ def left_to_go(changes: Sequence[float], ahead: float) -> float:
     """Return how far the heights are from where further rounds would take them, in changes of the last one.
 
     Rounds that creep have as far to go as `aitken` says, nine changes at most. Those that swing, or tremble for their
-    predictions are noisy, are off by one change, or by what is left of it if changes go on to fall as the last one did.
-    A single round's change is taken to halve.
+    predictions are noisy, are off by one change, or by what is left of it if changes go on to fall as the last two did,
+    by the lesser fall: one that happens to be small after others that were not says nothing. A single round's change is
+    taken to halve.
 
     Args:
         changes: root mean square of the changes of the heights in every round.
         ahead: from `aitken` by the last two; of no use with fewer.
     """
-    contraction = contraction_of(changes)
-    if contraction is None:
+    known = [c for c in (contraction_of(changes), contraction_of(changes[:-1])) if c is not None]
+    if not known:
         return 1.0
-    most = SLOWEST / (1.0 - SLOWEST)
+    contraction, most = max(known), SLOWEST / (1.0 - SLOWEST)
     creeps = ahead - 1.0 if 0.0 < ahead < 1.0 + most else most
     swings = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
     return max(creeps, swings)

@@ -111,3 +111,9 @@ def test_an_error_of_all_heights_is_added_in_squares():
     assert twice.bent is not None
     np.testing.assert_allclose(twice.bent, [error, error])
     np.testing.assert_allclose(twice.height_std, np.hypot(2.0, np.sqrt(2.0) * error), rtol=0.06)
+
+
+def test_one_small_change_among_large_ones_is_no_convergence():
+    """Off by a whole change where only the last fall is large. Catches the last ratio alone (0.53 changes for 0.35)."""
+    assert left_to_go([81.0, 92.0, 32.0], aitken(1.0, -0.35)) == 1.0
+    assert left_to_go([81.0, 8.1, 0.81], aitken(1.0, -0.1)) == pytest.approx(1.0 / 9.0)
