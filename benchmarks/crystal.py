@@ -1,15 +1,17 @@
 """Rows 5 to 7 of issue 5 on a crystal whose faces are known, and on the measured one: which stage makes which error.
 
 python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--tiny]
-                             [--sample crystal|tall|hills|pyramids|rough|measured]
+                             [--sample crystal|tall|hills|pyramids|rough|measured] [--law JSON]
 
 A truncated crystal ({100} top of 438 x 250 um, tilted by 6 degrees, four {111} sides at 125.26 degrees to it) on level
 ground is traced anew for five rotations of one detector, with gains, background (75 % of the reading), its drift and
 noise as the measured scans have them. Then one thing after the other is given as it truly is: the motions, the gains
 and background, the multiple scattering. `tall` stands 1100 um high and fills the field, `hills` and `rough` have no
 facets and are, as `pyramids`, scored by their slopes. Truth scores, and is given where a row says so; no reconstruction
-knows it otherwise. Finished rows are kept in the output file and not done again. Where the shared data are, the
-measured crystal is reconstructed by the same settings (`--sample measured`).
+knows it otherwise. `--law` makes another law of scattering true, as `[material.NAME]` of a scene would, of which the
+reconstruction, by the cosine law, knows nothing: {"kind": "backscattering", "sigma_deg": 30, "diffuse_fraction": 0.9}.
+Finished rows are kept in the output file and not done again. Where the shared data are, the measured crystal is
+reconstructed by the same settings (`--sample measured`).
 """
 
 import argparse
@@ -20,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import TypeAdapter
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -42,6 +45,8 @@ from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrumen
 from helio_jax.prepare.selfcalibrate import apply as apply_calibration  # noqa: E402
 from helio_jax.reconstruct.beamframe import unit_normal  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
+from helio_jax.scene.body import COSINE  # noqa: E402
+from helio_jax.scene.scattering import CosineLaw, Law  # noqa: E402
 from helio_jax.scene.surfaces import surface_body  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
@@ -108,7 +113,7 @@ class Recorded(NamedTuple):
     multiple: MicrographSet
 
 
-def record(sample: Sample, n: int, rays: int, seed: int, drifts: tuple = DRIFTS) -> Recorded:
+def record(sample: Sample, n: int, rays: int, seed: int, drifts: tuple = DRIFTS, law: Law = CosineLaw()) -> Recorded:
     """Trace five turned scans and read them as the measured ones were read."""
     instrument, rng = load_instrument(INSTRUMENT), np.random.default_rng(seed)
     step = FIELD_UM / n
@@ -126,7 +131,8 @@ def record(sample: Sample, n: int, rays: int, seed: int, drifts: tuple = DRIFTS)
         motion = Rigid(turn + math.radians(rng.uniform(-1.0, 1.0) if k else 0.0), (float(shift[0]), float(shift[1])))
         places = motion.inverse().apply(np.stack([mesh_x, mesh_y], -1))
         body = surface_body(mesh_x, mesh_y, sample.surface(places[..., 0], places[..., 1]), 8000.0)
-        experiment = make_experiment(body, instrument, TraceSettings(rays=rays, branches=2, seed=900 + k))
+        settings = TraceSettings(rays=rays, branches=2, seed=900 + k)
+        experiment = make_experiment(body, instrument, settings, {COSINE: law.terms()})
         traced = trace_pixels(experiment, pixel_x, pixel_y)
         signal, several = (
             a.reshape(n, n) / flat for a in (traced.total_mean[0], traced.mean[1:, 0].sum(0))
@@ -244,6 +250,7 @@ def main() -> None:
     parser.add_argument("--stages", default=",".join(STAGES))
     parser.add_argument("--methods", default="linear,nearfield")
     parser.add_argument("--refine", type=json.loads, default={}, help="JSON: settings of [reconstruct.refine]")
+    parser.add_argument("--law", type=TypeAdapter(Law).validate_json, default=CosineLaw(), help="JSON: true law")
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()
     if args.tiny:
@@ -251,6 +258,8 @@ def main() -> None:
     path = args.output / ("crystal_tiny.json" if args.tiny else "crystal.json")
     done = json.loads(path.read_text())["rows"] if path.exists() else []
     asked = {"size": args.size, "rays": args.rays, "seed": args.seed, "refine": args.refine}
+    if args.law != CosineLaw():
+        asked["law"] = {"kind": args.law.kind} | args.law.model_dump(exclude_defaults=True)
     is_real = args.sample == "measured"
     sample = None if is_real else make_sample(args.sample)
     known: Recorded | None = None
@@ -258,7 +267,7 @@ def main() -> None:
     for stage in ("measured",) if is_real else args.stages.split(","):
         for method in args.methods.split(","):
             key = {"sample": args.sample, "stage": stage, "method": method} | asked
-            if any(all(r.get(k) == v for k, v in key.items()) for r in done):
+            if any(all(r.get(k) == key.get(k) for k in (*key, "law")) for r in done):
                 continue
             which = stage, method == "refine"
             if which in stacks:
@@ -266,7 +275,7 @@ def main() -> None:
             elif sample is None:
                 stack = measured(args.shared, method)
             else:
-                known = known or record(sample, args.size, args.rays, args.seed)
+                known = known or record(sample, args.size, args.rays, args.seed, law=args.law)
                 stack = calibrated(known, stage, method)
             stacks[which] = stack
             rec = reconstructed(stack, method, args.refine)
@@ -279,7 +288,7 @@ def main() -> None:
                 text += f"; normals {found['turn_deg']:.1f} deg, rms {found['rms_um']:.0f} um; tilts {tilts}"
             if args.sample in SMOOTH:
                 text, is_reached = f"normals {found['turn_deg']:.1f} deg, rms {found['rms_um']:.0f} um", None
-            what = f"{args.sample}: {method}, known: {stage}"
+            what = f"{args.sample}: {method}, known: {stage}" + f", {args.law.kind}" * (args.law != CosineLaw())
             done.append(rows.row("5-7", what, text, "125.26 +- 2 (5), 438 x 250, <= 12 %", is_reached, **key, **found))
             rows.write(path, done, seed=args.seed)
 

@@ -4,10 +4,10 @@ python benchmarks/defects.py [--output benchmarks/out] [--size 61] [--defects no
     [--tiny]
 
 Each scan is read as in `calibration.py` (unlike gains, background, drift, lines, noise), with an instrument whose
-plate, reflectivity or multiple scattering is not what the fit takes it for; then `nearfield` and `refine`, both with
-default settings, which know nothing of the defect. A row: height, RMS and shape error of the sphere (its centre
-fitted, as on measured data), and the stated deviation. Truth scores, and nothing else. Nothing has to be reached: the
-rows tell which errors of the model `refine` does not survive, and whether its error bars say so.
+plate, reflectivity, law of scattering or multiple scattering is not what the fit takes it for; then `nearfield` and
+`refine`, both with default settings, which know nothing of the defect. A row: height, RMS and shape error of the sphere
+(its centre fitted, as on measured data), and the stated deviation. Truth scores, and nothing else. Nothing has to be
+reached: the rows tell which errors of the model `refine` does not survive, and whether its error bars say so.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,8 @@ BALL = 1.0, 0.93, 0.89
 """How the ball reflects into each detector, relative to the ground: about what the measured sphere A wants."""
 FOOT_UM = 50.0
 """Reach of the light that is added about the foot, over which it falls to 1/e."""
+LOBE = 0.1, 30.0
+"""Share of the atoms that do not leave by the cosine law, and the width (s.d.) of the lobe that they leave in, deg."""
 
 Change = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(single, multiple [detector, y, x], is on the sphere, distance from its foot um [y, x]) -> single, multiple."""
@@ -56,26 +59,48 @@ def _both(*args):
     return _other_ball(*_lit_foot(*args), *args[2:])
 
 
-DEFECTS: dict[str, tuple[float, Change, str]] = {
-    "none": (1.0, _alike, "as the fit takes it"),
-    "plate": (PLATE, _alike, f"apertures {PLATE:.2f} times as far out and as large"),
-    "foot": (1.0, _lit_foot, "multiple scattering twice as bright at the foot"),
-    "ball": (1.0, _other_ball, "ball unlike the ground, by detector"),
-    "all": (PLATE, _both, "these three"),
+class Defect(NamedTuple):
+    """What is not as the fit takes it."""
+
+    words: str
+    plate: float = 1.0
+    """Real apertures over stated ones, in place and size."""
+    change: Change = _alike
+    """What is done to the images."""
+    law: dict[str, object] = {}
+    """How ball and ground scatter, as `[material.NAME]` of a scene; empty: by the cosine law."""
+
+
+def _lobe(kind: str) -> Defect:
+    law = {"kind": kind, "sigma_deg": LOBE[1], "diffuse_fraction": 1.0 - LOBE[0]}
+    return Defect(f"{LOBE[0]:.0%} of the atoms in a {kind.replace('_', ' ')} lobe of {LOBE[1]:g} deg", law=law)
+
+
+DEFECTS = {
+    "none": Defect("as the fit takes it"),
+    "plate": Defect(f"apertures {PLATE:.2f} times as far out and as large", PLATE),
+    "foot": Defect("multiple scattering twice as bright at the foot", change=_lit_foot),
+    "ball": Defect("ball unlike the ground, by detector", change=_other_ball),
+    "all": Defect("these three", PLATE, _both),
+    "broad_specular": _lobe("broad_specular"),
+    "backscattering": _lobe("backscattering"),
 }
-"""Defects: scale of the plate, what is done to the images, in words."""
+"""Defects by their names."""
 
 
 def scan(path: Path, size: int, defect: str, seed: int, rays: int) -> MicrographStack:
     """Return the scan of a scene's sphere that a defect changes, told as if it did not."""
-    scale, change, _ = DEFECTS[defect]
+    scale, change, law = DEFECTS[defect][1:]
     raster = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": SIDE_UM / size, "trace.rays": rays}
     told = load_scene(path, raster)
-    apertures = {}
+    real: dict[str, object] = {}
     for k, detector in enumerate(told.model_dump()["detector"]):
         for key in ("center_um", "axes_um"):
-            apertures[f"detector.{k}.{key}"] = [scale * v for v in detector[key]]
-    stack = pipeline.simulate(load_scene(path, raster | apertures), seed=seed, maps=False).only()
+            real[f"detector.{k}.{key}"] = [scale * v for v in detector[key]]
+    if law:
+        real |= {"sample.material": "other", "sample.spheres.0.material": "other"}
+        real |= {f"material.other.{key}": value for key, value in law.items()}
+    stack = pipeline.simulate(load_scene(path, raster | real), seed=seed, maps=False).only()
     assert stack.by_order is not None  # simulated
     height = true_surface(told, stack.x, stack.y).height
     sphere, (shift_x, shift_y) = told.sample.model_dump()["spheres"][0], told.beam_shift
@@ -103,7 +128,7 @@ def study(path: Path, size: int, defect: str, method: str, seed: int, settings: 
         f"shape {100 * scores.shape_error:.1f} %"
     )
     return rows.row(
-        defect, f"{method}, {size} x {size}: {DEFECTS[defect][2]}", value, "", None,
+        defect, f"{method}, {size} x {size}: {DEFECTS[defect].words}", value, "", None,
         stated_std_percent=std, seconds=time.perf_counter() - began, scores=scores.as_dict(), status=rec.status,
         instrument=dict(rec.provenance.get("instrument", {})),
     )  # fmt: skip
@@ -121,7 +146,7 @@ def main() -> None:
     args = parser.parse_args()
     tiny = {"max_rounds": 1, "fixed_rounds": 0, "photometric_rounds": 1, "cg_steps": 10, "rays": 10_000, "samples": 4}
     settings, size, rays = (tiny, 16, 8) if args.tiny else ({}, args.size, 48)
-    defects = ["all"] if args.tiny else args.defects.split(",")
+    defects = ["all", "backscattering"] if args.tiny else args.defects.split(",")
     done = [
         study(args.scene, size, defect, method, args.seed, settings, rays)
         for defect in defects
