@@ -23,7 +23,7 @@ from helio_jax.effects import EFFECTS, LAG, Images
 from helio_jax.errors import HelioError, InputFileError, SceneError
 from helio_jax.evaluate.agreement import REACH, Agreement, Terms, contrast_by_cause, find_shift, normalise
 from helio_jax.evaluate.agreement_figure import save_agreement, save_effects
-from helio_jax.formats.safe import atomic_path
+from helio_jax.formats.safe import atomic_path, make_folder
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.truth import true_surface
@@ -104,7 +104,7 @@ class Comparison:
 
     def write(self, folder: Path) -> list[Path]:
         """Write comparison.json and comparison.png, and effects.png if there are any; return their paths."""
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         out = [folder / "comparison.json", folder / "comparison.png"]
         with atomic_path(out[0]) as part:
             part.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")

@@ -277,6 +277,14 @@ class Instrument(Settings):
         drop = self.sample_distance - self.working_distance - height
         return drop * tx, drop * ty, -drop
 
+    def directions(self) -> np.ndarray:
+        """Return how far, along x and y, the aperture's centre is per unit of height [detector, 2].
+
+        Seen from where the beam meets the reference plane.
+        """
+        spot = np.array(self.spot_position(0.0)[:2])
+        return (np.array([a.center for a in self.apertures()]) - spot) / self.sample_distance
+
     def surface_position(self, x: Any, y: Any, height: Any) -> tuple[Any, Any]:
         """Return where, in the sample frame, a point of `height` seen at beam position (x, y) lies [um]."""
         tx, ty = self.beam_shift

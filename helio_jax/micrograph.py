@@ -96,7 +96,7 @@ class MicrographStack:
                 raise error(f"is_observed must have the shape of counts {shape}, got {np.shape(self.is_observed)}")
             observed &= np.asarray(self.is_observed, bool)
         put("is_observed", observed)
-        if self.variance is not None and np.any(self.variance[observed] < 0):
+        if self.variance is not None and not np.all(self.variance[observed] >= 0):
             raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
 
     @property
@@ -108,6 +108,13 @@ class MicrographStack:
     def std_error(self) -> np.ndarray | None:
         """Square root of `variance`."""
         return None if self.variance is None else np.sqrt(self.variance)
+
+    @property
+    def signal(self) -> np.ndarray:
+        """Counts without the background, where it is known [detector, y, x]."""
+        if self.background is None:
+            return self.counts
+        return self.counts - (self.background[:, None, None] if self.background.ndim == 1 else self.background)
 
     @property
     def multiple(self) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from helio_jax.evaluate.report import write_report
 from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
-from helio_jax.formats.safe import atomic_path
+from helio_jax.formats.safe import atomic_path, make_folder
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.align import AlignSettings, align_scans
@@ -178,7 +178,7 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
 
     Args:
         stack: measured counts.
-        settings: table [calibrate]; default: its defaults.
+        settings: how; default: its defaults.
         changes: settings that replace those, e.g. drift=False.
 
     Raises:
@@ -204,12 +204,18 @@ def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> Micr
     return after
 
 
+_LIMITS = "robust_limits", "jump_limits"
+
+
 def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
     """Return changes of the settings, those added that the stack's calibration asks for and nobody has given."""
     given = dict(changes.get("refine", {}))
     calibration = stack.provenance.get("calibrate") or stack.provenance.get("self_calibrate", {})
     priors = calibration.get("priors", {})
-    asked = {key: value for key, value in priors.items() if key not in settings.refine.model_fields_set}
+    taken = settings.refine.model_fields_set | given.keys()
+    if taken & set(_LIMITS):  # they go together
+        taken |= set(_LIMITS)
+    asked = {key: value for key, value in priors.items() if key not in taken}
     if not asked and not given:
         return changes
     return changes | {"refine": settings.refine.model_dump() | asked | given}
@@ -353,10 +359,7 @@ def run(
         )
     scene.apertures()  # heights need them: told before anything is traced
     out = Path(folder) if folder else Path("helio-out") / scene.name
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise SceneError(f"output folder {out} cannot be made: {e.strerror}; choose another with -o") from None
+    make_folder(out)
     names = {"micrographs": "micrographs.h5", "height map": "height.h5", "scores": "scores.json"}
     names |= {"report": "report.html"} if report else {}
     files = {label: out / name for label, name in names.items()}

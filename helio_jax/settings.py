@@ -25,13 +25,13 @@ class Settings(BaseModel):
     )
 
     def changed(self, **changes: Any) -> Self:
-        """Return a copy with some values replaced, checked again.
+        """Return a copy with some values replaced, checked again; what nobody has set still counts as not set.
 
         Raises:
             SceneError: an unknown setting, or a value that is out of its range.
         """
         try:
-            return type(self).model_validate(self.model_dump() | changes)
+            return type(self).model_validate(self.model_dump(exclude_unset=True) | changes)
         except ValidationError as e:
             told = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}, got {p['input']!r}" for p in e.errors())
             raise SceneError(f"setting not accepted: {told}") from None

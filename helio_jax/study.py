@@ -29,7 +29,7 @@ from helio_jax.config import load_scene, resolved, with_files
 from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.evaluate.sweep import save_sweep
 from helio_jax.explain import explain_errors
-from helio_jax.formats.safe import atomic_path
+from helio_jax.formats.safe import atomic_path, make_folder
 from helio_jax.formats.toml import to_toml
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.files import read_bytes
@@ -239,10 +239,7 @@ def resume_study(folder: Path, *, say: Callable[[str], None] = print) -> Path:
 
 def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None:
     """Make the folder, or check that it holds this very study."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise SceneError(f"output folder {folder} cannot be made: {e.strerror}; choose another with -o") from None
+    make_folder(folder)
     manifest = folder / "study.json"
     now = {"study": str(path.resolve()), "scenes": hashlib.sha256("\n".join(scenes).encode()).hexdigest()}
     if not manifest.exists():
@@ -251,7 +248,10 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
         return
     if not is_shared:
         raise ResumeError(f"{folder} holds a study already: --resume goes on with it, -o names another folder")
-    then = json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError))
+    try:
+        then = dict(json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError)))
+    except (ValueError, TypeError):
+        raise ResumeError(f"{manifest} is damaged: remove it, and give the study again with --resume") from None
     if then.get("scenes") != now["scenes"]:
         raise ResumeError(
             f"{folder} holds another study, or {path} or its scene was changed since: name another folder"
@@ -259,12 +259,14 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
 
 
 def _scene_text(path: Path, overrides: dict[str, Any], place: str) -> str:
-    """Return the whole scene of a point as TOML; file names are made absolute."""
+    """Return the scene of a point as TOML; file names are made absolute."""
     try:
         scene = load_scene(path, overrides)
     except SceneError as e:
         raise SceneError(f"{place}: {e}") from None
-    return to_toml(with_files(resolved(scene), lambda name: str((scene.base_dir / name).resolve())))
+    # what [reconstruct] leaves open stays open: a calibration may set it
+    tables = resolved(scene) | {"reconstruct": scene.reconstruct.model_dump(mode="json", exclude_unset=True)}
+    return to_toml(with_files(tables, lambda name: str((scene.base_dir / name).resolve())))
 
 
 def _run_point(study: Study, point: _Point, text: str, options: pipeline.SimulateOptions) -> None:
@@ -321,6 +323,8 @@ def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: b
             part.write_text(content, encoding="utf-8")
     failed = [row for row in rows if row["status"] == "failed"]
     if is_last:
+        if study.score and study.score not in columns:
+            raise SceneError(f"{study.name}: score = {study.score!r} is none of the scores: {', '.join(columns)}")
         score = study.score or next(
             (c for c in columns if c.startswith(("rms_region", "rms_image", "multiple_"))), None
         )

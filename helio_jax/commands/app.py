@@ -123,6 +123,25 @@ def print_table(rows: list[tuple[str, str, str]]) -> None:
         print(f"  {label:<{width}}  {value:>10} {unit}")
 
 
+def set_options(items: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Return settings given as KEY=VALUE (`--set`), and those that have options of their own, where these were given.
+
+    Raises:
+        SceneError: an item is no KEY=VALUE, or a key is given twice.
+    """
+    from helio_jax.errors import SceneError
+
+    out = given_options(**options)
+    for item in items or ():
+        key, is_pair, value = item.partition("=")
+        if not is_pair or not key:
+            raise SceneError(f"--set {item}: give it as KEY=VALUE")
+        if key in out:
+            raise SceneError(f"--set {item}: {key} is given already: give it once")
+        out[key] = value
+    return out
+
+
 def given_options(**values: Any) -> dict[str, Any]:
     """Return the options that were given."""
     return {key: value for key, value in values.items() if value is not None}

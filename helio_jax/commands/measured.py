@@ -9,7 +9,19 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.app import FIGURE, AsJson, Bar, H5File, Rays, SceneArg, app, given_options, print_table, say
+from helio_jax.commands.app import (
+    FIGURE,
+    AsJson,
+    Bar,
+    H5File,
+    Rays,
+    SceneArg,
+    app,
+    given_options,
+    print_table,
+    say,
+    set_options,
+)
 
 
 @app.command("import")
@@ -58,7 +70,9 @@ def compare(
     """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
     from helio_jax.comparison import compare as compare_with_scene
     from helio_jax.formats.hdf5 import read_stack
+    from helio_jax.formats.safe import make_folder
 
+    make_folder(output)
     found = compare_with_scene(
         read_stack(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
     )
@@ -101,8 +115,7 @@ def align(
 
     if auto == (points is not None):
         raise SceneError("align needs either --points FILE.csv or --auto")
-    chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
-    stack, places = pipeline.align(_read_set(scans), points, **chosen)
+    stack, places = pipeline.align(_read_set(scans), points, **set_options(settings))
     write(stack, output)
     if figure:
         from helio_jax.evaluate.overlay import save_overlay
@@ -138,13 +151,17 @@ def calibrate(
     noise_model: Annotated[bool, typer.Option(help="Let the variance follow the counts.")] = True,
     spike_limit: Annotated[float | None, typer.Option(help="Standard deviations of a spike; 0: none.")] = None,
     masked_share: Annotated[float | None, typer.Option(help="Multiple scattering in the darkest spot / flat.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: border_fraction, drift_degree, ... (repeat).")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate background, gain, drift and noise of a measured scan; the fit goes on from these estimates."""
     from helio_jax.pipeline import calibrate_file
 
-    given = given_options(spike_limit=spike_limit, masked_share=masked_share)
-    found = calibrate_file(stack, output, drift=drift, lines=lines, noise_model=noise_model, **given)
+    own = {"drift": drift, "lines": lines, "noise_model": noise_model}
+    given = set_options(settings, **own, spike_limit=spike_limit, masked_share=masked_share)
+    found = calibrate_file(stack, output, **given)
     record = found.provenance["calibrate"]
     if as_json:
         print(json.dumps(record | {"detectors": found.instrument.detector_names}))
@@ -188,9 +205,8 @@ def orient(
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.orient import OrientSettings, find_orientation
 
-    chosen = {key: value for key, _, value in (item.partition("=") for item in settings or ())}
     names = None if detectors is None else tuple(name.strip() for name in detectors.split(","))
-    asked = OrientSettings().changed(**chosen, **given_options(turn_deg=turn, mirror=mirror, detectors=names))
+    asked = OrientSettings().changed(**set_options(settings, turn_deg=turn, mirror=mirror, detectors=names))
     with Bar("fitting orientations") as bar:
         found = find_orientation(read_stack(stack), asked, bar)
     print(json.dumps(found.as_dict()) if as_json else "\n".join(found.summary()))

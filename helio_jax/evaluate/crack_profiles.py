@@ -290,7 +290,8 @@ def _measure_thin(
     if is_dark.sum() < 2:
         return seen | {"kind": "line", "depth_note": "neither dark as a slit nor bright and dark as a step"}
     slant = abs(float(np.dot(stack.instrument.beam_shift, beside.normal)))
-    rims = [float(np.max(np.abs(a.rim(64) @ beside.normal))) for a in stack.instrument.apertures()]
+    spot = np.array(stack.instrument.spot_position(0.0)[:2])
+    rims = [float(np.max(np.abs((a.rim(64) - spot) @ beside.normal))) for a in stack.instrument.apertures()]
     reaches = np.array(rims) / stack.instrument.sample_distance + slant
     bound = max(0.0, float(np.max((missing - _SEEN * missing_std) / reaches)))
     return seen | {

@@ -117,7 +117,7 @@ def contrast_of(stack: MicrographStack) -> Contrast:
     axis = 1 if stack.fast_axis == "x" else 0
     known = np.all(stack.is_observed, axis=0)
     values, variance = [], []
-    for counts, noise in zip(stack.counts, stack.variance, strict=True):
+    for counts, noise in zip(stack.signal, stack.variance, strict=True):
         flat = float(np.median(counts[known]))
         q = np.where(known, counts / flat - 1.0, 0.0)
         for _ in range(_LINE_ROUNDS):
@@ -128,9 +128,7 @@ def contrast_of(stack: MicrographStack) -> Contrast:
             q = np.where(known, q - np.nan_to_num(lines), 0.0)
         values.append(q)
         variance.append(np.where(known, noise, 0.0) / flat**2)
-    apertures = stack.instrument.apertures()
-    directions = np.array([a.center for a in apertures]) / stack.instrument.sample_distance
-    return Contrast(np.array(values), np.array(variance), known, directions)
+    return Contrast(np.array(values), np.array(variance), known, stack.instrument.directions())
 
 
 def kernel(order: int, width: float, angle: float) -> np.ndarray:

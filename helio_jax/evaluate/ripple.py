@@ -204,14 +204,14 @@ def compare_with_images(
     every = np.all(stack.is_observed, axis=0)
     unit = np.array(ripple.raster_k) / math.hypot(*ripple.raster_k)
     waves, noises, response = [], [], []
-    for k, aperture in enumerate(stack.instrument.apertures()):
+    for k, direction in enumerate(stack.instrument.directions()):
         spectrum, field = _image_spectrum(stack, k, every, regions, settings)
         blocks = spectrum.blocks
         n = np.array([b.rows.size for b in blocks.blocks])
-        mean = np.array([stack.counts[k][b.rows, b.columns].mean() for b in blocks.blocks])
+        mean = np.array([stack.signal[k][b.rows, b.columns].mean() for b in blocks.blocks])
         waves.append(_complex_amplitudes(field, blocks, ripple.raster_k, steps, settings.degree) / mean)
         noises.append(2.0 * spectrum.floor_at(*ripple.raster_k) / n / mean**2)
-        response.append(-float(unit @ aperture.center) / stack.instrument.sample_distance)
+        response.append(-float(unit @ direction))
     z, variance, r = np.array(waves), np.array(noises), np.array(response)[:, None]
     slope = np.sum(r * z / variance, 0) / np.sum(r**2 / variance, 0)
     rms = lambda a: np.sqrt(np.sum(np.abs(a) ** 2 * n, -1) / n.sum())  # noqa: E731

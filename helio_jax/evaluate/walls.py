@@ -115,7 +115,7 @@ def find_walls(rec: Reconstruction, inside: np.ndarray | None = None, settings: 
         marked &= inside
     height = np.where(np.isfinite(rec.height), rec.height, np.nanmedian(rec.height))
     smooth = ndimage.gaussian_filter(height, s.blur_px)
-    upward, rightward = np.gradient(smooth)
+    upward, rightward = np.gradient(smooth, *_sides(rec)[::-1])
     fall = np.stack([-rightward, -upward], -1)
     left, walls, used = marked.copy(), [], 0
     steepest = np.argsort(-np.hypot(*np.moveaxis(fall, -1, 0)), axis=None)
@@ -160,8 +160,8 @@ def _measure(
     rows, columns = np.nonzero(region)
     if rows.size < 3:
         return None
-    step, middle = pitch(rec.raster_x), np.array([columns.mean(), rows.mean()])
-    offset = np.stack([columns, rows], -1) - middle
+    step, sides, middle = pitch(rec.raster_x), _sides(rec), np.array([columns.mean(), rows.mean()])
+    offset = (np.stack([columns, rows], -1) - middle) * sides
     moments = offset.T @ offset / rows.size
     along = np.linalg.eigh(moments)[1][:, 1]
     across = np.array([along[1], -along[0]])
@@ -172,7 +172,7 @@ def _measure(
     length, width = float(np.ptp(u)) + 1.0, math.sqrt(12.0 * float(np.var(v)) + 1.0)
     if length < s.min_length_px or length < 1.5 * width:
         return None
-    ends = rec.beam_positions(middle + np.outer([u.min(), u.max()], along))
+    ends = rec.beam_positions(middle + np.outer([u.min(), u.max()], along) / sides)
     value, std, is_determined, note = _difference(rec, middle, along, across, (u.min(), u.max()), (v.min(), v.max()), s)
     reason = rec.reason[region]
     return Wall(
@@ -194,6 +194,11 @@ def _measure(
     )
 
 
+def _sides(rec: Reconstruction) -> np.ndarray:
+    """Return the sides of a pixel along x and y [2], in those along x: in such units edges are measured."""
+    return np.array([1.0, pitch(rec.raster_y) / pitch(rec.raster_x)])
+
+
 def _difference(
     rec: Reconstruction,
     middle: np.ndarray,
@@ -205,7 +210,7 @@ def _difference(
 ) -> tuple[float, float, bool, str]:
     """Return height above minus below, its deviation, whether it is determined, and why not."""
     y, x = np.mgrid[: rec.height.shape[0], : rec.height.shape[1]]
-    offset = np.stack([x, y], -1) - middle
+    offset = (np.stack([x, y], -1) - middle) * _sides(rec)
     u, v = offset @ along, offset @ across
     known = np.isfinite(rec.height) & rec.has_relief
     near = (u >= extent[0]) & (u <= extent[1]) & known

@@ -32,6 +32,18 @@ _BOOT = (
 )
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder for output, and those above it, where it is not there yet.
+
+    Raises:
+        SceneError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise SceneError(f"output folder {folder} cannot be made: {e.strerror}; choose another with -o") from None
+
+
 def check_size(path: str | os.PathLike, limit_bytes: int) -> int:
     """Return the size of a regular, non-empty file of at most `limit_bytes`.
 

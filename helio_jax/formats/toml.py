@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+from helio_jax.errors import SceneError
 from helio_jax.formats.safe import atomic_path
 from helio_jax.reconstruction import Reconstruction
 
@@ -46,8 +47,16 @@ def write_instrument(rec: Reconstruction, path: str | os.PathLike) -> None:
 
     The distance of the sample is left to the scene. The uncertainties are the posterior deviations of polar angles and
     azimuths, the largest of all detectors (those of the file that the fit started from where it did not fit them).
+
+    Raises:
+        SceneError: nothing of the geometry was fitted.
     """
     found = rec.provenance.get("instrument", {}).get("values", {})
+    if not any(name.startswith(("polar ", "azimuth ")) for name in found):
+        raise SceneError(
+            f"{path}: the heights are by {rec.method}, which fitted no directions of detectors: use refine, on a stack "
+            "whose instrument file says how uncertain they are (table [uncertainty])"
+        )
     tables = rec.instrument.model_dump(mode="json", exclude_none=True)
     tables["plate"].pop("sample_distance_um", None)
     for kind in ("polar", "azimuth"):

@@ -19,7 +19,7 @@ from helio_jax.settings import Settings
 
 
 class CalibrateSettings(Settings):
-    """How drift, background and gain are first estimated: table `[calibrate]`."""
+    """How drift, background and gain are first estimated: `helio calibrate --set KEY=VALUE`."""
 
     border_fraction: float = Field(default=0.08, gt=0.0, lt=0.5)
     """Width of the flat border, as a fraction of the image on each side."""

@@ -8,7 +8,7 @@ axis of the scan neighbouring pixels follow one another in time.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter, median_filter, minimum_filter
 
 from helio_jax.micrograph import MicrographStack
 
@@ -31,8 +31,17 @@ class NoiseModel:
 
     def variance(self, counts: np.ndarray) -> np.ndarray:
         """Return the variance of every pixel [detector, y, x] from a smoothed image, so that no count sets its own."""
-        mean = np.stack([median_filter(image, 5, mode="nearest") for image in counts])
+        mean = np.stack([median_filter(_filled(image), 5, mode="nearest") for image in counts])
         return self.constant[:, None, None] + self.per_count[:, None, None] * np.maximum(mean, 0.0)
+
+
+def _filled(image: np.ndarray) -> np.ndarray:
+    """Return an image [y, x] whose missing pixels have the value of the nearest one that is there; 0 if none is."""
+    missing = ~np.isfinite(image)
+    if missing.all():
+        return np.zeros(image.shape)
+    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    return image[tuple(nearest)]  # type: ignore[arg-type]
 
 
 def time_last(stack: MicrographStack) -> np.ndarray:

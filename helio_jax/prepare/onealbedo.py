@@ -142,7 +142,7 @@ class _Fit:
                 self.noise.append(math.hypot(_MODEL_ERROR * float(np.std(inside)), math.sqrt(noise / self.together)))
                 self.view.append(k)
                 azimuth.append(math.atan2(aperture.center[1], aperture.center[0]))
-                tangent.append(math.hypot(*aperture.center) / stack.instrument.working_distance)
+                tangent.append(math.hypot(*aperture.center) / stack.instrument.sample_distance)
         self.azimuth, self.polar_given = np.array(azimuth), np.arctan(tangent)
         self.sigma = np.maximum(np.array(self.noise), 1e-6)
         self.gain, self.share, self.more_polar = np.ones(len(self.view)), 0.0, 0.0

@@ -90,7 +90,7 @@ def common_raster(
     if axes[0].size * axes[1].size > MAX_PIXELS:
         raise GuardError(
             f"the union of the scans needs {axes[0].size} x {axes[1].size} pixels of {pitch(first.x):g} um, the limit "
-            f"is {MAX_PIXELS}: use --field reference, or give the scan with the coarsest raster first"
+            f"is {MAX_PIXELS}: use --set field=reference, or give the scan with the coarsest raster first"
         )
     return axes[0], axes[1]
 

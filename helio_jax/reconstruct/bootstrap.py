@@ -17,7 +17,7 @@ from helio_jax.arrays import border_mask
 from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.reconstruct.linear import PhotometricSolution
 from helio_jax.reconstruct.model import Prediction
-from helio_jax.reconstruct.samples import thinning
+from helio_jax.reconstruct.samples import on_raster, thinning
 from helio_jax.reconstruct.settings import ReconstructSettings
 
 MAX_PIXELS = 10_000
@@ -65,8 +65,7 @@ def bootstrap_heights(
         reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
         reading = as_at_border(reading, data, settings) * (other.flat_signal() / told)[:, None, None]
         drawn.append(solve(reading, spread, other, stride) - height)
-    row, column = (np.minimum(np.arange(n) // stride, m - 1) for n, m in zip(shape, height.shape, strict=True))
-    return np.array(drawn)[:, row[:, None], column]
+    return on_raster(np.array(drawn), shape, stride)
 
 
 def as_at_border(data: np.ndarray, told: np.ndarray, settings: ReconstructSettings) -> np.ndarray:

@@ -29,7 +29,7 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
         "log_multiple": (settings.multiple_error, "relative"),
         "drift": (settings.drift_std, "of the signal"),
         "law": (settings.law_std, "of the exponent"),
-        "distance": (settings.level_std_um or sure.sample_distance_um, "um"),
+        "distance": (fit.distance_std, "um"),
         "tilt": (sure.tilt_deg, "deg"),
         "polar": (sure.polar_deg, "deg"),
         "azimuth": (sure.azimuth_deg, "deg"),

@@ -33,7 +33,7 @@ class PhotometricSolution:
     Attributes:
         normals: unit normals [y, x, 3]; (0, 0, 1) where invalid.
         albedo: relative reflectivity [y, x]; NaN where invalid.
-        weight: confidence of the slope, relative to the best pixel [y, x]; 0 where invalid.
+        weight: confidence of the slope, 0.05 to 1, relative to the best tenth's [y, x]; 0 where invalid.
         n_images: usable images [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
     """
@@ -51,10 +51,7 @@ def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
     Without a known number of beam atoms the unit is the mean signal, so that the albedo is relative. Without
     a known variance every datum gets the same one: 1 % of the mean signal, squared.
     """
-    counts = np.where(stack.is_observed, stack.counts, np.nan)
-    if stack.background is not None:
-        background = stack.background
-        counts = counts - (background[:, None, None] if background.ndim == 1 else background)
+    counts = np.where(stack.is_observed, stack.signal, np.nan)
     unit = stack.n_rays or float(np.nanmean(np.abs(counts)))
     if stack.variance is not None:
         variance = np.where(stack.is_observed, stack.variance, np.nan)

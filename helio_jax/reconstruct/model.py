@@ -174,8 +174,8 @@ INSTRUMENT = (
 
 class Unknowns(NamedTuple):
     """Whitened heights and slopes [y, x]; gain, offset, scale of the multiple scattering [detector]; one for the unseen
-    side; albedo modes; slow drift [detector, mode]; offsets of the scan lines [detector, line]; distance of the sample
-    [1], its tilt [2: x, y]; polar angle and azimuth of the apertures [detector, 2].
+    side; albedo modes; slow drift [detector, mode]; offsets of the scan lines [detector, line]; power of the scattering
+    law [1]; distance of the sample [1], its tilt [2: x, y]; polar angle and azimuth of the apertures [detector, 2].
 
     All but the surface in prior deviations. Unknowns that are known have no entries.
     """

@@ -65,6 +65,7 @@ class Fit:
     tilt: np.ndarray
     instrument: Instrument
     values: dict[str, np.ndarray]
+    distance_std: float
     residuals: np.ndarray
     weight: np.ndarray
     model_share: np.ndarray
@@ -122,7 +123,7 @@ def _posterior(refiner: Refiner, settings: ReconstructSettings, region: np.ndarr
     length = s.error_reach * float(np.ptp(refiner.surface.height))
     error = ModelError(part.model_share, (length / m.dy, length / m.dx), stride)
     linear = linearise(m.thinned(stride), unknowns, lagged)
-    found = sample_posterior(linear, s.samples, error=error)
+    found = sample_posterior(linear, s.samples, error=error).levelled(part.tilt_std * part.across)
     found = found.widened(refiner.values, GEOMETRY).widened(refiner.values, GAINS, OFF_BY_FAR)
     return found.on_raster(refiner.signal.shape[1:], stride)
 
@@ -249,6 +250,7 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         tilt=refiner.tilt,
         instrument=refiner.instrument,
         values=refiner.values,
+        distance_std=refiner.distance_std,
         residuals=refiner.residuals,
         weight=refiner.weight,
         model_share=refiner.model_share,

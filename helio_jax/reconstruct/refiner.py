@@ -7,6 +7,7 @@ differences.
 """
 
 import copy
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -189,6 +190,11 @@ class Refiner:
         return held or self.model.geometry.instrument.uncertainty.sample_distance_um
 
     @property
+    def tilt_std(self) -> float:
+        """Prior deviation of the tilt of the reference plane, rad."""
+        return math.radians(self.model.geometry.instrument.uncertainty.tilt_deg)
+
+    @property
     def aim_std(self) -> np.ndarray:
         """Prior deviations of polar angle and azimuth [2], rad."""
         sure = self.model.geometry.instrument.uncertainty
@@ -310,7 +316,6 @@ class Refiner:
     def lag(self, limit: float, cut: float) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
         s, m, p = self.settings, self.model, self.near
-        sure = m.geometry.instrument.uncertainty
         height, slope_x, slope_y = self.surface
         self.weight = geman_mcclure(self.residuals, limit)
         edges_x, edges_y = self.edges(cut)
@@ -362,7 +367,7 @@ class Refiner:
             lines_std=s.line_std * self.mean_signal,
             law_std=s.law_std,
             distance_std=self.distance_std,
-            tilt_std=np.radians(sure.tilt_deg),
+            tilt_std=self.tilt_std,
             aim_std=self.aim_std,
         )
         return Unknowns(*map(np.asarray, unknowns)), Lagged(*map(np.asarray, lagged))
@@ -411,8 +416,7 @@ class Refiner:
     @property
     def tilt(self) -> np.ndarray:
         """Slopes (x, y) of the reference plane that have been fitted [2]."""
-        std = np.radians(self.model.geometry.instrument.uncertainty.tilt_deg)
-        return std * self.values["tilt"] if self.values["tilt"].size else np.zeros(2)
+        return self.tilt_std * self.values["tilt"] if self.values["tilt"].size else np.zeros(2)
 
     @property
     def levelled(self) -> Surface:

@@ -11,6 +11,15 @@ def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
     return stride
 
 
+def on_raster(fields: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
+    """Return fields [..., y, x] of every `stride`-th pixel on the raster they are of, each taking its nearest one's."""
+    row, column = (
+        np.minimum(np.rint(np.arange(n) / stride).astype(int), m - 1)
+        for n, m in zip(shape, fields.shape[-2:], strict=True)
+    )
+    return fields[..., row[:, None], column]
+
+
 def also_off_by(samples: np.ndarray, error: np.ndarray, seed: int) -> np.ndarray:
     """Return samples [sample, y, x] with one error more, of all heights together, known up to a factor of deviation 1.
 

@@ -68,7 +68,8 @@ def reconstruct_stack(
     Args:
         stack: images of one scan; background known or zero.
         settings: method and options.
-        make_predict: for `refine`: from a number of paths to what predicts, with them, all but single scattering.
+        make_predict: from a number of paths to what predicts, with them, all but single scattering; `refine` needs it,
+            the other methods correct with it.
         report: called before each round of `refine`.
 
     Raises:

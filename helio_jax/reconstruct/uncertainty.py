@@ -14,6 +14,7 @@ On rasters above `MAX_PIXELS` every 2nd (4th, ...) row and column stands for the
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -25,7 +26,7 @@ from scipy.sparse.linalg import splu
 
 from helio_jax.reconstruct.edges import along
 from helio_jax.reconstruct.model import SLOPE_STD, Lagged, Model, Surface, Unknowns
-from helio_jax.reconstruct.samples import also_off_by
+from helio_jax.reconstruct.samples import also_off_by, on_raster
 
 MAX_PIXELS = 30_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -113,6 +114,20 @@ class Posterior:
         """Standard deviation of every height [y, x], um; itself known to 1 / sqrt(2 samples)."""
         return np.sqrt(np.mean(self.samples**2, axis=0))
 
+    def levelled(self, planes: np.ndarray) -> "Posterior":
+        """Return it for the heights above a reference plane that is tilted, by the parameters tilt[0] and tilt[1].
+
+        Args:
+            planes: what one prior deviation of each raises the reference plane by [2, y, x], um.
+        """
+        tilts = [self.names.index(name) for name in ("tilt[0]", "tilt[1]") if name in self.names]
+        if not tilts:
+            return self
+        response = self.response.copy()
+        response[tilts] -= planes
+        fallen = np.tensordot(self.instrument_samples[:, tilts], planes, 1)
+        return replace(self, samples=self.samples - fallen, response=response)
+
     def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...], least: float = 1.0) -> "Posterior":
         """Return it with error bars that allow for a model that lacks something.
 
@@ -156,11 +171,7 @@ class Posterior:
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
         if stride == 1:
             return self
-        nearest = [
-            np.minimum(np.rint(np.arange(n) / stride).astype(int), m - 1)
-            for n, m in zip(shape, self.samples.shape[1:], strict=True)
-        ]
-        full = lambda a: a[:, nearest[0][:, None], nearest[1][None, :]]  # noqa: E731
+        full = partial(on_raster, shape=shape, stride=stride)
         bent = None if self.bent is None else full(self.bent)
         return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from helio_jax.arrays import border_mask
-from helio_jax.errors import SceneError
+from helio_jax.errors import InputFileError, SceneError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.pipeline import calibrate
-from helio_jax.prepare.faults import estimate_noise, find_spikes, line_noise
+from helio_jax.prepare.faults import NoiseModel, estimate_noise, find_spikes, line_noise
 from helio_jax.reconstruct.background import ScanOrder, drift_modes
 
 
@@ -91,3 +91,18 @@ def test_a_known_beam_is_not_calibrated_again(bshem):
     stack = measured(bshem, np.ones((3, 20, 20)), n_rays=1.0)
     with pytest.raises(SceneError, match="calibrated already"):
         calibrate(stack)
+
+
+def test_variance_beside_pixels_that_were_not_recorded(bshem):
+    """A ramp with a hole: what is there has its own variance. Catches a median that takes NaN along, a detector of NaN.
+
+    And a stack refuses a variance that is not a number where it was recorded: one such pixel makes all heights NaN.
+    """
+    counts = np.broadcast_to(np.linspace(1000.0, 3000.0, 40), (3, 40, 40)).copy()
+    whole = NoiseModel(np.full(3, 100.0), np.ones(3)).variance(counts)
+    counts[0, 10:17, 10:17], counts[2] = np.nan, np.nan
+    found = NoiseModel(np.full(3, 100.0), np.ones(3)).variance(counts)
+    known = np.isfinite(counts)
+    assert found[known] == pytest.approx(whole[known], rel=0.1) and np.all(np.isfinite(found))
+    with pytest.raises(InputFileError, match="variance must be >= 0, got nan"):
+        measured(bshem, np.ones((3, 4, 5)), variance=np.full((3, 4, 5), np.nan))

@@ -7,6 +7,7 @@ import pytest
 
 from helio_jax.detector import Aperture, Detector, cone_ellipse
 from helio_jax.instrument import Beam, Instrument, Plate
+from helio_jax.reconstruct.formfactor import SpotGeometry
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:
@@ -110,3 +111,15 @@ def test_detector_refuses_mixtures(keys):
     """A detector is an ellipse or a cone that meets the plate. Catches: half-given apertures that pass silently."""
     with pytest.raises(ValueError, match="detector 'd'"):
         Detector(name="d", **keys)
+
+
+@pytest.mark.parametrize("sample_distance", [4000.0, 4720.0])
+def test_directions_are_those_of_the_form_factor(sample_distance):
+    """From the spot on the reference plane to a small aperture: the form factor's direction, to its size squared.
+
+    Catches directions from the origin, which the beam meets at the working distance only.
+    """
+    wide = make_instrument(sample_distance=sample_distance)
+    small = wide.model_copy(update={"detector": (wide.detector[0].model_copy(update={"half_angle_deg": 0.5}),)})
+    phi = np.asarray(SpotGeometry(small).form_factor(np.zeros((1, 1))))[0, :, 0, 0]
+    np.testing.assert_allclose(small.directions()[0], phi[:2] / phi[2], atol=2e-4)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helio_jax.config import load_instrument, load_scene
+from helio_jax.errors import SceneError
 from helio_jax.formats.toml import write_instrument
 from helio_jax.instrument import Uncertainty
 from helio_jax.reconstruction import Reconstruction
@@ -46,9 +47,10 @@ def test_fitted_instrument_comes_back_from_its_file(bshem, tmp_path):
 
 def test_distance_of_the_sample_is_the_scenes(bshem, tmp_path):
     """Catches the calibration sample's distance handed on to another sample, in the table or over the scene's own."""
-    write_instrument(fitted(bshem, {}), tmp_path / "found.toml")
+    polar = {name: value for name, value in FOUND.items() if not name.startswith("azimuth")}
+    write_instrument(fitted(bshem, polar), tmp_path / "found.toml")
     assert load_instrument(tmp_path / "found.toml").plate.sample_distance_um is None
-    assert load_instrument(tmp_path / "found.toml").uncertainty == SURE
+    assert load_instrument(tmp_path / "found.toml").uncertainty == SURE.model_copy(update={"polar_deg": 1.1})
     scene = 'extends = "found.toml"\n[plate]\nsample_distance_um = 4321.0\n[sample]\nkind = "flat"\n'
     scan = "[scan]\nnx = 4\nny = 4\npixel_size_um = 30.0\n"
     (tmp_path / "scene.toml").write_text(scene + scan, encoding="utf-8")
@@ -59,3 +61,10 @@ def test_distance_of_the_sample_is_the_scenes(bshem, tmp_path):
     moved = np.arctan(np.hypot(*centers.T) / loaded.working_distance)
     assert moved - np.arctan(np.hypot(*stated.T) / bshem.working_distance) == pytest.approx(AIM[:, 0])
     assert math.isclose(np.arctan2(*centers[0][::-1]), AIM[0, 1])
+
+
+def test_an_instrument_that_was_not_fitted_is_not_called_so(bshem, tmp_path):
+    """Catches the stated apertures written as fitted ones, after nearfield or a fit by a known instrument."""
+    with pytest.raises(SceneError, match="uncertainty"):
+        write_instrument(fitted(bshem, {"log_gain forward": [0.1, 9.0, 0.3, "relative"]}), tmp_path / "found.toml")
+    assert not (tmp_path / "found.toml").exists()

@@ -134,3 +134,10 @@ def test_what_lines_need():
             contrast_of(stack.replace(**changes))
     with pytest.raises(GuardError, match="no pixel"):
         find_lines(contrast_of(stack), np.zeros((SIZE, SIZE), bool), "line", LineSettings())
+
+
+def test_a_known_background_is_no_signal():
+    """Catches contrasts over the reading: a background of twice the signal would make them three times too small."""
+    plain = make_stack(0.1 * nuisance(1))
+    read = plain.replace(counts=plain.counts + 2.0, background=np.full(3, 2.0))
+    assert contrast_of(read).values == pytest.approx(contrast_of(plain).values)

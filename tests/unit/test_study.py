@@ -103,7 +103,8 @@ def test_scene_as_toml_is_read_back(tmp_path, name):
 def test_points_index_and_going_on(tmp_path):
     """Every point has its scene and micrographs, the index its values and scores; only what is missing is run again.
 
-    Catches values that do not reach the tracer, an index that mixes points, and a resume that begins anew.
+    Catches values that do not reach the tracer, an index that mixes points, a resume that begins anew, and defaults
+    written into a point's scene, over which a calibration's priors then have no say.
     """
     path, out = grid(tmp_path), tmp_path / "out"
     index = run_study(path, out, options=QUIET)
@@ -123,9 +124,16 @@ def test_points_index_and_going_on(tmp_path):
     before = {p: p.stat().st_mtime_ns for p in out.glob("point_*/micrographs.h5")}
     resume_study(out, say=lambda text: None)
     assert (point / "micrographs.h5").exists() and before == {p: p.stat().st_mtime_ns for p in before}
-    path.write_text(path.read_text().replace("700.0]", "701.0]"))
+    refine = hx.load_scene(point / "scene.toml").reconstruct.refine
+    assert refine.model_fields_set == hx.load_scene(SCENES / "sphere_a.toml").reconstruct.refine.model_fields_set
+    text = path.read_text()
+    path.write_text(text.replace("700.0]", "701.0]"))
     with pytest.raises(ResumeError, match="changed since"):
         resume_study(out)
+    path.write_text(text)
+    (out / "study.json").write_text("{")
+    with pytest.raises(ResumeError, match="damaged"):
+        run_study(path, out, options=QUIET, resume=True)
 
 
 def test_shards_of_a_study(tmp_path):

@@ -1,6 +1,7 @@
 """Vertical edges of height maps whose jumps, masked pixels and floating regions are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,3 +93,16 @@ def test_nothing_known_beside():
     assert math.isnan(w.step_std_um) and "no deviation" in w.note and w.as_dict()["step_std_um"] is None
     flat = find_walls(make_rec(np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE), int)))
     assert flat.walls == () and flat.share == 0.0
+
+
+def test_a_wall_on_oblong_pixels():
+    """The same wall on pixels 1.5 times as long along x. Catches lengths and directions counted in pixels."""
+    rec = replace(terrace(), raster_x=1.5 * AXIS)
+    (w,) = find_walls(rec).walls
+    along = np.array([1.5 * math.cos(TURN), math.sin(TURN)])
+    direction = math.degrees(math.atan2(along[1], along[0]))
+    assert w.length_um == pytest.approx(900.0 * np.hypot(*along), abs=3.0 * PITCH)
+    assert w.direction_deg == pytest.approx(direction, abs=2.0)
+    assert w.falls_deg == pytest.approx(direction - 90.0, abs=2.0)
+    assert math.dist(w.start, w.end) == pytest.approx(w.length_um, abs=2.0 * PITCH)
+    assert w.step_um == pytest.approx(50.0, abs=1e-6)

@@ -117,3 +117,21 @@ def test_one_small_change_among_large_ones_is_no_convergence():
     """Off by a whole change where only the last fall is large. Catches the last ratio alone (0.53 changes for 0.35)."""
     assert left_to_go([81.0, 92.0, 32.0], aitken(1.0, -0.35)) == 1.0
     assert left_to_go([81.0, 8.1, 0.81], aitken(1.0, -0.1)) == pytest.approx(1.0 / 9.0)
+
+
+def test_error_bars_above_a_tilted_plane():
+    """Heights that are white noise above a plane whose slopes are unknown: its spread is not theirs.
+
+    Catches error bars of the heights before they are levelled, and what a tilt does to them taken with its other sign.
+    """
+    rng = np.random.default_rng(4)
+    planes = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0))) * 30.0
+    tilts, white = rng.standard_normal((4000, 2)), rng.standard_normal((4000, *SHAPE))
+    response = np.stack([np.ones(SHAPE), *planes])
+    names = ("log_gain[0]", "tilt[0]", "tilt[1]")
+    gains = rng.standard_normal((4000, 1))
+    raw = white + np.tensordot(tilts, planes, 1)
+    levelled = Posterior(raw, np.hstack([gains, tilts]), response, np.eye(3), names).levelled(planes)
+    assert levelled.samples == pytest.approx(white)
+    assert levelled.response[0] == pytest.approx(1.0) and levelled.response[1:] == pytest.approx(0.0)
+    assert posterior(5).levelled(planes).samples.shape == (5, *SHAPE)  # where no tilt is unknown

@@ -1,0 +1,40 @@
+"""Settings that are given, left open, or go together."""
+
+import pytest
+
+from helio_jax.commands.app import set_options
+from helio_jax.errors import SceneError
+from helio_jax.pipeline import _with_priors
+from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.turned import _JUMPS
+
+
+def test_what_nobody_set_stays_open():
+    """Catches a change of one setting that makes all others count as given: a calibration's priors lose their say."""
+    settings = ReconstructSettings().changed(border="free")
+    assert settings.model_fields_set == {"border"} and not settings.refine.model_fields_set
+
+
+@pytest.mark.parametrize("way", ["file", "call"])
+def test_limits_go_together(bshem, way):
+    """Who gives one list of limits keeps the other: a calibration's has another length. Catches an error about it."""
+    own = {"robust_limits": (9.0, 9.0, 7.0)}
+    settings = ReconstructSettings(refine=own if way == "file" else {})
+    changes = {"refine": own} if way == "call" else {}
+
+    class Stack:
+        """What is asked of a stack."""
+
+        provenance = {"self_calibrate": {"priors": dict(_JUMPS) | {"max_rounds": 12}}}
+
+    chosen = settings.changed(**_with_priors(settings, Stack(), changes)).refine  # type: ignore[arg-type]
+    assert chosen.robust_limits == own["robust_limits"] and len(chosen.jump_limits) == 3 and chosen.max_rounds == 12
+
+
+def test_options_by_their_keys():
+    """Catches a key given twice, which ended in a TypeError, and an item without a value, which became an empty one."""
+    assert set_options(["a=1", "b=x=y"], c=2, d=None) == {"a": "1", "b": "x=y", "c": 2}
+    assert set_options(None) == {}
+    for items in (["a"], ["=1"], ["a=1", "a=2"], ["c=1"]):
+        with pytest.raises(SceneError, match="--set"):
+            set_options(items, c=2)
