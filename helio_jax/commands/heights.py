@@ -22,6 +22,7 @@ from helio_jax.commands.app import (
     app,
     given_options,
     print_table,
+    set_options,
 )
 
 
@@ -121,7 +122,10 @@ def measure(
     stack: Annotated[
         Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple? Where are cracks?")
     ] = None,
-    min_pixels: Annotated[int, typer.Option(min=9, help="Smallest facet.")] = 60,
+    min_pixels: Annotated[int | None, typer.Option(help="Smallest facet.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: max_turn_deg, along_axes, ... (repeat).")
+    ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Facets, ripple, or cracks as a picture (.png, .pdf, .svg).", callback=FIGURE)
     ] = None,
@@ -141,12 +145,12 @@ def measure(
         profile=profile,
         step=step,
         roughness=roughness,
-        min_pixels=min_pixels,
         ripple=ripple,
         regions=tuple(region or ()),
         cracks=cracks,
         vertical_edges=vertical_edges,
         table=table is not None,
+        settings=set_options(settings, min_pixels=min_pixels),
     )
     images = read_stack(stack) if stack else None
     found, lines = measure_height_map(read_height(height), wanted, figure, images)

@@ -126,7 +126,8 @@ def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) 
     numbers = sorted((n for n in range(1, labels.max() + 1)), key=lambda n: -int(np.sum(labels == n)))
     if not numbers:
         raise GuardError(
-            f"no planar region of {settings.min_pixels} or more pixels found: lower min_pixels or raise max_turn_deg"
+            f"no planar region of {settings.min_pixels} or more pixels found: lower min_pixels or raise "
+            f"max_turn_deg ({settings.max_turn_deg:g}): --set KEY=VALUE"
         )
     order = np.zeros(labels.max() + 1, int)
     order[numbers] = np.arange(1, len(numbers) + 1)

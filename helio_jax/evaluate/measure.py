@@ -1,5 +1,6 @@
 """What `helio measure` answers: facets, profile, step, roughness, ripple, cracks, edges, as JSON and lines of text."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ from helio_jax.arrays import as_json
 from helio_jax.errors import SceneError
 from helio_jax.evaluate.crack_figure import crack_panel
 from helio_jax.evaluate.crack_text import crack_lines, wall_lines
-from helio_jax.evaluate.cracks import find_cracks
+from helio_jax.evaluate.cracks import CrackSettings, find_cracks
 from helio_jax.evaluate.facets import Facets, FacetSettings, find_facets
 from helio_jax.evaluate.figures import save_figure
 from helio_jax.evaluate.overlay import facet_map
@@ -21,24 +22,40 @@ from helio_jax.evaluate.ripple import (
 )
 from helio_jax.evaluate.ripple_figure import ripple_panel
 from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
-from helio_jax.evaluate.walls import find_walls
+from helio_jax.evaluate.spectrum import RippleSettings
+from helio_jax.evaluate.walls import WallSettings, find_walls
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where."""
+    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where; `settings`: how."""
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None
     step: bool = False
     roughness: bool = False
-    min_pixels: int = 60
     ripple: bool = False
     regions: tuple[str, ...] = ()
     cracks: bool = False
     vertical_edges: bool = False
     table: bool = False
+    settings: Mapping[str, Any] = {}
+
+
+_SETTINGS = {"facets": FacetSettings, "ripple": RippleSettings, "cracks": CrackSettings, "vertical_edges": WallSettings}
+"""Settings of each measurement, by its field of `Wanted`."""
+
+
+def _settings(wanted: Wanted) -> dict[str, Any]:
+    """Return the settings of each measurement: those of `wanted.settings` that it has."""
+    has = {name: kind.model_fields.keys() for name, kind in _SETTINGS.items() if getattr(wanted, name)}
+    known = sorted(set().union(*has.values()))
+    for key in wanted.settings:
+        if key not in known:
+            raise SceneError(f"--set {key}: what is measured has no such setting, only: {', '.join(known) or 'none'}")
+    chosen = {name: {k: v for k, v in wanted.settings.items() if k in has.get(name, ())} for name in _SETTINGS}
+    return {name: kind().changed(**chosen[name]) for name, kind in _SETTINGS.items()}
 
 
 def measure_height_map(
@@ -53,7 +70,7 @@ def measure_height_map(
         stack: calibrated micrographs of these heights: to ask about the ripple, to find cracks in.
 
     Raises:
-        SceneError: nothing is wanted, or a step or a figure without what it needs.
+        SceneError: nothing is wanted, a step or a figure without what it needs, or a setting that nothing wanted has.
         GuardError: too little is known there.
     """
     lines_wanted = wanted.cracks or wanted.vertical_edges
@@ -79,11 +96,12 @@ def measure_height_map(
         raise SceneError("--cracks are found in the micrographs: give --stack FILE.h5, which helio calibrate wrote")
     if wanted.table and not lines_wanted:
         raise SceneError("--table has a row for every crack and vertical edge: give --cracks or --vertical-edges, too")
+    how = _settings(wanted)
     regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
     found: dict[str, Any] = {"reconstructed": reconstructed_area(rec)}
     lines = [f"reconstructed: {found['reconstructed']['share']:.1%} of the raster"]
     if wanted.facets:
-        facets = find_facets(rec, FacetSettings(min_pixels=wanted.min_pixels))
+        facets = find_facets(rec, how["facets"])
         found["facets"] = facets.as_dict()
         lines += _facet_lines(facets)
         if figure:
@@ -107,12 +125,12 @@ def measure_height_map(
         units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
         lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
     if wanted.ripple:
-        found["ripple"], more = _ripple(rec, regions or [np.ones(rec.height.shape, bool)], figure, stack)
+        found["ripple"], more = _ripple(rec, regions or [np.ones(rec.height.shape, bool)], figure, stack, how["ripple"])
         lines += more
     if lines_wanted:
         whole = regions or [np.ones(rec.height.shape, bool)]
-        cracks = find_cracks(rec, stack, whole) if wanted.cracks and stack is not None else None
-        walls = find_walls(rec, np.any(whole, axis=0)) if wanted.vertical_edges else None
+        cracks = find_cracks(rec, stack, whole, how["cracks"]) if wanted.cracks and stack is not None else None
+        walls = find_walls(rec, np.any(whole, axis=0), how["vertical_edges"]) if wanted.vertical_edges else None
         if cracks is not None:
             found["cracks"] = cracks.as_dict()
             lines += crack_lines(cracks)
@@ -127,10 +145,14 @@ def measure_height_map(
 
 
 def _ripple(
-    rec: Reconstruction, regions: list[np.ndarray], figure: str | Path | None, stack: MicrographStack | None
+    rec: Reconstruction,
+    regions: list[np.ndarray],
+    figure: str | Path | None,
+    stack: MicrographStack | None,
+    settings: RippleSettings,
 ) -> tuple[dict[str, Any], list[str]]:
     """Measure the strongest ripple; return a record and lines."""
-    r, spectrum, along = height_ripple(rec, regions)
+    r, spectrum, along = height_ripple(rec, regions, settings)
     lines = [
         f"ripple: wavelength {r.wavelength_um:.1f} +- {r.wavelength_std_um:.1f} um, amplitude {r.amplitude:.3f} +- "
         f"{r.amplitude_std:.3f} um, wave vector at {r.direction_deg:+.1f} +- {r.direction_std_deg:.1f} deg from x",
@@ -140,7 +162,7 @@ def _ripple(
     ]
     record = r.as_dict()
     if stack is not None:
-        a = compare_with_images(stack, r, regions)
+        a = compare_with_images(stack, r, regions, settings)
         record["micrographs"] = vars(a) | {"verdict": a.verdict}
         for name, share in a.shares.items():
             lines.append(
@@ -149,7 +171,7 @@ def _ripple(
             )
         lines.append(f"  {a.verdict} ({a.amplitude_um:.3f} um high; noise {a.false_alarm:.1e}, misfit {a.misfit:.1e})")
     if figure:
-        images = image_spectra(stack, regions) if stack is not None else {}
+        images = image_spectra(stack, regions, settings) if stack is not None else {}
         save_figure(ripple_panel(rec, along, regions, r, {"heights": spectrum, **images}), figure)
     return record, lines
 

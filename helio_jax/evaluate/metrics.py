@@ -372,6 +372,6 @@ def fit_center(
     if not best.success or moved > reach_um:
         raise GuardError(
             f"the sphere's centre was not found within {reach_um:g} um of {start.center} um (best {best.x.round(1)} "
-            f"um, {best.message}): start nearer or enlarge reach_um"
+            f"um, {best.message}): state a centre that is nearer"
         )
     return replace(start, center=(float(best.x[0]), float(best.x[1])))

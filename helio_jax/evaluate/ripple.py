@@ -257,7 +257,9 @@ def _peak(spectrum: Spectrum) -> tuple[Pair, float]:
     candidates = np.where(is_top & spectrum.is_searched, spectrum.ratio, -1.0)
     i, j = (int(v) for v in np.unravel_index(np.argmax(candidates), candidates.shape))
     if candidates[i, j] <= 0.0:
-        raise GuardError("the spectrum has no maximum in the searched range: allow other wavelengths")
+        raise GuardError(
+            "the spectrum has no maximum in the searched range: allow other wavelengths (shortest_um, longest_um)"
+        )
     return (float(spectrum.kx[j]), float(spectrum.ky[i])), float(candidates[i, j])
 
 

@@ -214,7 +214,8 @@ def take_spectrum(
     if not searched.any():
         raise GuardError(
             f"no wavelength between {shortest:g} and {longest:g} um can be told from the raster's axes with a "
-            f"resolution of {1e3 * max(width):.2g} cycles per mm: enlarge the region, or look along the axes, too"
+            f"resolution of {1e3 * max(width):.2g} cycles per mm: enlarge the region, or "
+            "look along the axes, too (along_axes)"
         )
     floor, ring = _floor(power, k, half, searched, blocks)
     found = Spectrum(kx, ky, power, floor, searched, ring, blocks)

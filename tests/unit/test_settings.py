@@ -4,6 +4,8 @@ import pytest
 
 from helio_jax.commands.app import set_options
 from helio_jax.errors import SceneError
+from helio_jax.evaluate.measure import Wanted, _settings
+from helio_jax.evaluate.spectrum import RippleSettings
 from helio_jax.pipeline import _with_priors
 from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.turned import _JUMPS
@@ -38,3 +40,13 @@ def test_options_by_their_keys():
     for items in (["a"], ["=1"], ["a=1", "a=2"], ["c=1"]):
         with pytest.raises(SceneError, match="--set"):
             set_options(items, c=2)
+
+
+def test_settings_of_a_measurement():
+    """Each goes to what has it; one that nothing wanted has is refused. Catches remedies that cannot be followed."""
+    wanted = Wanted(facets=True, cracks=True, settings={"max_turn_deg": "20", "min_pixels": 9})
+    how = _settings(wanted)
+    assert how["facets"].max_turn_deg == 20.0 and how["facets"].min_pixels == 9 and how["ripple"] == RippleSettings()
+    with pytest.raises(SceneError, match="along_axes: what is measured has no such setting"):
+        _settings(wanted._replace(settings={"along_axes": "true"}))
+    assert _settings(Wanted(ripple=True, settings={"along_axes": "true"}))["ripple"].along_axes
