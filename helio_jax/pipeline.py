@@ -240,6 +240,7 @@ def reconstruct(
     *,
     settings: ReconstructSettings | None = None,
     report: Callable[[int, int, str], None] | None = None,
+    workers: int | None = None,
     **changes: Any,
 ) -> Reconstruction:
     """Turn micrographs into heights.
@@ -249,6 +250,7 @@ def reconstruct(
         method: "linear", "nearfield" or "refine"; default: the settings' own.
         settings: table [reconstruct]; default: its defaults.
         report: called before each round of the refinement with (round, rounds, what is known).
+        workers: threads that trace; default: one per CPU that this process may use.
         changes: settings that replace those, e.g. integrator="dct_poisson".
 
     Raises:
@@ -269,7 +271,8 @@ def reconstruct(
     refine = chosen.refine
 
     def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
-        return make_predictor(one, n_rays, refine.substrate_um, multiple=refine.multiple, border=chosen.border)
+        about = {"multiple": refine.multiple, "border": chosen.border, "workers": workers}
+        return make_predictor(one, n_rays, refine.substrate_um, **about)
 
     rec = reconstruct_stack(one, chosen, make_predict, report)
     others = [f"{name} ({kind})" for name, kind in one.provenance.get("materials", {}).items() if kind != "cosine"]
@@ -368,7 +371,7 @@ def run(
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
     assert isinstance(stack, MicrographStack)  # no shards here, and one view
     with stage("reconstructing heights") as progress:
-        rec = reconstruct(stack, settings=scene.reconstruct, report=progress)
+        rec = reconstruct(stack, settings=scene.reconstruct, report=progress, workers=crew.workers)
     write(rec, files["height map"])
     with stage("scoring and reporting"):
         truth = true_height(scene, rec)

@@ -44,12 +44,14 @@ def reconstruct(
 
     given = load_scene(settings).reconstruct if settings else None
     images = read_stack(stack)
+    if write_instrument:
+        from helio_jax.formats import toml
+
+        toml.check_uncertain(images.instrument, write_instrument)
     with Bar("reconstructing") as bar:
         result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
     write(result, output)
     if write_instrument:
-        from helio_jax.formats import toml
-
         toml.write_instrument(result, write_instrument)
     print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
     for name, factor in result.provenance.get("sensitivity", {}).items():

@@ -308,7 +308,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
     flat = np.stack([rec.x[region], rec.y[region]], -1)
     along = np.array([plane[0], plane[1]]) / (np.hypot(plane[0], plane[1]) or 1.0)
     lift = np.outer(along, along) * (1.0 / normal[2] - 1.0)  # lengths up the slope grow by 1 / cos(tilt)
-    sides, true_sides = (_sides(p, projected, step) for p in (flat, flat + flat @ lift))
+    sides, true_sides = (_sides(p, step) for p in (flat, flat + flat @ lift))
     rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
     edge_std = step * _roughness_of_rim(region)
     lower = ndimage.binary_dilation(region) & _outside(use, s.min_pixels)
@@ -342,7 +342,7 @@ def _outside(use: np.ndarray, min_pixels: int) -> np.ndarray:
     return ~use & (np.bincount(pieces.ravel())[pieces] >= min_pixels)
 
 
-def _sides(points: np.ndarray, projected: float, step: float) -> tuple[float, float]:
+def _sides(points: np.ndarray, step: float) -> tuple[float, float]:
     """Return the long and short side [um] of the rectangle with the second moments of points on a square grid.
 
     A rectangle a x b has the moments a^2/12, b^2/12; points at the middles of cells miss step^2/12 of it.

@@ -137,12 +137,15 @@ class Step:
     slope: float
 
 
-def measure_step(profile: Profile, gap: float = 0.1) -> Step:
+_GAP = 0.1
+"""Share of a profile's length that is left out about a step. After ISO 5436-1, which leaves out a third."""
+
+
+def measure_step(profile: Profile) -> Step:
     """Fit two parallel lines to the two sides of the steepest place of a profile; their distance is the step.
 
     Args:
         profile: with one step.
-        gap: share of the profile's length left out about the step. After ISO 5436-1, which leaves out a third.
 
     Raises:
         GuardError: fewer than 4 known heights on a side.
@@ -156,7 +159,7 @@ def measure_step(profile: Profile, gap: float = 0.1) -> Step:
         jump = abs(np.median(z[i : i + 4]) - np.median(z[max(i - 4, 0) : i]))
         if jump > best:
             best, position = jump, 0.5 * (d[i - 1] + d[i])
-    use = np.abs(d - position) > 0.5 * gap * (d[-1] - d[0])
+    use = np.abs(d - position) > 0.5 * _GAP * (d[-1] - d[0])
     upper = (d > position) & use
     if upper.sum() < 4 or (use & ~upper).sum() < 4:
         raise GuardError("a step needs 4 or more known heights on either side: take a longer profile")

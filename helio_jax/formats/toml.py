@@ -7,6 +7,7 @@ from typing import Any
 
 from helio_jax.errors import SceneError
 from helio_jax.formats.safe import atomic_path
+from helio_jax.instrument import Instrument
 from helio_jax.reconstruction import Reconstruction
 
 _MOST = 30.0
@@ -42,6 +43,23 @@ def _key(key: str) -> str:
     return key if key.isascii() and key.replace("_", "").replace("-", "").isalnum() else json.dumps(key)
 
 
+def _not_fitted(path: str | os.PathLike) -> SceneError:
+    return SceneError(
+        f"{path}: no directions of detectors are fitted: use refine, on a stack whose instrument file says how "
+        "uncertain they are (polar_deg, azimuth_deg in the table [uncertainty])"
+    )
+
+
+def check_uncertain(instrument: Instrument, path: str | os.PathLike) -> None:
+    """Refuse, before the work, a file of a fitted instrument of which nothing would be fitted.
+
+    Raises:
+        SceneError: the directions of the detectors are known.
+    """
+    if not instrument.uncertainty.polar_deg and not instrument.uncertainty.azimuth_deg:
+        raise _not_fitted(path)
+
+
 def write_instrument(rec: Reconstruction, path: str | os.PathLike) -> None:
     """Write the instrument that a fit found as an instrument file, which scenes may extend and `helio import` takes.
 
@@ -53,10 +71,7 @@ def write_instrument(rec: Reconstruction, path: str | os.PathLike) -> None:
     """
     found = rec.provenance.get("instrument", {}).get("values", {})
     if not any(name.startswith(("polar ", "azimuth ")) for name in found):
-        raise SceneError(
-            f"{path}: the heights are by {rec.method}, which fitted no directions of detectors: use refine, on a stack "
-            "whose instrument file says how uncertain they are (table [uncertainty])"
-        )
+        raise _not_fitted(path)
     tables = rec.instrument.model_dump(mode="json", exclude_none=True)
     tables["plate"].pop("sample_distance_um", None)
     for kind in ("polar", "azimuth"):

@@ -53,7 +53,7 @@ def fit_points(picks: Picks, views: tuple[str, ...], source: str = "the control 
         InputFileError: a view without picks, with too few shared points, or with points on top of each other.
     """
     shared = _shared(picks, views, source)
-    motions, places = _solve(shared, views)
+    motions, places = _solve(shared, views, source)
     residuals = {
         v: {p: float(np.hypot(*(motions[i].apply(places[p]) - at))) for p, at in shared[v].items()}
         for i, v in enumerate(views)
@@ -93,7 +93,9 @@ def _shared(picks: Picks, views: tuple[str, ...], source: str) -> dict[str, dict
     return shared
 
 
-def _solve(shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...]) -> tuple[tuple[Rigid, ...], dict]:
+def _solve(
+    shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...], source: str
+) -> tuple[tuple[Rigid, ...], dict]:
     """Alternate between places and motions, started from the view that shares most points; first view fixed."""
     motions: dict[str, Rigid] = {views[0]: Rigid(0.0, (0.0, 0.0))}
     places = dict(shared[views[0]])
@@ -103,7 +105,8 @@ def _solve(shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...]) -> 
         common = sorted(shared[view].keys() & places.keys())
         if len(common) < 2:
             raise InputFileError(
-                f"control points: view {view!r} shares {len(common)} points with the views before it, 2 are needed"
+                f"{source}: view {view!r} shares {len(common)} points with the views before it, 2 are needed: "
+                "pick more (helio pick), under the same names"
             )
         motions[view] = _fitted(places, shared[view], common)
         back = motions[view].inverse()
@@ -139,7 +142,7 @@ def _left_out(shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...], 
     if len(rest[view]) < 2 or sum(point in named for named in rest.values()) < 1:
         return math.nan
     try:
-        motions, places = _solve(rest, views)
+        motions, places = _solve(rest, views, "without it")
     except InputFileError:
         return math.nan
     return float(np.hypot(*(motions[views.index(view)].apply(places[point]) - shared[view][point])))

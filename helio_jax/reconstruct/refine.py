@@ -15,7 +15,7 @@ import numpy as np
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruct.background import ScanOrder
 from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Surface, Unknowns, smooth_albedo
+from helio_jax.reconstruct.model import Surface, smooth_albedo
 from helio_jax.reconstruct.noisebias import noise_bias
 from helio_jax.reconstruct.refiner import Predict, Refiner
 from helio_jax.reconstruct.rounds import aitken, contraction_of, left_to_go, status_of
@@ -41,10 +41,9 @@ class Fit:
         normals: unit normals [y, x, 3].
         albedo: relative reflectivity [y, x].
         gain, offset: per detector, data = gain * model + offset.
-        background: offset, slow drift and scan lines together [detector, y, x], in units of the beam.
-        tilt: slopes (x, y) of the reference plane, from which the heights have been taken.
         instrument: with the geometry that was fitted.
         values: unknowns of the instrument, in prior deviations, by name.
+        distance_std: prior deviation of the distance of the sample, um.
         residuals: (model - data) / standard deviation [detector, y, x].
         weight: what robust weighting left of each datum [detector, y, x].
         model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].
@@ -61,8 +60,6 @@ class Fit:
     albedo: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
-    background: np.ndarray
-    tilt: np.ndarray
     instrument: Instrument
     values: dict[str, np.ndarray]
     distance_std: float
@@ -236,9 +233,7 @@ def fit_heights(
 
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s = refiner.settings
-    _, lagged = refiner.lag(s.robust_limits[-1], s.jump_limits[-1])
-    values = Unknowns(*(None,) * 3, **{name: jnp.asarray(value) for name, value in refiner.values.items()})
-    background = np.broadcast_to(refiner.model.background(values, lagged), refiner.signal.shape)
+    refiner.lag(s.robust_limits[-1], s.jump_limits[-1])  # weights and edges at the last surface
     surface = refiner.levelled
     return Fit(
         surface=surface,
@@ -246,8 +241,6 @@ def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, poster
         albedo=np.asarray(smooth_albedo(jnp.asarray(refiner.values["albedo"]), surface.height.shape, s.albedo_std)),
         gain=np.exp(s.gain_std * refiner.values["log_gain"]),
         offset=s.offset_std * refiner.mean_signal * refiner.values["offset"],
-        background=background,
-        tilt=refiner.tilt,
         instrument=refiner.instrument,
         values=refiner.values,
         distance_std=refiner.distance_std,

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from helio_jax import read, write
 from helio_jax.config import load_instrument
+from helio_jax.instrument import Uncertainty
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,6 +57,11 @@ def test_steps_one_by_one(small_scene, finished, tmp_path):
     stack, height = tmp_path / "s.h5", tmp_path / "h.h5"
     assert helio("simulate", small_scene, "-o", stack, "--rays", 16, "--noise").returncode == 0
     found = tmp_path / "found.toml"
+    refused = helio("reconstruct", stack, "-o", height, "--write-instrument", found)
+    assert refused.returncode == 2 and "[uncertainty]" in refused.stderr and not height.exists()
+    known = read(stack)
+    unsure = known.instrument.model_copy(update={"uncertainty": Uncertainty(polar_deg=1.0)})
+    write(known.replace(instrument=unsure), stack)
     done = helio("reconstruct", stack, "-o", height, "--method", "refine", "--write-instrument", found)
     assert done.returncode == 0 and len(load_instrument(found).detector_names) == 3
     scored = helio("evaluate", height, "--truth", small_scene, "--json")

@@ -222,7 +222,7 @@ def test_center_out_of_reach_is_refused():
     """Catches: a centre at the limit of the search that is returned as if it were found."""
     _, rec, truth = make_case()
     height, _ = first_hit(rec.raster_x, rec.raster_y, (150.0, 0.0))
-    with pytest.raises(GuardError, match="enlarge reach_um"):
+    with pytest.raises(GuardError, match="state a centre that is nearer"):
         fit_center(
             rec.replace(height=height),
             lambda x, y: first_hit(rec.raster_x, rec.raster_y, (x, y))[0],
