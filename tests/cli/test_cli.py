@@ -62,7 +62,8 @@ def test_steps_one_by_one(small_scene, finished, tmp_path):
     known = read(stack)
     unsure = known.instrument.model_copy(update={"uncertainty": Uncertainty(polar_deg=1.0)})
     write(known.replace(instrument=unsure), stack)
-    done = helio("reconstruct", stack, "-o", height, "--method", "refine", "--write-instrument", found)
+    quick = "--settings", small_scene, "--method", "refine"
+    done = helio("reconstruct", stack, "-o", height, *quick, "--write-instrument", found)
     assert done.returncode == 0 and len(load_instrument(found).detector_names) == 3
     scored = helio("evaluate", height, "--truth", small_scene, "--json")
     assert scored.returncode == 0 and json.loads(scored.stdout)["n_pixels"] > 50
