@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("--stages", default=",".join(STAGES))
     parser.add_argument("--methods", default="linear,nearfield")
     parser.add_argument("--refine", type=json.loads, default={}, help="JSON: settings of [reconstruct.refine]")
-    parser.add_argument("--law", type=TypeAdapter(Law).validate_json, default=CosineLaw(), help="JSON: true law")
+    parser.add_argument("--law", type=TypeAdapter(Law).validate_json, help="JSON: true law; default: cosine")
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()
     if args.tiny:
@@ -258,8 +258,7 @@ def main() -> None:
     path = args.output / ("crystal_tiny.json" if args.tiny else "crystal.json")
     done = json.loads(path.read_text())["rows"] if path.exists() else []
     asked = {"size": args.size, "rays": args.rays, "seed": args.seed, "refine": args.refine}
-    if args.law != CosineLaw():
-        asked["law"] = {"kind": args.law.kind} | args.law.model_dump(exclude_defaults=True)
+    asked["law"] = args.law and args.law.model_dump(mode="json", exclude_unset=True)
     is_real = args.sample == "measured"
     sample = None if is_real else make_sample(args.sample)
     known: Recorded | None = None
@@ -267,7 +266,7 @@ def main() -> None:
     for stage in ("measured",) if is_real else args.stages.split(","):
         for method in args.methods.split(","):
             key = {"sample": args.sample, "stage": stage, "method": method} | asked
-            if any(all(r.get(k) == key.get(k) for k in (*key, "law")) for r in done):
+            if any(all(r.get(k) == v for k, v in key.items()) for r in done):
                 continue
             which = stage, method == "refine"
             if which in stacks:
@@ -275,7 +274,7 @@ def main() -> None:
             elif sample is None:
                 stack = measured(args.shared, method)
             else:
-                known = known or record(sample, args.size, args.rays, args.seed, law=args.law)
+                known = known or record(sample, args.size, args.rays, args.seed, law=args.law or CosineLaw())
                 stack = calibrated(known, stage, method)
             stacks[which] = stack
             rec = reconstructed(stack, method, args.refine)
@@ -288,7 +287,7 @@ def main() -> None:
                 text += f"; normals {found['turn_deg']:.1f} deg, rms {found['rms_um']:.0f} um; tilts {tilts}"
             if args.sample in SMOOTH:
                 text, is_reached = f"normals {found['turn_deg']:.1f} deg, rms {found['rms_um']:.0f} um", None
-            what = f"{args.sample}: {method}, known: {stage}" + f", {args.law.kind}" * (args.law != CosineLaw())
+            what = f"{args.sample}: {method}, known: {stage}" + (f", {args.law.kind}" if args.law else "")
             done.append(rows.row("5-7", what, text, "125.26 +- 2 (5), 438 x 250, <= 12 %", is_reached, **key, **found))
             rows.write(path, done, seed=args.seed)
 

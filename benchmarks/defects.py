@@ -90,7 +90,7 @@ DEFECTS = {
 
 def scan(path: Path, size: int, defect: str, seed: int, rays: int) -> MicrographStack:
     """Return the scan of a scene's sphere that a defect changes, told as if it did not."""
-    scale, change, law = DEFECTS[defect][1:]
+    _, scale, change, law = DEFECTS[defect]
     raster = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": SIDE_UM / size, "trace.rays": rays}
     told = load_scene(path, raster)
     real: dict[str, object] = {}

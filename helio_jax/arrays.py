@@ -59,6 +59,21 @@ def pitch(axis: np.ndarray) -> float:
     return float((axis[-1] - axis[0]) / (axis.size - 1)) if axis.size > 1 else 1.0
 
 
+def nearest_known(is_known: np.ndarray, sides: tuple[float, float] = (1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Return row and column of the known pixel that is nearest to every pixel [y, x] each.
+
+    Args:
+        is_known: at least one of them [y, x].
+        sides: of a pixel along y and x.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = np.asarray(
+        distance_transform_edt(~is_known, sampling=sides, return_distances=False, return_indices=True)
+    )
+    return rows, columns
+
+
 def as_json(value: Any) -> Any:
     """Return nested mappings, sequences and arrays as JSON values; numbers that are not finite are None: not known."""
     if isinstance(value, Mapping):

@@ -135,9 +135,7 @@ class MicrographStack:
 
         The effusive beam's counts, which are not part of them, are given relative to them.
         """
-        background = np.zeros(1) if self.background is None else self.background
-        background = background[:, None, None] if background.ndim == 1 else background
-        total = float(np.sum((self.counts - background)[self.is_observed]))
+        total = float(np.sum(self.signal[self.is_observed]))
         parts = {"multiple scattering": self.multiple, "scattered on the plate": self.plate}
         parts["effusive beam, besides"] = self.effuse
         found = {name: float(part.sum()) for name, part in parts.items() if part is not None}

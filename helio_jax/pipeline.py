@@ -205,6 +205,7 @@ def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> Micr
 
 
 _LIMITS = "robust_limits", "jump_limits"
+"""One schedule in two settings of the same length: who gives one of them gives both."""
 
 
 def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
@@ -213,7 +214,7 @@ def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes:
     calibration = stack.provenance.get("calibrate") or stack.provenance.get("self_calibrate", {})
     priors = calibration.get("priors", {})
     taken = settings.refine.model_fields_set | given.keys()
-    if taken & set(_LIMITS):  # they go together
+    if taken & set(_LIMITS):
         taken |= set(_LIMITS)
     asked = {key: value for key, value in priors.items() if key not in taken}
     if not asked and not given:

@@ -116,17 +116,22 @@ def image_spectra(
     stack: MicrographStack, regions: Sequence[np.ndarray], settings: RippleSettings | None = None
 ) -> dict[str, Spectrum]:
     """Return the spectrum of every micrograph of a stack over some regions, by the detector's name."""
-    settings, names = settings or RippleSettings(), stack.instrument.detector_names
-    return {n: _image_spectrum(stack, k, stack.is_observed[k], regions, settings)[0] for k, n in enumerate(names)}
+    settings, steps = settings or RippleSettings(), (pitch(stack.x), pitch(stack.y))
+    images = zip(stack.instrument.detector_names, stack.signal, stack.is_observed, strict=True)
+    return {name: _image_spectrum(signal, steps, seen, regions, settings)[0] for name, signal, seen in images}
 
 
 def _image_spectrum(
-    stack: MicrographStack, detector: int, seen: np.ndarray, regions: Sequence[np.ndarray], settings: RippleSettings
+    signal: np.ndarray,
+    steps: tuple[float, float],
+    seen: np.ndarray,
+    regions: Sequence[np.ndarray],
+    settings: RippleSettings,
 ) -> tuple[Spectrum, np.ndarray]:
-    """Return the spectrum of the micrograph of a detector where it is `seen` [y, x], and its field without trend."""
+    """Return the spectrum of a detector's signal where it is `seen` [y, x], and its field without trend."""
     blocks = make_blocks([seen & region for region in regions], settings.block_px)
-    field = without_trend(np.where(seen, stack.counts[detector], 0.0), blocks, settings.degree)
-    return take_spectrum([field], blocks, (pitch(stack.x), pitch(stack.y)), settings), field
+    field = without_trend(np.where(seen, signal, 0.0), blocks, settings.degree)
+    return take_spectrum([field], blocks, steps, settings), field
 
 
 def image_ripple(
@@ -138,7 +143,7 @@ def image_ripple(
         GuardError: as `height_ripple`.
     """
     settings, steps = settings or RippleSettings(), (pitch(stack.x), pitch(stack.y))
-    spectrum, field = _image_spectrum(stack, detector, stack.is_observed[detector], regions, settings)
+    spectrum, field = _image_spectrum(stack.signal[detector], steps, stack.is_observed[detector], regions, settings)
     start, ratio = _peak(spectrum)
     fit = _fit_wave(field, spectrum, start, steps, settings.degree)
     return _ripple(spectrum, fit, ratio, 1.0, stack.unit, np.eye(2), steps)
@@ -204,11 +209,11 @@ def compare_with_images(
     every = np.all(stack.is_observed, axis=0)
     unit = np.array(ripple.raster_k) / math.hypot(*ripple.raster_k)
     waves, noises, response = [], [], []
-    for k, direction in enumerate(stack.instrument.directions()):
-        spectrum, field = _image_spectrum(stack, k, every, regions, settings)
+    for signal, direction in zip(stack.signal, stack.instrument.directions(), strict=True):
+        spectrum, field = _image_spectrum(signal, steps, every, regions, settings)
         blocks = spectrum.blocks
         n = np.array([b.rows.size for b in blocks.blocks])
-        mean = np.array([stack.signal[k][b.rows, b.columns].mean() for b in blocks.blocks])
+        mean = np.array([signal[b.rows, b.columns].mean() for b in blocks.blocks])
         waves.append(_complex_amplitudes(field, blocks, ripple.raster_k, steps, settings.degree) / mean)
         noises.append(2.0 * spectrum.floor_at(*ripple.raster_k) / n / mean**2)
         response.append(-float(unit @ direction))

@@ -8,8 +8,9 @@ axis of the scan neighbouring pixels follow one another in time.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import maximum_filter, median_filter, minimum_filter
 
+from helio_jax.arrays import nearest_known
 from helio_jax.micrograph import MicrographStack
 
 _MAD = 1.4826
@@ -37,11 +38,8 @@ class NoiseModel:
 
 def _filled(image: np.ndarray) -> np.ndarray:
     """Return an image [y, x] whose missing pixels have the value of the nearest one that is there; 0 if none is."""
-    missing = ~np.isfinite(image)
-    if missing.all():
-        return np.zeros(image.shape)
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return image[tuple(nearest)]  # type: ignore[arg-type]
+    known = np.isfinite(image)
+    return image[nearest_known(known)] if known.any() else np.zeros(image.shape)
 
 
 def time_last(stack: MicrographStack) -> np.ndarray:

@@ -9,9 +9,8 @@ import inspect
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
-from helio_jax.arrays import as_float_array
+from helio_jax.arrays import as_float_array, nearest_known
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.reconstruct.integrate_bilateral import integrate_bilateral
 from helio_jax.reconstruct.integrate_jumps import integrate_cutting_jumps, integrate_weighted
@@ -114,7 +113,6 @@ def _prepare(a: Image, b: Image, dx: float, dy: float, weights: Image | None) ->
     if not is_known.any():
         raise GuardError("at least one pixel must have a weight > 0, got none")
     if not is_known.all():
-        nearest = distance_transform_edt(~is_known, sampling=(dy, dx), return_distances=False, return_indices=True)
-        rows, columns = np.asarray(nearest)
-        a, b = a[rows, columns], b[rows, columns]
+        nearest = nearest_known(is_known, (dy, dx))
+        a, b = a[nearest], b[nearest]
     return a, b, trust

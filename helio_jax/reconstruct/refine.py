@@ -233,7 +233,7 @@ def fit_heights(
 
 def _finish(refiner: Refiner, changes: list[float], is_interrupted: bool, posterior: Posterior | None) -> Fit:
     s = refiner.settings
-    refiner.lag(s.robust_limits[-1], s.jump_limits[-1])  # weights and edges at the last surface
+    refiner.weigh(s.robust_limits[-1], s.jump_limits[-1])
     surface = refiner.levelled
     return Fit(
         surface=surface,

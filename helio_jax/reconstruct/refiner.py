@@ -313,13 +313,18 @@ class Refiner:
         about = self.signal, self.variance, self.surface, self.shift
         self.torn = shadow_edges(*about, 1), shadow_edges(*about, 0)
 
+    def weigh(self, limit: float, cut: float) -> tuple[Edges, Edges]:
+        """Find robust weights and edges at the current surface, and keep them; return the edges."""
+        self.weight = geman_mcclure(self.residuals, limit)
+        edges_x, edges_y = self.edges(cut)
+        self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
+        return edges_x, edges_y
+
     def lag(self, limit: float, cut: float) -> tuple[Unknowns, Lagged]:
         """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
         s, m, p = self.settings, self.model, self.near
         height, slope_x, slope_y = self.surface
-        self.weight = geman_mcclure(self.residuals, limit)
-        edges_x, edges_y = self.edges(cut)
-        self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
+        edges_x, edges_y = self.weigh(limit, cut)
         scale_x, scale_y = (self._slope_scale(e, axis) for e, axis in ((edges_x, 1), (edges_y, 0)))
         base_x = one_sided(np.diff(height, axis=1) / m.dx, edges_x.intact, 1)
         base_y = one_sided(np.diff(height, axis=0) / m.dy, edges_y.intact, 0)

@@ -18,7 +18,7 @@ def test_what_nobody_set_stays_open():
 
 
 @pytest.mark.parametrize("way", ["file", "call"])
-def test_limits_go_together(bshem, way):
+def test_limits_go_together(way):
     """Who gives one list of limits keeps the other: a calibration's has another length. Catches an error about it."""
     own = {"robust_limits": (9.0, 9.0, 7.0)}
     settings = ReconstructSettings(refine=own if way == "file" else {})
