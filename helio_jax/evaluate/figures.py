@@ -79,10 +79,10 @@ def observed_counts(stack: MicrographStack) -> np.ndarray:
 
 def multiple_fraction(stack: MicrographStack) -> np.ndarray | None:
     """Return the fraction of the sample's counts of order 2 and above [detector, y, x]; None if orders are unknown."""
-    if stack.by_order is None:
+    if stack.by_order is None or stack.multiple is None:
         return None
     total = stack.by_order.sum(0)
-    return np.divide(stack.by_order[1:].sum(0), total, out=np.full_like(total, np.nan), where=total > 0)
+    return np.divide(stack.multiple, total, out=np.full_like(total, np.nan), where=total > 0)
 
 
 def residual_rms(residuals: np.ndarray) -> np.ndarray:

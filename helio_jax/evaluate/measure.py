@@ -98,6 +98,7 @@ def measure_height_map(
         raise SceneError("--table has a row for every crack and vertical edge: give --cracks or --vertical-edges, too")
     how = _settings(wanted)
     regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
+    where = regions or [np.ones(rec.height.shape, bool)]
     found: dict[str, Any] = {"reconstructed": reconstructed_area(rec)}
     lines = [f"reconstructed: {found['reconstructed']['share']:.1%} of the raster"]
     if wanted.facets:
@@ -125,12 +126,11 @@ def measure_height_map(
         units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
         lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
     if wanted.ripple:
-        found["ripple"], more = _ripple(rec, regions or [np.ones(rec.height.shape, bool)], figure, stack, how["ripple"])
+        found["ripple"], more = _ripple(rec, where, figure, stack, how["ripple"])
         lines += more
     if lines_wanted:
-        whole = regions or [np.ones(rec.height.shape, bool)]
-        cracks = find_cracks(rec, stack, whole, how["cracks"]) if wanted.cracks and stack is not None else None
-        walls = find_walls(rec, np.any(whole, axis=0), how["vertical_edges"]) if wanted.vertical_edges else None
+        cracks = find_cracks(rec, stack, where, how["cracks"]) if wanted.cracks and stack is not None else None
+        walls = find_walls(rec, np.any(where, axis=0), how["vertical_edges"]) if wanted.vertical_edges else None
         if cracks is not None:
             found["cracks"] = cracks.as_dict()
             lines += crack_lines(cracks)
@@ -140,7 +140,7 @@ def measure_height_map(
             found["vertical_edges"] = walls.as_dict()
             lines += wall_lines(walls)
         if figure:
-            save_figure(crack_panel(rec, whole, stack, cracks, walls), figure)
+            save_figure(crack_panel(rec, where, stack, cracks, walls), figure)
     return as_json(found), lines
 
 
