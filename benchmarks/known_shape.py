@@ -26,6 +26,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
+from helio_jax.arrays import robust_std  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.evaluate.agreement import find_shift, normalise  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
@@ -90,7 +91,7 @@ class KnownShape:
             return at
 
         n = int(self.free.sum())
-        typical = 1.4826 * float(np.median(np.abs(self.residuals(self.start))))
+        typical = float(robust_std(self.residuals(self.start)))
         found = least_squares(
             lambda q: self.residuals(whole(q)) / (OUTLIER * typical),
             np.zeros(n),

@@ -23,6 +23,8 @@ from helio_jax.errors import HelioError
 
 WALL_PITCHES = 5.0
 """A rise between two neighbouring pixels of a beam-frame raster of more than this many pitches is a wall."""
+_NORMAL = 1.4826
+"""Standard deviation of normal noise over the median of its absolute value."""
 
 
 def as_float_array(name: str, value: Any, shape: tuple[int | None, ...], error: type[HelioError]) -> np.ndarray:
@@ -52,6 +54,16 @@ def check_axis(name: str, values: np.ndarray, error: type[HelioError]) -> None:
                 f"{name} must increase in equal steps, got steps of {step.min():g} to {step.max():g} um: "
                 "resample the scan onto a regular raster"
             )
+
+
+def robust_std(residuals: np.ndarray, axes: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return the standard deviation of normal noise about 0, from the median of its absolute value; NaN not counted.
+
+    Args:
+        residuals: outliers up to a half do no harm.
+        axes: over which; they are kept with length 1. None: over all, as a scalar.
+    """
+    return _NORMAL * np.nanmedian(np.abs(residuals), axis=axes, keepdims=axes is not None)
 
 
 def pitch(axis: np.ndarray) -> float:

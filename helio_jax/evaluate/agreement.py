@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import shift as shift_image
 from scipy.optimize import minimize
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import pitch, robust_std
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 
@@ -100,7 +100,7 @@ class Agreement:
     @property
     def is_flagged(self) -> np.ndarray:
         """Pixels too far off to be noise or a smooth model error in any detector: scratches, dirt, edges [y, x]."""
-        spread = 1.4826 * np.nanmedian(np.abs(self.residuals), axis=(1, 2), keepdims=True)
+        spread = robust_std(self.residuals, (1, 2))
         return np.any(np.abs(np.nan_to_num(self.residuals)) > FLAGGED * np.maximum(spread, 1.0), axis=0)
 
     @property
@@ -165,7 +165,7 @@ def _fit(data: np.ndarray, std: np.ndarray, seen: np.ndarray, basis: np.ndarray)
         w = weight / scale
         coefficients = np.linalg.lstsq(columns * w[:, None], target * w, rcond=None)[0]
         misfit = np.abs(target - columns @ coefficients) / scale
-        limit = OUTLIER * max(1.4826 * float(np.median(misfit)), 1.0)
+        limit = OUTLIER * max(float(robust_std(misfit)), 1.0)
         weight = np.sqrt(np.minimum(1.0, limit / np.maximum(misfit, 1e-12)))
     return coefficients
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import as_json, pitch
+from helio_jax.arrays import as_json, pitch, robust_std
 from helio_jax.errors import GuardError
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.settings import Settings
@@ -268,7 +268,7 @@ def _fit_plane(
         root = np.sqrt(weight)[:, None]
         plane = np.linalg.lstsq(design * root, z * root[:, 0], rcond=None)[0]
         misfit = z - design @ plane
-        scale = _TUKEY * 1.4826 * np.median(np.abs(misfit)) + 1e-9 * (np.ptp(z) + 1.0)
+        scale = _TUKEY * robust_std(misfit) + 1e-9 * (np.ptp(z) + 1.0)
         new = np.where(np.abs(misfit) < scale, (1 - np.minimum(np.abs(misfit) / scale, 1.0) ** 2) ** 2, 0.0)
         if np.allclose(new, weight, atol=1e-6):
             break

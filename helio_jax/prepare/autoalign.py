@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from helio_jax.arrays import robust_std
 from helio_jax.prepare.correlate import correlate_masked, find_peak
 from helio_jax.prepare.rigid import Rigid, about, separation
 from helio_jax.prepare.views import Frame, View, read
@@ -292,7 +293,7 @@ def _components(pictures: np.ndarray, use: np.ndarray) -> np.ndarray:
 
 def _trust(misfit: np.ndarray) -> np.ndarray:
     """Return robust weights: 1 at no misfit, a quarter at `_ROBUST` robust deviations."""
-    return 1.0 / (1.0 + (misfit / (_ROBUST * 1.4826 * np.median(np.abs(misfit)) + 1e-12)) ** 2) ** 2
+    return 1.0 / (1.0 + (misfit / (_ROBUST * robust_std(misfit) + 1e-12)) ** 2) ** 2
 
 
 def _combine(columns: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ unknowns of the fit. Needs a flat border and a spot that is masked in each image
 import numpy as np
 from pydantic import Field
 
-from helio_jax.arrays import border_mask
+from helio_jax.arrays import border_mask, robust_std
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.faults import estimate_noise, find_spikes, line_noise
@@ -61,7 +61,7 @@ def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
     for _ in range(4):
         coefficients = np.linalg.lstsq(basis[keep], image[keep], rcond=None)[0]
         misfit = np.abs(image - basis @ coefficients)
-        keep = frame & (misfit <= 3.0 * 1.4826 * np.median(misfit[keep]) + 1e-12)
+        keep = frame & (misfit <= 3.0 * robust_std(misfit[keep]) + 1e-12)
     curve = basis @ coefficients
     return curve - curve.mean()
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import pitch, robust_std
 from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.resample import Readable, smooth
 from helio_jax.prepare.rigid import Rigid, about, separation
@@ -90,7 +90,7 @@ def align_one_albedo(stacks: tuple[MicrographStack, ...], start: list[Rigid]) ->
     return OneAlbedo(
         tuple(fit.motions),
         stds,
-        1.4826 * float(np.median(np.abs(length - 1.0))),
+        float(robust_std(length - 1.0)),
         fit.share,
         math.degrees(float(fit.polar()[0])),
     )

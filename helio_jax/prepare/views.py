@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import pitch, robust_std
 from helio_jax.micrograph import MicrographStack
 from helio_jax.prepare.resample import Readable, smooth
 from helio_jax.prepare.rigid import Rigid
@@ -110,4 +110,4 @@ def _despiked(image: np.ndarray) -> np.ndarray:
     """Replace pixels that stand out of the median of their neighbourhood by five robust deviations or more."""
     middle = ndimage.median_filter(image, 3, mode="nearest")
     away = np.abs(image - middle)
-    return np.where(away > _SPIKE * 1.4826 * max(float(np.median(away)), 1e-12), middle, image)
+    return np.where(away > _SPIKE * max(float(robust_std(away)), 1e-12), middle, image)

@@ -8,6 +8,7 @@ assumed about the jump's size where a jump closes around a region: that region's
 
 import numpy as np
 
+from helio_jax.arrays import robust_std
 from helio_jax.errors import SceneError
 from helio_jax.reconstruct.integrate_poisson import (
     EdgeProblem,
@@ -59,7 +60,7 @@ def estimate_slope_noise(a: Image, b: Image, dx: float, dy: float, weights: Imag
     is_known = is_known[1:, 1:] & is_known[1:, :-1] & is_known[:-1, 1:] & is_known[:-1, :-1]
     if not is_known.any():
         return 0.0
-    return float(1.4826 * np.median(np.abs(circulation[is_known])) / np.hypot(dx, dy))
+    return float(robust_std(circulation[is_known]) / np.hypot(dx, dy))
 
 
 def edge_noise(a: Image, b: Image, confidence_x: EdgesX, confidence_y: EdgesY, noise: float) -> tuple[EdgesX, EdgesY]:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from helio_jax.arrays import border_mask, pitch
+from helio_jax.arrays import border_mask, pitch, robust_std
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruct.beamframe import slopes_of_normal
@@ -39,7 +39,7 @@ def level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray)
     for _ in range(3):
         plane = np.linalg.lstsq(basis[keep], height[rows, columns][keep], rcond=None)[0]
         misfit = np.abs(height[rows, columns] - basis @ plane)
-        keep = misfit <= 3.0 * max(1.4826 * np.median(misfit), 1e-9)
+        keep = misfit <= 3.0 * max(robust_std(misfit), 1e-9)
     i, j = np.mgrid[: height.shape[0], : height.shape[1]]
     return height - (plane[0] + plane[1] * i / height.shape[0] + plane[2] * j / height.shape[1])
 
