@@ -5,8 +5,8 @@ python benchmarks/known_shape.py STACK.h5 SCENE.toml [--hold incidence,...]   (n
 Incidence, polar angle of every aperture, distance and the sphere's place are fitted to the micrographs, with gain,
 offset and drift as `helio compare` has them, by least squares with Cauchy's weights: a foot that is unlike the scene's
 shall not decide. Printed with error bars (of the counts, scaled to the residuals left; the simulation's own noise is
-not in them, which makes a sphere of our own 4 of them wrong with 64 rays), chi-square per pixel and the median square
-residual. Held at what the scene says: what is named after --hold.
+not in them, which makes a sphere of our own 4 of them wrong with 64 rays), chi-square per pixel, and from the median
+residual (robust). Held at what the scene says: what is named after --hold.
 
 The truth goes into it: whoever reconstructs the same sphere with this geometry scores nothing. It tells what in a
 reconstruction comes from the stated geometry, and may serve for other samples in the same instrument.
@@ -14,7 +14,6 @@ reconstruction comes from the stated geometry, and may serve for other samples i
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +25,18 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
-from helio_jax.arrays import robust_std  # noqa: E402
+from helio_jax.arrays import pitch, robust_std  # noqa: E402
+from helio_jax.comparison import raster_of  # noqa: E402
 from helio_jax.config import SceneFile, load_scene  # noqa: E402
 from helio_jax.evaluate.agreement import find_shift, normalise  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.reconstruct.linear import signal_of  # noqa: E402
 
-Vector = Callable[[np.ndarray], np.ndarray]
 STEP_DEG, STEP_UM = 1.0, 100.0
 """Steps of the derivatives; places by a quarter of a pixel."""
 OUTLIER = 3.0
-"""Residuals, in standard deviations of the median one, from which on they count less (Cauchy)."""
+"""Residuals, in robust standard deviations, from which on they count less (Cauchy)."""
 INCIDENCE, POLAR, FARTHER = 24.0, (3.0, -2.0, 1.0), -200.0
 """The sphere of our own: incidence [deg]; polar angles [deg] and distance [um] more than the scene's."""
 
@@ -56,11 +56,10 @@ class KnownShape:
 
     def __init__(self, stack: MicrographStack, path: Path, rays: int, held: list[str]) -> None:
         self.stack, self.path, self.scene = stack, path, load_scene(path)
-        self.raster = {"scan.nx": stack.x.size, "scan.ny": stack.y.size, "trace.rays": rays, "scan.pitch": "sample"}
-        self.raster |= {"scan.pixel_size_um": float(stack.y[1] - stack.y[0])}
+        self.rays = rays
         polar = [f"polar {name}" for name in self.scene.detector_names]
         self.names = ["incidence", *polar, "distance", "place x", "place y"]
-        quarter = 0.25 * float(stack.y[1] - stack.y[0])
+        quarter = 0.25 * pitch(stack.y)
         self.steps = np.array([STEP_DEG, *(STEP_DEG,) * len(polar), STEP_UM, quarter, quarter])
         start = [self.scene.beam.incidence_deg, *(0.0,) * len(polar), self.scene.sample_distance]
         self.start = np.array([*start, *find_shift(stack, self.simulated(np.array([*start, 0.0, 0.0]))[0])])
@@ -69,12 +68,9 @@ class KnownShape:
     def simulated(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return detection probabilities and their variance, for values of all that is named."""
         incidence, *polar, distance, x, y = at
-        middle = [float(self.stack.x.mean() - x), float(self.stack.y.mean() - y)]
-        changes = self.raster | {"scan.center_um": middle, "beam.incidence_deg": float(incidence)}
-        changes |= changed(self.scene, np.array(polar), distance)
-        made = pipeline.simulate(load_scene(self.path, changes), maps=False).only()
-        assert made.n_rays is not None and made.variance is not None  # simulated
-        return made.counts / made.n_rays, made.variance / made.n_rays**2
+        changes = raster_of(self.stack, self.scene, (x, y)) | changed(self.scene, np.array(polar), distance)
+        changes |= {"beam.incidence_deg": float(incidence), "trace.rays": self.rays}
+        return signal_of(pipeline.simulate(load_scene(self.path, changes), maps=False).only())
 
     def residuals(self, at: np.ndarray) -> np.ndarray:
         """Return (measured - simulated) / standard deviation of all observed pixels, gain and background fitted."""
@@ -82,45 +78,46 @@ class KnownShape:
         found = normalise(self.stack, image, own_variance=variance).residuals
         return np.where(self.stack.is_observed, found, 0.0).ravel()
 
-    def fit(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values of all that is named, and their standard deviations (0: held)."""
+    def fit(self, typical: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the values of all that is named, their standard deviations (0: held), and the residuals there.
 
-        def whole(scaled: np.ndarray) -> np.ndarray:
+        Args:
+            typical: residual at the start; from `OUTLIER` times it on they count less.
+        """
+
+        def residuals(scaled: np.ndarray) -> np.ndarray:
             at = self.start.copy()
             at[self.free] += scaled * self.steps[self.free]
-            return at
+            return self.residuals(at)
 
-        n = int(self.free.sum())
-        typical = float(robust_std(self.residuals(self.start)))
+        def derivatives(
+            scaled: np.ndarray,
+        ) -> np.ndarray:  # over a whole step each way: shorter ones drown in ray noise
+            return np.stack(
+                [0.5 * (residuals(scaled + way) - residuals(scaled - way)) for way in np.eye(scaled.size)], 1
+            )
+
         found = least_squares(
-            lambda q: self.residuals(whole(q)) / (OUTLIER * typical),
-            np.zeros(n),
-            self._jacobian(whole, typical),  # type: ignore[arg-type]  # SciPy's stubs know texts only
+            residuals,
+            np.zeros(self.free.sum()),
+            derivatives,  # type: ignore[arg-type]  # SciPy's stubs know texts only
             loss="cauchy",
+            f_scale=OUTLIER * typical,
             xtol=1e-3,
             ftol=1e-4,
             max_nfev=20,
         )
-        weight = 1.0 / (1.0 + found.fun**2)
+        weight = 1.0 / (1.0 + (found.fun / (OUTLIER * typical)) ** 2)
         spread = np.sum(weight * found.fun**2) / np.sum(weight)
         covariance = spread * np.linalg.inv(found.jac.T @ found.jac)  # found.jac: weighted by the loss
-        std = np.zeros(len(self.names))
+        values, std = self.start.copy(), np.zeros(len(self.names))
+        values[self.free] += found.x * self.steps[self.free]
         std[self.free] = np.sqrt(np.diag(covariance)) * self.steps[self.free]
-        return whole(found.x), std
-
-    def _jacobian(self, whole: Vector, typical: float) -> Vector:
-        """Return the function that gives derivatives over a whole step each way: shorter ones drown in ray noise."""
-
-        def jacobian(q: np.ndarray) -> np.ndarray:
-            ways = np.eye(q.size)
-            columns = [self.residuals(whole(q + way)) - self.residuals(whole(q - way)) for way in ways]
-            return np.stack(columns, 1) / (2.0 * OUTLIER * typical)
-
-        return jacobian
+        return values, std, found.fun
 
 
 def our_own(path: Path, rays: int, size: int) -> MicrographStack:
-    """Return a noisy scan of the scene by an instrument that differs from the stated one as `TRUE` says."""
+    """Return a noisy scan of the scene by an instrument that differs from the stated one."""
     scene = load_scene(path)
     nominal = scene.scan.model_dump()
     polar, distance = np.array(POLAR), scene.sample_distance + FARTHER
@@ -152,16 +149,16 @@ def main() -> None:
     known = KnownShape(stack, args.scene, rays, [name for name in args.hold.split(",") if name])
     names = known.names[:-2]  # without the place
     true = dict(zip(names, [INCIDENCE, *POLAR, known.scene.sample_distance + FARTHER], strict=True)) if is_own else {}
-    values, std = known.fit()
+    before = known.residuals(known.start)
+    values, std, after = known.fit(float(robust_std(before)))
     done = []
     for name, stated, value, error in zip(known.names, known.start, values, std, strict=True):
         unit = "um" if name.startswith(("dist", "place")) else "deg"
         aim = f"{true[name]:.1f} {unit}" if name in true else f"start {stated:.1f} {unit}"
         is_reached = bool(abs(value - true[name]) <= 4.0 * max(error, 0.1)) if name in true else None
         done.append(rows.row("shape", name, f"{value:.2f} +- {error:.2f} {unit}", aim, is_reached))
-    for when, at in (("as stated", known.start), ("as fitted", values)):
-        r = known.residuals(at)
-        text = f"chi-square per pixel {np.mean(r**2):.2f}, median square residual {np.median(r**2) / 0.455:.2f}"
+    for when, r in (("as stated", before), ("as fitted", after)):
+        text = f"chi-square per pixel {np.mean(r**2):.2f}, robust one {robust_std(r) ** 2:.2f}"
         done.append(rows.row("shape", f"{stack.name}, geometry {when}", text, "1", None))
     rows.write(args.output / ("known_shape_tiny.json" if args.tiny else "known_shape.json"), done, 5)
 

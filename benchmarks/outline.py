@@ -21,6 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
 from helio_jax import pipeline  # noqa: E402
+from helio_jax.comparison import raster_of  # noqa: E402
 from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
@@ -74,9 +75,8 @@ def cap_heights(stack: MicrographStack, scene_path: Path, rays: int, center: np.
     middle = np.median(seen[:, :2], axis=0) - 0.02 * ball * np.array([np.sign(shift[0]), np.sign(shift[1])])
     sizes = []
     for share in CAPS:
-        changes = {"scan.nx": x.size, "scan.ny": y.size, "scan.pixel_size_um": float(y[1] - y[0]), "trace.rays": rays}
-        changes |= {"scan.center_um": [float(x.mean() - middle[0]), float(y.mean() - middle[1])]}
-        changes |= {"sample.spheres.0.cap_height_um": share * nominal, "scan.pitch": "sample"}
+        changes = raster_of(stack, scene, (middle[0], middle[1]))
+        changes |= {"trace.rays": rays, "sample.spheres.0.cap_height_um": share * nominal}
         made = pipeline.simulate(load_scene(scene_path, changes), maps=False).only()
         here = made.x + middle[0], made.y + middle[1]
         sizes.append([outline(image, *here, middle, radius)[2:] for image in made.counts])

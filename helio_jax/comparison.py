@@ -115,7 +115,7 @@ class Comparison:
         return out
 
 
-def _raster(stack: MicrographStack, scene: SceneFile, shift: tuple[float, float]) -> dict[str, Any]:
+def raster_of(stack: MicrographStack, scene: SceneFile, shift: tuple[float, float]) -> dict[str, Any]:
     """Return the settings that make the scene's raster the stack's, the sample moved by `shift` [um]."""
     steps = pitch(stack.x), pitch(stack.y)
     stretch = 1.0 / math.cos(math.radians(scene.beam.incidence_deg))
@@ -206,7 +206,7 @@ def compare(
     progress("simulating the scene, looking for the sample")
     shift, reach = (0.0, 0.0), REACH
     for last in (False,) * (MAX_PASSES - 1) + (True,):  # moved by interpolation first, then simulated there
-        here = given | _raster(data, scene, shift)
+        here = given | raster_of(data, scene, shift)
         images = _images(path, here)
         found = find_shift(data, images.total, reach=reach)
         if last or np.hypot(*found) < NEAR * pitch(data.x):

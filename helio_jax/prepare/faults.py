@@ -68,7 +68,7 @@ def _noise_line(image: np.ndarray) -> tuple[float, float]:
         return float(np.nanvar(image)), 0.0
     groups = np.array_split(np.argsort(level), min(_BINS, second.size // _FEWEST))
     x = np.array([level[g].mean() for g in groups])
-    y = np.array([(robust_std(second[g])) ** 2 / 6.0 for g in groups])
+    y = np.array([robust_std(second[g]) ** 2 / 6.0 for g in groups])
     weight = 1.0 / np.maximum(y, 1e-9 * y.max() + 1e-300)
     lines = []
     for columns in ([0, 1], [1], [0]):
@@ -121,6 +121,6 @@ def line_noise(stack: MicrographStack, steady: np.ndarray, frame: np.ndarray) ->
             continue
         mean = np.sum(np.where(known, image, 0.0), axis - 1)[enough] / n[k][enough]
         noise = np.sum(np.where(known, stack.variance[k], 0.0), axis - 1)[enough] / n[k][enough] ** 2
-        spread = (robust_std(mean - np.median(mean))) ** 2
+        spread = robust_std(mean - np.median(mean)) ** 2
         out.append(float(np.sqrt(max(spread - np.median(noise), 0.0))))
     return np.array(out)
