@@ -32,6 +32,8 @@ TOP = 0.99
 """Quantile of the scene's heights from which on pixels are its top."""
 MAX_PASSES, NEAR = 5, 0.05
 """The sample is moved and simulated anew so often, or until it moves by less than this [pixels]."""
+WRITTEN = ("comparison.json", "comparison.png", "effects.png")
+"""Files that a comparison writes in its folder; the last one where effects were explained."""
 MAX_LAG = 5.0
 """Longest response time of a detector that `explain` looks for [pixels]."""
 Progress = Callable[[str], Any]
@@ -105,12 +107,11 @@ class Comparison:
     def write(self, folder: Path) -> list[Path]:
         """Write comparison.json and comparison.png, and effects.png if there are any; return their paths."""
         make_folder(folder)
-        out = [folder / "comparison.json", folder / "comparison.png"]
+        out = [folder / name for name in (WRITTEN if self.effects else WRITTEN[:2])]
         with atomic_path(out[0]) as part:
             part.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
         save_agreement(self.stack, self.agreement, self.contrast, out[1])
         if self.effects:
-            out.append(folder / "effects.png")
             save_effects([(row.name, row.d_bic, row.height) for row in self.effects], self.height, out[2])
         return out
 

@@ -69,6 +69,26 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
     return scene.at(path.parent).settled()
 
 
+def files_read(
+    path: str | os.PathLike, label: str, overrides: Mapping[str, Any] | None = None
+) -> list[tuple[str, Path]]:
+    """Return what names each file that a scene or instrument file has read, and its path; the file itself first.
+
+    Beside an OBJ every .mtl counts. Nothing is checked: what is wrong with the file is told when it is loaded.
+    """
+    path = Path(path)
+    names: list[str] = []
+    try:
+        extended = _read_toml(path).get("extends")
+        tables = _merge(_read_extended(path), _nest(overrides or {}))
+    except SceneError:
+        return [(label, path)]
+    with_files(tables, lambda name: names.append(name) or name)
+    found = [path.parent / name for name in ([extended] if isinstance(extended, str) else []) + names]
+    found += [mtl for obj in found if obj.suffix.lower() == ".obj" for mtl in obj.parent.glob("*.mtl")]
+    return [(label, path), *((f"{label}: a file of {path.name}", file) for file in found)]
+
+
 def read_reconstruction(path: Path) -> Reconstruction:
     """Read a reconstruction, for samples that are one.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.checkpoint import Keeper, Shard, is_finished
-from helio_jax.config import SceneFile, load_scene
+from helio_jax.config import SceneFile, files_read, load_scene
 from helio_jax.errors import InputFileError, ResumeError, SceneError
 from helio_jax.evaluate.before_after import save_before_after
 from helio_jax.evaluate.figures import panel, save_figure
@@ -19,7 +19,7 @@ from helio_jax.evaluate.report import write_report
 from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
-from helio_jax.formats.safe import atomic_path, make_folder
+from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.predict import make_predictor
 from helio_jax.prepare.align import AlignSettings, align_scans
@@ -38,6 +38,14 @@ DEFAULT_CREW = Crew()
 """Threads of this process, one per CPU."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
+RUN_FILES = {
+    "micrographs": "micrographs.h5",
+    "height map": "height.h5",
+    "scores": "scores.json",
+    "report": "report.html",
+    "panel": "report.png",
+}
+"""What `run` writes in its folder."""
 
 
 def _silent(label: str) -> Any:
@@ -110,6 +118,7 @@ def simulate_file(
         GuardError: ray book-keeping failed.
     """
     o, overrides = options, overrides or {}
+    check_outputs(files_read(scene_path, "the scene", overrides), [("output", Path(output))])
     scene = load_scene(scene_path, overrides)
     parts = Parts(Path(output))
     shard = Shard.parse(o.shard) if o.shard else None
@@ -197,10 +206,12 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
 
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
+    picture = Path(output).with_suffix(".png")
+    check_outputs([("path", Path(path))], [("output", Path(output)), ("output: the .png beside it", picture)])
     before = read_stack(path)
     after = calibrate(before, **changes)
     write(after, output)
-    save_before_after(before, after, Path(output).with_suffix(".png"))
+    save_before_after(before, after, picture)
     return after
 
 
@@ -363,10 +374,10 @@ def run(
         )
     scene.apertures()  # heights need them: told before anything is traced
     out = Path(folder) if folder else Path("helio-out") / scene.name
-    make_folder(out)
-    names = {"micrographs": "micrographs.h5", "height map": "height.h5", "scores": "scores.json"}
-    names |= {"report": "report.html"} if report else {}
+    names = {label: name for label, name in RUN_FILES.items() if report or label not in ("report", "panel")}
+    check_outputs(files_read(scene_path, "the scene", overrides), files_within("-o", out, names.values()))
     files = {label: out / name for label, name in names.items()}
+    make_folder(out)
     with stage("simulating micrographs") as progress:
         options = SimulateOptions(noise=True, crew=crew, restart=restart, progress=progress, say=say)
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
@@ -381,5 +392,5 @@ def run(
             part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")
         if report:
             title = f"{scene.name}: simulated, reconstructed, scored"
-            files["panel"] = write_report_files(files["report"], stack, rec, truth, scores, title=title)
+            write_report_files(files["report"], stack, rec, truth, scores, title=title)
     return RunResult(scene.name, rec.method, rec.status, scores, files)

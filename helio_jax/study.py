@@ -25,11 +25,11 @@ from scipy.stats import qmc
 
 from helio_jax import pipeline
 from helio_jax.checkpoint import Shard
-from helio_jax.config import load_scene, resolved, with_files
+from helio_jax.config import files_read, load_scene, resolved, with_files
 from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.evaluate.sweep import save_sweep
 from helio_jax.explain import explain_errors
-from helio_jax.formats.safe import atomic_path, make_folder
+from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
 from helio_jax.formats.toml import to_toml
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.files import read_bytes
@@ -39,6 +39,8 @@ MAX_POINTS = 100_000
 INDEX_SECONDS = 5.0
 """The index is written at most this often, and at the end."""
 MAX_STUDY_MB = 4.0
+WRITTEN = ("study.json", "index.json", "index.csv", "index.png")
+"""Files in a study's folder, beside those of its points."""
 
 
 class Range(Settings):
@@ -205,6 +207,8 @@ def run_study(
     study = load_study(path)
     points = [_Point(i, v, folder / f"point_{i:05d}") for i, v in enumerate(study.points(), start=1)]
     scene_path = path.parent / study.scene
+    inputs = [("the study", path), *files_read(scene_path, "its scene", study.set)]
+    check_outputs(inputs, files_within("-o", folder, WRITTEN))
     scenes = [_scene_text(scene_path, study.set | p.values, f"{path}: point {p.number}") for p in points]
     _begin(folder, path, scenes, is_shared=resume or options.shard is not None)
     shard = Shard.parse(options.shard) if options.shard else Shard(1, 1)

@@ -11,10 +11,13 @@ from typing import Annotated
 import typer
 
 from helio_jax.commands.app import AsJson, SceneArg, app
+from helio_jax.commands.door import Reads, Writes
 
 
 @app.command()
-def info(file: Annotated[Path, typer.Argument(help="File written by helio (.h5).")], as_json: AsJson = False) -> None:
+def info(
+    file: Annotated[Path, typer.Argument(help="File written by helio (.h5)."), Reads()], as_json: AsJson = False
+) -> None:
     """Say what a file holds, where it came from and how it was made."""
     from helio_jax.formats.hdf5 import describe
 
@@ -84,7 +87,9 @@ def doctor(as_json: AsJson = False) -> None:
 
 @app.command("fetch-data")
 def fetch_data(
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder (default: the user's cache).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder (default: the user's cache)."), Writes(within=())
+    ] = None,
 ) -> None:
     """Download the paper's public micrographs (CC BY-SA), check their SHA-256 and say where they are."""
     from helio_jax.formats.fetch import CITATION, fetch_pack

@@ -5,14 +5,22 @@ Light at import (`helio --help` in under 0.3 s): every command imports what it n
 """
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-app = typer.Typer(
+from helio_jax.commands.door import HDF5_SUFFIXES, Command, Reads, Writes
+
+
+class _Helio(typer.Typer):
+    """An application all of whose commands pass the door."""
+
+    def command(self, name: str | None = None, *, cls: Any = Command, **options: Any) -> Any:
+        return super().command(name, cls=cls, **options)
+
+
+app = _Helio(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -21,58 +29,20 @@ app = typer.Typer(
 )
 
 
-HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")  # as in formats/hdf5.py, which is too heavy to ask here
-
-
-def _written_as(what: str, *suffixes: str) -> Callable[[Path | None], Path | None]:
-    """Return a check of an output's suffix that refuses another one before anything is computed (exit code 2)."""
-
-    def check(path: Path | None) -> Path | None:
-        if path is not None and path.suffix.lower() not in suffixes:
-            known = " or ".join(suffixes)
-            raise typer.BadParameter(f"{path}: is written as {what}: give it the suffix {known}, got {path.suffix!r}")
-        return path
-
-    return check
-
-
-class SpacedCommand(TyperCommand):
-    """A command with options of several numbers, which stand with spaces between: a comma is told with its remedy."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse as usual, once no option of several values has been given one word with commas."""
-        several = {name: option for option in self.params if option.nargs > 1 for name in option.opts}
-        for word, following in zip(args, [*args[1:], ""], strict=True):
-            name, _, value = word.partition("=")
-            value = value or following
-            if name in several and "," in value:
-                shown = " ".join(v for v in value.split(",") if v)
-                raise typer.BadParameter(
-                    f"{name} takes its {several[name].nargs} values with spaces between, got "
-                    f"{value!r}: write {name} {shown}"
-                )
-        return super().parse_args(ctx, args)
-
-
-SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml")]
-H5File = Annotated[
-    Path, typer.Option("--output", "-o", help="File to write (.h5).", callback=_written_as("HDF5", *HDF5_SUFFIXES))
-]
-HtmlFile = Annotated[
-    Path, typer.Option("--output", "-o", help="File to write (.html).", callback=_written_as("HTML", ".html", ".htm"))
-]
-ObjFile = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", help="File to write (.obj).", callback=_written_as("OBJ, which names parts", ".obj")
-    ),
-]
-FIGURE = _written_as("a figure", ".png", ".pdf", ".svg")
-"""Callback of options that name a picture to write."""
-CSV = _written_as("a table", ".csv")
-"""Callback of options that name a table to write."""
-TOML = _written_as("TOML", ".toml")
-"""Callback of options that name a scene or instrument file to write."""
+SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml"), Reads(names_files=True)]
+HDF5 = Writes("HDF5", HDF5_SUFFIXES)
+"""Mark of what is written as HDF5."""
+HTML = Writes("HTML", (".html", ".htm"), beside=(".png",))
+"""Mark of a report, beside which its panel is written."""
+FIGURE = Writes("a figure", (".png", ".pdf", ".svg"))
+"""Mark of options that name a picture to write."""
+CSV = Writes("a table", (".csv",))
+"""Mark of options that name a table to write."""
+TOML = Writes("TOML", (".toml",))
+"""Mark of options that name a scene or instrument file to write."""
+COLUMNS = Writes("a table", (".csv", ".npz"))
+"""Mark of options that name a table of columns to write."""
+H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]

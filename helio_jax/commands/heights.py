@@ -12,29 +12,31 @@ import typer
 from helio_jax.commands.app import (
     CSV,
     FIGURE,
+    HTML,
     TOML,
     AsJson,
     Bar,
     H5File,
-    HtmlFile,
     Method,
-    SpacedCommand,
     app,
     given_options,
     print_table,
     set_options,
 )
+from helio_jax.commands.door import Reads
 
 
 @app.command()
 def reconstruct(
-    stack: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
+    stack: Annotated[Path, typer.Argument(help="Micrographs (.h5)."), Reads()],
     output: H5File,
     method: Method = None,
-    settings: Annotated[Path | None, typer.Option(help="Scene file whose table [reconstruct] is used.")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(help="Scene file whose table [reconstruct] is used."), Reads(names_files=True)
+    ] = None,
     border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
     write_instrument: Annotated[
-        Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml).", callback=TOML)
+        Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
 ) -> None:
     """Turn three or more micrographs into a height map."""
@@ -63,8 +65,10 @@ def reconstruct(
 
 @app.command()
 def evaluate(
-    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
-    truth: Annotated[Path, typer.Option(help="Scene file, or a height map (.h5) on the same raster.")],
+    height: Annotated[Path, typer.Argument(help="Height map (.h5)."), Reads()],
+    truth: Annotated[
+        Path, typer.Option(help="Scene file, or a height map (.h5) on the same raster."), Reads(names_files=True)
+    ],
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -87,10 +91,12 @@ def evaluate(
 
 @app.command()
 def report(
-    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
-    output: HtmlFile,
-    stack: Annotated[Path | None, typer.Option(help="Its micrographs (.h5).")] = None,
-    truth: Annotated[Path | None, typer.Option(help="Scene file or height map to compare with.")] = None,
+    height: Annotated[Path, typer.Argument(help="Height map (.h5)."), Reads()],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.html)."), HTML],
+    stack: Annotated[Path | None, typer.Option(help="Its micrographs (.h5)."), Reads()] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Scene file or height map to compare with."), Reads(names_files=True)
+    ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
@@ -105,9 +111,9 @@ def report(
     print(f"{output}\n{panel}")
 
 
-@app.command(cls=SpacedCommand)
+@app.command()
 def measure(
-    height: Annotated[Path, typer.Argument(help="Height map (.h5).")],
+    height: Annotated[Path, typer.Argument(help="Height map (.h5)."), Reads()],
     facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
     profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
     step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
@@ -122,18 +128,18 @@ def measure(
         bool, typer.Option("--vertical-edges", help="Walls in the map of jumps, masked and floating pixels.")
     ] = False,
     stack: Annotated[
-        Path | None, typer.Option(help="Calibrated micrographs (.h5): do they show the ripple? Where are cracks?")
+        Path | None,
+        typer.Option(help="Calibrated micrographs (.h5): do they show the ripple? Where are cracks?"),
+        Reads(),
     ] = None,
     min_pixels: Annotated[int | None, typer.Option(help="Smallest facet.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE: max_turn_deg, along_axes, ... (repeat).")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Facets, ripple, or cracks as a picture (.png, .pdf, .svg).", callback=FIGURE)
+        Path | None, typer.Option(help="Facets, ripple, or cracks as a picture (.png, .pdf, .svg)."), FIGURE
     ] = None,
-    table: Annotated[
-        Path | None, typer.Option(help="Cracks and vertical edges, a row for each (.csv).", callback=CSV)
-    ] = None,
+    table: Annotated[Path | None, typer.Option(help="Cracks and vertical edges, a row for each (.csv)."), CSV] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure on a height map: facets, a profile or step, roughness, a ripple, cracks, vertical edges."""

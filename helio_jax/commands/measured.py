@@ -4,6 +4,7 @@ Each parses, calls, prints; no logic of its own.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 
 from helio_jax.commands.app import (
     FIGURE,
+    HDF5,
     AsJson,
     Bar,
     H5File,
@@ -22,13 +24,21 @@ from helio_jax.commands.app import (
     say,
     set_options,
 )
+from helio_jax.commands.door import Reads, Writes
+
+COMPARISON = ("comparison.json", "comparison.png", "effects.png")
+"""What `compare` writes in its folder (comparison.py)."""
 
 
 @app.command("import")
 def import_files(
-    files: Annotated[list[Path], typer.Argument(help="Micrographs (.mat of B-SHeM, A-SHeM, the reference simulator).")],
+    files: Annotated[
+        list[Path], typer.Argument(help="Micrographs (.mat of B-SHeM, A-SHeM, the reference simulator)."), Reads()
+    ],
     output: H5File,
-    instrument: Annotated[Path | None, typer.Option(help="Instrument or scene file: what the file lacks.")] = None,
+    instrument: Annotated[
+        Path | None, typer.Option(help="Instrument or scene file: what the file lacks."), Reads(names_files=True)
+    ] = None,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
     from helio_jax import MicrographSet, import_micrographs, write
@@ -44,8 +54,12 @@ def import_files(
 
 @app.command()
 def export(
-    file: Annotated[Path, typer.Argument(help="Micrographs (.h5).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mat (the reference's layout).")],
+    file: Annotated[Path, typer.Argument(help="Micrographs (.h5)."), Reads()],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="File to write: .mat (the reference's layout)."),
+        Writes("MATLAB", (".mat",)),
+    ],
     view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
 ) -> None:
     """Write micrographs in the layout of another program, by the suffix of the file."""
@@ -60,9 +74,11 @@ def export(
 
 @app.command()
 def compare(
-    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5).")],
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5)."), Reads()],
     scene: SceneArg,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("helio-out/comparison"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write."), Writes(within=COMPARISON)] = Path(
+        "helio-out/comparison"
+    ),
     explain: Annotated[bool, typer.Option(help="Add one effect at a time and tabulate what it does.")] = False,
     rays: Rays = None,
     as_json: AsJson = False,
@@ -70,9 +86,7 @@ def compare(
     """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
     from helio_jax.comparison import compare as compare_with_scene
     from helio_jax.formats.hdf5 import read_stack
-    from helio_jax.formats.safe import make_folder
 
-    make_folder(output)
     found = compare_with_scene(
         read_stack(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
     )
@@ -96,16 +110,16 @@ def _read_set(path: Path) -> Any:
 
 @app.command()
 def align(
-    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
+    scans: Annotated[
+        Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import)."), Reads()
+    ],
     output: H5File,
-    points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um).")] = None,
+    points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um)."), Reads()] = None,
     auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")
     ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg).", callback=FIGURE)
-    ] = None,
+    figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg)."), FIGURE] = None,
     as_json: AsJson = False,
 ) -> None:
     """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
@@ -130,8 +144,12 @@ def align(
 
 @app.command()
 def pick(
-    scans: Annotated[Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Control points (CSV); goes on with what is there.")],
+    scans: Annotated[
+        Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import)."), Reads()
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Control points (CSV); goes on with what is there."), Writes()
+    ],
 ) -> None:
     """Open a window to click the same points in all scans; every click is saved."""
     from helio_jax.evaluate.pick import pick_points
@@ -144,8 +162,10 @@ def pick(
 
 @app.command()
 def calibrate(
-    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5), from helio import.")],
-    output: H5File,
+    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5), from helio import."), Reads()],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write (.h5)."), replace(HDF5, beside=(".png",))
+    ],
     drift: Annotated[bool, typer.Option(help="Take slow drift off, and leave it to the fit.")] = True,
     lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
     noise_model: Annotated[bool, typer.Option(help="Let the variance follow the counts.")] = True,
@@ -186,7 +206,7 @@ def calibrate(
 
 @app.command()
 def orient(
-    stack: Annotated[Path, typer.Argument(help="Micrographs of one scan with 3 or more detectors (.h5).")],
+    stack: Annotated[Path, typer.Argument(help="Micrographs of one scan with 3 or more detectors (.h5)."), Reads()],
     output: H5File,
     turn: Annotated[int | None, typer.Option(help="Counter-clockwise turn: 0, 90, 180, 270 (default: tried).")] = None,
     mirror: Annotated[

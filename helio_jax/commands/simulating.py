@@ -11,31 +11,38 @@ from typing import Annotated
 import typer
 
 from helio_jax.commands.app import (
+    COLUMNS,
     FIGURE,
     AsJson,
     Bar,
     H5File,
     Method,
-    ObjFile,
     Processes,
     Rays,
     Restart,
     SceneArg,
     Scheduler,
     Seed,
-    SpacedCommand,
     Workers,
     app,
     given_options,
     print_table,
     say,
 )
+from helio_jax.commands.door import Reads, Writes
+
+RUN = ("micrographs.h5", "height.h5", "scores.json", "report.html", "report.png")
+"""What `run` writes in its folder (pipeline.py)."""
+STUDY = ("study.json", "index.json", "index.csv", "index.png")
+"""What `study` writes in its folder beside the points (study.py)."""
 
 
 @app.command()
 def run(
     scene: SceneArg,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder (default: helio-out/NAME).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder (default: helio-out/NAME)."), Writes(within=RUN)
+    ] = None,
     rays: Rays = None,
     seed: Seed = None,
     method: Method = None,
@@ -98,27 +105,24 @@ def simulate(
                 print(f"  {name}: {share:.2%} of the counts")
 
 
-@app.command(cls=SpacedCommand)
+@app.command()
 def rays(
     scene: SceneArg,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Table of all atoms (.csv or .npz)."), COLUMNS],
     pixel: Annotated[tuple[int, int] | None, typer.Option(metavar="ROW COLUMN", help="From 0 (default: all).")] = None,
-    directions: Annotated[Path | None, typer.Option(help="Histogram of directions, too (.csv or .npz).")] = None,
+    directions: Annotated[
+        Path | None, typer.Option(help="Histogram of directions, too (.csv or .npz)."), COLUMNS
+    ] = None,
     view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
     n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
     seed: Seed = None,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
     from helio_jax.config import load_scene
-    from helio_jax.errors import SceneError
-    from helio_jax.formats.columns import check_table_target, write_columns
+    from helio_jax.formats.columns import write_columns
     from helio_jax.trace.follow import follow_scene
     from helio_jax.trace.tally import FATES
 
-    for target in filter(None, (output, directions)):
-        check_table_target(target)
-    if directions and directions.resolve() == output.resolve():
-        raise SceneError(f"{output}: -o and --directions name one file: give them two names")
     loaded = load_scene(scene, given_options(**{"trace.rays": n, "trace.seed": seed}))
     atoms = follow_scene(loaded, loaded.trace, pixel, view)
     write_columns(output, atoms.columns())
@@ -130,7 +134,9 @@ def rays(
 
 @app.command()
 def resume(
-    path: Annotated[Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study.")],
+    path: Annotated[
+        Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
+    ],
 ) -> None:
     """Go on with what was interrupted or killed; no unit that was finished is traced again."""
     from helio_jax.pipeline import resume as resume_run
@@ -146,8 +152,12 @@ def resume(
 
 @app.command()
 def study(
-    file: Annotated[Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the points and their index.")],
+    file: Annotated[
+        Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml"), Reads()
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for the points and their index."), Writes(within=STUDY)
+    ],
     go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
     workers: Workers = None,
     processes: Processes = False,
@@ -166,7 +176,7 @@ def study(
 def spot(
     scene: SceneArg,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg).", callback=FIGURE)
+        Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg)."), FIGURE
     ] = None,
     heights: Annotated[str, typer.Option(help="Heights above the reference plane [um], commas between.")] = "0",
     as_json: AsJson = False,
@@ -190,8 +200,14 @@ def spot(
 
 @app.command()
 def plate(
-    instrument: Annotated[Path, typer.Argument(help="Instrument or scene file with apertures.", metavar="SCENE.toml")],
-    output: ObjFile,
+    instrument: Annotated[
+        Path,
+        typer.Argument(help="Instrument or scene file with apertures.", metavar="SCENE.toml"),
+        Reads(names_files=True),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write (.obj)."), Writes("OBJ, which names parts", (".obj",))
+    ],
     thickness_um: Annotated[float, typer.Option(help="Thickness of the plate [um].")],
     radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: room for all).")] = None,
     channel_deg: Annotated[

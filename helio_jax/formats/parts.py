@@ -9,7 +9,7 @@ import contextlib
 import io
 import json
 import os
-import shutil
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +22,8 @@ from helio_jax.formats import safe
 
 MAX_PART_BYTES = safe.GIB
 MAX_MANIFEST_BYTES = 16 * safe.MIB
+_OWN = re.compile(r"\d{6}\.npz|whole\.\w+|\.(\d{6}|manifest|whole)\.[0-9a-f]{8}\.part\.\w+")
+"""Names that parts have, finished or not."""
 
 
 class Parts:
@@ -138,10 +140,15 @@ class Parts:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the folder, with the parts and what a killed process left there; the manifest first.
+        """Remove the parts and what a killed process left of them, the manifest first, and the folder once it is empty.
 
-        When this is killed half-way, what is left is no unfinished run.
+        When this is killed half-way, what is left is no unfinished run. What others put there stays.
         """
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             (self.folder / "manifest.json").unlink(missing_ok=True)
-            shutil.rmtree(self.folder)
+            for path in self.folder.iterdir():
+                if _OWN.fullmatch(path.name) and path.is_file():
+                    path.unlink(missing_ok=True)
+        for folder in (self.folder / "claimed", self.folder):
+            with contextlib.suppress(OSError):  # it holds something else, or is gone
+                folder.rmdir()

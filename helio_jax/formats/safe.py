@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from helio_jax.errors import InputFileError, MissingDependencyError, SceneError
 
 MIB = 1024**2
 GIB = 1024**3
+MAX_NAME_BYTES = 230
+"""Longest name of an output; most disks take 255, and what is written first adds to it (.part)."""
 
 _BOOT = (
     "import sys; root = sys.argv[1]; root in sys.path or sys.path.insert(0, root); "
@@ -228,14 +230,92 @@ def check_target(target: Path) -> Path:
     Raises:
         SceneError: it is a folder, a device or write-protected, or its folder does not exist.
     """
-    real = target.resolve()
-    if real.exists() and not real.is_file():
+    try:
+        real = target.resolve()
+        is_there, is_file, has_folder = real.exists(), real.is_file(), real.parent.is_dir()
+    except (OSError, RuntimeError) as e:  # a name that is too long, a loop of links
+        raise SceneError(f"cannot write {target}: {getattr(e, 'strerror', None) or e}; name another file") from None
+    if is_there and not is_file:
         raise SceneError(f"cannot write {target}: it is a folder or device; name a file")
-    if real.exists() and not os.access(real, os.W_OK):
+    if is_there and not (os.access(real, os.W_OK) and real.stat().st_mode & 0o222):  # root may write what is protected
         raise SceneError(f"cannot write {target}: it is write-protected; name another file or allow writing")
-    if not real.parent.is_dir():
+    if not has_folder:
         raise SceneError(f"cannot write {target}: No such file or directory; check the folder, rights and space")
     return real
+
+
+def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
+    """Refuse, before any work, outputs that are an input, that are one file, or that could not be written.
+
+    Files are told apart by what they are, not by how they are spelled: links of both kinds are seen through.
+
+    Args:
+        inputs: of every file that is read, what names it (an option) and its path.
+        outputs: the same of every file that will be written.
+
+    Raises:
+        SceneError: the message names the file, what names it twice, and the remedy.
+    """
+    outputs, inputs = list(outputs), list(inputs)
+    for name, path in outputs:
+        for source, read in inputs:
+            if _is_same(path, read):
+                raise SceneError(
+                    f"{path} ({name}) is the same file as {read} ({source}), which is read and would be lost: name "
+                    f"another file with {name.partition(':')[0]}"
+                )
+    for i, (name, path) in enumerate(outputs):
+        for other, before in outputs[:i]:
+            if _is_same(path, before):
+                raise SceneError(f"{path} ({name}) and {before} ({other}) are one file: give them two names")
+    for name, path in outputs:
+        try:
+            real = check_target(path)
+            if (n_bytes := len(os.fsencode(real.name))) > MAX_NAME_BYTES:
+                limit = f"the limit is {MAX_NAME_BYTES}: shorten it"
+                raise SceneError(f"cannot write {path}: its name has {n_bytes} bytes, {limit}")
+            _check_folder(real.parent, path)
+        except SceneError as e:
+            raise SceneError(f"{name}: {e}") from None
+
+
+def files_within(name: str, folder: Path, files: Iterable[str]) -> list[tuple[str, Path]]:
+    """Return, for `check_outputs`, the files that will be written in a folder that may have to be made first.
+
+    Raises:
+        SceneError: the folder cannot be made, or nothing can be written in it.
+    """
+    try:
+        is_there = folder.exists()
+        above = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+        if not above.is_dir():
+            raise SceneError(f"cannot write {folder}: {above} is a file; name a folder")
+        _check_folder(above, folder)
+    except OSError as e:  # a name that is too long
+        raise SceneError(f"{name}: cannot write {folder}: {e.strerror}; name another folder") from None
+    except SceneError as e:
+        raise SceneError(f"{name}: {e}") from None
+    return [(f"{name}: its {file}", folder / file) for file in files] if is_there else []
+
+
+def _check_folder(folder: Path, what: Path) -> None:
+    """Refuse a folder in which nothing can be made (rights, a read-only disk), as the system sees it."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as e:
+        raise SceneError(f"cannot write {what}: {e.strerror or e}; check the folder, rights and space") from None
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    """Whether two paths lead to one file, or would if it were there."""
+    try:
+        path, other = path.resolve(), other.resolve()
+        if path.exists() and other.exists():
+            return os.path.samefile(path, other)
+        return path.name == other.name and os.path.samefile(path.parent, other.parent)
+    except (OSError, RuntimeError):  # told by whoever reads or writes it
+        return False
 
 
 @contextlib.contextmanager

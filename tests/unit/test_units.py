@@ -185,7 +185,7 @@ def test_killed_while_cleaning_up(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(parts_module.shutil, "rmtree", killed)
+        patch.setattr(parts_module.Path, "iterdir", killed)
         with pytest.raises(KeyboardInterrupt):
             pipeline.simulate_file(SCENE, output, overrides=QUICK)
     assert output.is_file() and not Parts(output).exist

@@ -1,0 +1,114 @@
+"""The door that every command passes: what it would write is checked before it does anything.
+
+A command says in its annotations which files it reads and which it writes; the door refuses an output that is an
+input, two outputs in one file, and an output that could not be written. Light at import, as app.py.
+"""
+
+import inspect
+import itertools
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")  # as in formats/hdf5.py, which is too heavy to ask here
+
+
+@dataclass(frozen=True)
+class Reads:
+    """Mark of an argument or option: files that the command reads.
+
+    Attributes:
+        names_files: it may be a scene or an instrument file, whose own files are read, too.
+    """
+
+    names_files: bool = False
+
+
+@dataclass(frozen=True)
+class Writes:
+    """Mark of an argument or option: a file, or a folder of files, that the command writes.
+
+    Attributes:
+        what: what it is written as, for messages.
+        suffixes: that it may have, lower case; none: any.
+        beside: suffixes of further files that are written beside it.
+        within: names of the files that are written in it: it is a folder.
+    """
+
+    what: str = "a file"
+    suffixes: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    within: tuple[str, ...] | None = None
+
+    def check_suffix(self, label: str, path: Path) -> None:
+        """Refuse another suffix than those known (exit code 2)."""
+        if self.suffixes and path.suffix.lower() not in self.suffixes:
+            known = " or ".join(self.suffixes)
+            raise typer.BadParameter(
+                f"{label}: {path} is written as {self.what}: give it the suffix {known}, got {path.suffix!r}"
+            )
+
+    def files(self, label: str, path: Path) -> list[tuple[str, Path]]:
+        """Return what names each file that is written, and where it is."""
+        from helio_jax.formats.safe import files_within
+
+        if self.within is not None:
+            return files_within(label, path, self.within)
+        return [(label, path), *((f"{label}: the {s} beside it", path.with_suffix(s)) for s in self.beside)]
+
+
+def marks_of(function: Any) -> dict[str, Reads | Writes]:
+    """Return the mark of every parameter that has one."""
+    hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
+    marks = ((name, m) for name, hint in hints.items() for m in getattr(hint, "__metadata__", ()))
+    return {name: mark for name, mark in marks if isinstance(mark, (Reads, Writes))}
+
+
+class Command(TyperCommand):
+    """A command of helio; of an option of several numbers, which stand with spaces between, a comma is told."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse as usual, once no option of several values has been given one word with commas."""
+        several = {name: option for option in self.params if option.nargs > 1 for name in option.opts}
+        for word, following in itertools.zip_longest(args, args[1:], fillvalue=""):
+            name, _, value = word.partition("=")
+            value = value or following
+            if name in several and "," in value:
+                shown = " ".join(v for v in value.split(",") if v)
+                raise typer.BadParameter(
+                    f"{name} takes its {several[name].nargs} values with spaces between, got "
+                    f"{value!r}: write {name} {shown}"
+                )
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command, once what it would write has been checked."""
+        marks = marks_of(self.callback)
+        for label, mark, path in self._given(ctx, marks, Writes):
+            mark.check_suffix(label, path)
+        outputs = [file for label, mark, path in self._given(ctx, marks, Writes) for file in mark.files(label, path)]
+        if outputs:
+            from helio_jax.config import files_read
+            from helio_jax.formats.safe import check_outputs
+
+            inputs = []
+            for label, mark, path in self._given(ctx, marks, Reads):
+                has_files = mark.names_files and path.suffix.lower() not in HDF5_SUFFIXES
+                inputs += files_read(path, label) if has_files else [(label, path)]
+            check_outputs(inputs, outputs)
+        return super().invoke(ctx)
+
+    def _given(self, ctx: Any, marks: dict[str, Any], kind: type) -> Iterator[tuple[str, Any, Path]]:
+        """Yield the paths given for marks of a kind: what names it (-o, STACK), the mark, the path."""
+        for param in self.params:
+            mark, value = marks.get(param.name or ""), ctx.params.get(param.name)
+            if isinstance(mark, kind) and value is not None:
+                own = getattr(param, "metavar", None) or str(param.name).upper()
+                label = min(param.opts, key=len) if param.param_type_name == "option" else own
+                for one in value if isinstance(value, (list, tuple)) else [value]:
+                    yield label, mark, Path(one)
