@@ -20,17 +20,17 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, write  # noqa: E402
+from helio_jax.alignment.align import Alignment, find_motions  # noqa: E402
+from helio_jax.alignment.control_points import rms  # noqa: E402
+from helio_jax.alignment.rigid import Rigid, separation  # noqa: E402
 from helio_jax.arrays import pitch  # noqa: E402
-from helio_jax.config import load_instrument  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.formats.points import read_points  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
-from helio_jax.prepare.align import Alignment, find_motions  # noqa: E402
-from helio_jax.prepare.points import rms  # noqa: E402
-from helio_jax.prepare.rigid import Rigid, separation  # noqa: E402
 from helio_jax.scene.surfaces import surface_body  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
+from helio_jax.workflows.scene_file import load_instrument  # noqa: E402
 
 PITCH_UM = 20.0
 COUNTS = 200.0

@@ -29,27 +29,27 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
 from benchmarks.alignment import INSTRUMENT, POINTS, SCANS, Surface, bumps, pyramids, rough  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
+from helio_jax.alignment.align import find_motions  # noqa: E402
+from helio_jax.alignment.resample import resample  # noqa: E402
+from helio_jax.alignment.rigid import Rigid  # noqa: E402
 from helio_jax.arrays import pitch  # noqa: E402
-from helio_jax.config import load_instrument  # noqa: E402
+from helio_jax.calibration.self_calibration import SelfCalibration, effective_instrument  # noqa: E402
+from helio_jax.calibration.self_calibration import apply as apply_calibration  # noqa: E402
 from helio_jax.errors import GuardError  # noqa: E402
-from helio_jax.evaluate.facets import Facet, FacetSettings, find_facets  # noqa: E402
-from helio_jax.evaluate.measure import reconstructed_area  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.formats.points import read_points  # noqa: E402
+from helio_jax.forward.beam_frame import unit_normal  # noqa: E402
+from helio_jax.measure.facets import Facet, FacetSettings, find_facets  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
-from helio_jax.prepare.align import find_motions  # noqa: E402
-from helio_jax.prepare.resample import resample  # noqa: E402
-from helio_jax.prepare.rigid import Rigid  # noqa: E402
-from helio_jax.prepare.selfcalibrate import SelfCalibration, effective_instrument  # noqa: E402
-from helio_jax.prepare.selfcalibrate import apply as apply_calibration  # noqa: E402
-from helio_jax.reconstruct.beamframe import unit_normal  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
 from helio_jax.scene.body import COSINE  # noqa: E402
 from helio_jax.scene.scattering import CosineLaw, Law  # noqa: E402
 from helio_jax.scene.surfaces import surface_body  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
+from helio_jax.workflows.measure import reconstructed_area  # noqa: E402
+from helio_jax.workflows.scene_file import load_instrument  # noqa: E402
 
 FIELD_UM = 2000.0
 TOP_UM, ANGLE_DEG, TILT_DEG, TURN_DEG = (438.0, 250.0), 125.26, 6.0, 65.0

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.fft import dctn, idct
 
 from helio_jax.arrays import border_mask
+from helio_jax.forward.beam_frame import normal_of_slopes
 from helio_jax.instrument import Instrument
+from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.residuals import Prediction
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.beamframe import normal_of_slopes
-from helio_jax.reconstruct.model import Prediction
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.solve import reconstruct_stack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.trace.direct import form_factors
 

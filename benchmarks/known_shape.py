@@ -24,14 +24,14 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.arrays import pitch, robust_std  # noqa: E402
-from helio_jax.comparison import raster_of  # noqa: E402
-from helio_jax.config import SceneFile, load_scene  # noqa: E402
-from helio_jax.evaluate.agreement import find_shift, normalise  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
+from helio_jax.inverse.linear import signal_of  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
-from helio_jax.reconstruct.linear import signal_of  # noqa: E402
+from helio_jax.scores.agreement import find_shift, normalise  # noqa: E402
+from helio_jax.workflows.compare import raster_of  # noqa: E402
+from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 
 STEP_DEG, STEP_UM = 1.0, 100.0
 """Steps of the derivatives; places by a quarter of a pixel."""

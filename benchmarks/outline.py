@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
-from helio_jax.comparison import raster_of  # noqa: E402
-from helio_jax.config import load_scene  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.workflows.compare import raster_of  # noqa: E402
+from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 
 CAPS = 0.86, 1.0
 """Cap heights that are simulated, as shares of the scene's."""

@@ -27,19 +27,19 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.error_bars import coverage_row, efficiency_row  # noqa: E402
 from benchmarks.rows import with_origin  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
-from helio_jax.config import SceneFile, load_scene  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
+from helio_jax.forward.form_factor import SpotGeometry  # noqa: E402
+from helio_jax.forward.masking import hidden_form_factor  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
+from helio_jax.inverse.methods import reconstruct_stack  # noqa: E402
+from helio_jax.inverse.problem import Refiner  # noqa: E402
+from helio_jax.inverse.residuals import Prediction, Surface  # noqa: E402
+from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
-from helio_jax.predict import make_predictor  # noqa: E402
-from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
-from helio_jax.reconstruct.model import Prediction, Surface  # noqa: E402
-from helio_jax.reconstruct.refiner import Refiner  # noqa: E402
-from helio_jax.reconstruct.settings import ReconstructSettings  # noqa: E402
-from helio_jax.reconstruct.solve import reconstruct_stack  # noqa: E402
-from helio_jax.reconstruct.visibility import hidden_form_factor  # noqa: E402
-from helio_jax.truth import true_height  # noqa: E402
+from helio_jax.workflows.corrections import make_predictor  # noqa: E402
+from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
+from helio_jax.workflows.truth import true_height  # noqa: E402
 
 Case = dict[str, Any]
 SCENES = ROOT / "scenes"
@@ -276,7 +276,7 @@ def ablation_row(record: Record, seed: int, size: int) -> None:
             def work(name=name, case=case, refine=refine, change=change) -> Case:
                 scene, stack = own(name, seed, **raster)
                 geometry = FarField if case == "no near field" else SpotGeometry
-                with mock.patch("helio_jax.reconstruct.solve.SpotGeometry", geometry):
+                with mock.patch("helio_jax.inverse.methods.SpotGeometry", geometry):
                     rec, seconds = changed(scene, stack, change, samples=0, **refine)
                 full = score(scene, stack, rec, seconds)
                 return {key: full[key] for key in ("rms_all", "rms_valid", "height", "seconds")}

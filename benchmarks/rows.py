@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from helio_jax import provenance
+from helio_jax.workflows import provenance
 
 Row = dict[str, object]
 PACKAGES = ("helio-jax", "numpy", "jax", "optimistix", "embreex", "numba", "h5py")

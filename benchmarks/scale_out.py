@@ -25,13 +25,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, update, write  # noqa: E402
-from helio_jax import pipeline  # noqa: E402
-from helio_jax.checkpoint import Keeper  # noqa: E402
-from helio_jax.config import SceneFile, load_scene  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.parts import Parts  # noqa: E402
 from helio_jax.trace.job import Job  # noqa: E402
 from helio_jax.trace.run import n_cpus  # noqa: E402
 from helio_jax.trace.scan import Crew  # noqa: E402
+from helio_jax.workflows.checkpoint import Keeper  # noqa: E402
+from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 
 MIB = 1024**2
 ARRAYS = ("counts", "variance", "by_order", "masked", "shadowed", "is_observed", "x", "y")

@@ -21,7 +21,6 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, update, write  # noqa: E402
 from benchmarks.tracer_plot import draw  # noqa: E402
-from helio_jax.config import load_scene  # noqa: E402
 from helio_jax.instrument import Beam, Detector, Instrument, Plate  # noqa: E402
 from helio_jax.scene.shapes import Sphere, SpheresSample, StepSample, TrenchSample  # noqa: E402
 from helio_jax.scene.surfaces import Body  # noqa: E402
@@ -30,6 +29,7 @@ from helio_jax.trace.intersect import MISS, Hits, Intersector  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
 from helio_jax.trace.tally import Estimate  # noqa: E402
+from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 
 CLAUSING = {1: 0.671984, 2: 0.514231, 5: 0.310525, 10: 0.190941}
 """Transmission probability of a tube by length / radius.

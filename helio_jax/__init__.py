@@ -25,8 +25,6 @@ Public names are loaded on first use, so that `import helio_jax` is instant.
 """
 
 import importlib
-import sys
-from types import ModuleType
 from typing import Any
 
 __version__ = "0.1.0"
@@ -38,13 +36,13 @@ _HOME = {
     "HeightMap": "heightmap",
     "Reconstruction": "reconstruction",
     "HelioError": "errors",
-    "load_scene": "config",
-    "load_instrument": "config",
-    "simulate": "pipeline",
-    "reconstruct": "pipeline",
-    "true_height": "truth",
-    "evaluate": "pipeline",
-    "run": "pipeline",
+    "load_scene": "workflows.scene_file",
+    "load_instrument": "workflows.scene_file",
+    "simulate": "workflows.pipeline",
+    "reconstruct": "workflows.pipeline",
+    "true_height": "workflows.truth",
+    "evaluate": "workflows.pipeline",
+    "run": "workflows.pipeline",
     "read": "formats.hdf5",
     "write": "formats.hdf5",
     "import_micrographs": "formats.matlab",
@@ -53,29 +51,7 @@ _HOME = {
 __all__ = [*sorted(_HOME), "__version__"]
 
 
-class _VerbFolder(ModuleType):
-    """A folder that shares its name with its verb: `hx.reconstruct(stack)` calls `pipeline.reconstruct`."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        verb = self.__name__.rpartition(".")[2]
-        return getattr(importlib.import_module("helio_jax.pipeline"), verb)(*args, **kwargs)
-
-
-class _Package(ModuleType):
-    """This package; makes the verb folders callable when the import system attaches them."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("reconstruct", "evaluate") and isinstance(value, ModuleType):
-            value.__class__ = _VerbFolder
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
-
-
 def __getattr__(name: str) -> Any:
-    if name in ("reconstruct", "evaluate"):
-        return importlib.import_module(f"helio_jax.{name}")
     if name in _HOME:
         value = getattr(importlib.import_module(f"helio_jax.{_HOME[name]}"), name)
         globals()[name] = value

@@ -5,8 +5,8 @@ import traceback
 
 from helio_jax.commands import about, heights, measured, simulating  # noqa: F401 (they register their commands)
 from helio_jax.commands.app import app, say
-from helio_jax.compiled import keep_compiled
 from helio_jax.errors import HelioError
+from helio_jax.workflows.compilation_cache import keep_compiled
 
 
 def main(args: list[str] | None = None) -> None:

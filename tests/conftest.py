@@ -36,6 +36,6 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def bshem():
     """The reference geometry: B-SHeM at 4 mm, sphere A's flat 4.72 mm below the plate."""
-    from helio_jax.config import load_scene
+    from helio_jax.workflows.scene_file import load_scene
 
     return load_scene(Path(__file__).resolve().parents[1] / "scenes" / "sphere_a.toml").instrument

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.micrograph import MicrographStack
 from helio_jax.trace import run, units
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.scan import Crew
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "sphere_a.toml"
 N_UNITS = 12

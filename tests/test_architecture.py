@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
-Order (DESIGN.md section 5), each level may import only from levels below; the stages are blind to one another:
-__main__ > commands > study, comparison, orient > pipeline, doctor > turned > predict, checkpoint, provenance, spot,
-effects, truth > config > explain > stages > scene > nouns > settings, arrays, kernel, errors.
+Each level may import only from levels below; stages of one level are blind to one another:
+commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward, trace, formats > scene >
+nouns > settings, arrays, kernel, errors.
 """
 
 import ast
@@ -21,50 +21,34 @@ LEVELS = [
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},
     {"scene"},
-    {"trace", "prepare", "reconstruct", "evaluate", "formats"},
-    {"explain"},
-    {"config"},
-    {"predict", "checkpoint", "provenance", "spot", "effects", "truth"},
-    {"turned"},
-    {"pipeline", "doctor"},
-    {"study", "comparison", "orient"},
-    {"commands", "compiled"},
+    {"trace", "forward", "formats"},
+    {"inverse", "calibration", "alignment", "scores", "measure"},
+    {"figures"},
+    {"workflows"},
+    {"commands"},
     {"__main__", "__init__"},
 ]
 LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
-STAGES = LEVELS[6]
+STAGES = LEVELS[6] | LEVELS[7]
 DOORS = {
     "embreex": {"trace/intersect.py"},
     "trimesh": {"scene/sample.py", "formats/meshes.py"},
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
-    "matplotlib": {
-        f"evaluate/{name}.py"
-        for name in (
-            "figures",
-            "agreement_figure",
-            "before_after",
-            "crack_figure",
-            "overlay",
-            "pick",
-            "ripple_figure",
-            "spot",
-            "sweep",
-        )
-    },
-    "plotly": {"evaluate/interactive.py", "evaluate/report.py"},
-    "optimistix": {"reconstruct/leastsquares.py"},
-    "lineax": {"reconstruct/leastsquares.py"},
+    "optimistix": {"inverse/solver.py"},
+    "lineax": {"inverse/solver.py"},
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
     "manifold3d": {"scene/drill.py"},
-    "platformdirs": {"compiled.py"},
+    "platformdirs": {"workflows/compilation_cache.py"},
     "numba": {"kernel.py", "trace/random.py"},
 }
 FOLDERS = {
-    "jax": {"reconstruct", "doctor.py"},
-    "equinox": {"reconstruct"},
+    "jax": {"forward", "inverse", "workflows/doctor.py"},
+    "equinox": {"forward", "inverse"},
+    "matplotlib": {"figures"},
+    "plotly": {"figures"},
     "llvmlite": {"trace"},
     "typer": {"commands"},
 }
@@ -97,10 +81,10 @@ def _layer_problem(place: str, part: str, name: str) -> str | None:
     if rest[0] not in LEVEL:
         home = "import it from its own module"
         return None if part == "commands" else f"{place} imports {name} through the package's front door: {home}"
-    if part in STAGES and rest[0] in STAGES:
-        return f"{place} imports {name}: stages are blind to one another, only pipeline joins them"
+    if part in STAGES and LEVEL[rest[0]] == LEVEL[part]:
+        return f"{place} imports {name}: stages are blind to one another, only workflows/ joins them"
     if LEVEL[rest[0]] >= LEVEL[part]:
-        return f"{place} imports {name}, which lies above or beside it: move what both need down, or join in pipeline"
+        return f"{place} imports {name}, which lies above or beside it: move what both need down, or join in workflows/"
     return None
 
 
@@ -109,7 +93,7 @@ def problems(place: str, source: str) -> list[str]:
     out = []
     part = place.split("/")[0].removesuffix(".py")
     if part not in LEVEL:
-        return [f"{place} has no level: add {part!r} to LEVELS here and to DESIGN.md section 5"]
+        return [f"{place} has no level: add {part!r} to LEVELS here"]
     for name in imports(source):
         head = name.split(".")[0]
         if head in DOORS and place not in DOORS[head]:
@@ -157,8 +141,8 @@ def find_cycle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def truth_imports(source: str) -> list[str]:
-    """Return what a file of `reconstruct` imports that knows the truth: scorer, scene, tracer, or what joins them."""
-    forbidden = {"evaluate", "scene", "trace", "config", "predict", "pipeline", "study", "truth", "comparison"}
+    """Return what a file of `inverse` imports that knows the truth: scorer, scene, tracer, or what joins them."""
+    forbidden = {"scores", "figures", "scene", "trace", "workflows"}
     return [n for n in imports(source) if n.startswith("helio_jax.") and n.split(".")[1] in forbidden]
 
 
@@ -176,14 +160,14 @@ def test_imports_and_size(path):
 @pytest.mark.parametrize(
     ("place", "source"),
     [
-        ("reconstruct/refine.py", "from helio_jax.evaluate.metrics import Truth"),
-        ("trace/run.py", "from helio_jax.reconstruct.render import render_single"),
-        ("scene/scan.py", "import helio_jax.pipeline"),
-        ("evaluate/metrics.py", "import h5py"),
-        ("evaluate/figures.py", "import plotly.graph_objects as go"),
-        ("reconstruct/linear.py", "def f():\n    from matplotlib import pyplot"),
-        ("reconstruct/linear.py", "import optimistix"),
-        ("reconstruct/linear.py", "from numba import njit"),
+        ("inverse/fit.py", "from helio_jax.scores.metrics import Truth"),
+        ("trace/run.py", "from helio_jax.forward.render import render_single"),
+        ("scene/scan.py", "import helio_jax.workflows.pipeline"),
+        ("scores/metrics.py", "import h5py"),
+        ("measure/facets.py", "import plotly.graph_objects as go"),
+        ("inverse/linear.py", "def f():\n    from matplotlib import pyplot"),
+        ("inverse/linear.py", "import optimistix"),
+        ("inverse/linear.py", "from numba import njit"),
         ("trace/run.py", "import embreex"),
         ("scene/surfaces.py", "import trimesh"),
         ("formats/hdf5.py", "from pymatreader import read_mat"),
@@ -191,11 +175,11 @@ def test_imports_and_size(path):
         ("instrument.py", "from helio_jax.micrograph import MicrographStack"),
         ("errors.py", "from helio_jax.arrays import pitch"),
         ("trace/run.py", "from helio_jax import evaluate"),
-        ("reconstruct/solve.py", "from helio_jax import true_height"),
-        ("reconstruct/solve.py", "import helio_jax\ntruth = helio_jax.true_height"),
-        ("reconstruct/solve.py", "from ..evaluate import metrics"),
-        ("reconstruct/solve.py", "from __future__ import annotations"),
-        ("reconstruct/solve.py", "import jax\njax.config.update('jax_enable_x64', True)"),
+        ("inverse/methods.py", "from helio_jax import true_height"),
+        ("inverse/methods.py", "import helio_jax\ntruth = helio_jax.true_height"),
+        ("inverse/methods.py", "from ..evaluate import metrics"),
+        ("inverse/methods.py", "from __future__ import annotations"),
+        ("inverse/methods.py", "import jax\njax.config.update('jax_enable_x64', True)"),
         ("utils.py", "x = 1"),
     ],
 )
@@ -208,10 +192,10 @@ def test_checker_sees_violations(place, source):
 @pytest.mark.parametrize(
     ("place", "source"),
     [
-        ("config.py", "from helio_jax.reconstruct.settings import ReconstructSettings"),
+        ("workflows/scene_file.py", "from helio_jax.inverse.settings import ReconstructSettings"),
         ("trace/run.py", "from helio_jax.trace.tally import Tally"),
         ("formats/hdf5.py", "import h5py\nimport helio_jax\nversion = helio_jax.__version__"),
-        ("commands/heights.py", "from helio_jax import pipeline, read"),
+        ("commands/heights.py", "from helio_jax import read"),
     ],
 )
 def test_checker_lets_the_rest_pass(place, source):
@@ -232,11 +216,11 @@ def test_no_import_cycle():
     assert find_cycle(module_graph(bad)) == ["p.a", "p.b", "p.c", "p.a"]
 
 
-def test_truth_stays_out_of_reconstruct():
+def test_truth_stays_out_of_inverse():
     """No truth may enter a reconstruction: nothing of the scorer, its settings, the scene or the tracer is there."""
-    for path in (ROOT / "reconstruct").rglob("*.py"):
+    for path in (ROOT / "inverse").rglob("*.py"):
         assert truth_imports(path.read_text(encoding="utf-8")) == [], path
-    assert truth_imports("def f():\n    from helio_jax.evaluate.settings import TruthSettings")
+    assert truth_imports("def f():\n    from helio_jax.scores.settings import TruthSettings")
 
 
 def loaded_by(code: str) -> set[str]:

@@ -40,9 +40,9 @@ def info(
 @app.command()
 def validate(scene: SceneArg) -> None:
     """Check a scene file and its sample; list every error with place, value, limit and remedy."""
-    from helio_jax.config import load_scene
     from helio_jax.scene.plates import check_solid
     from helio_jax.scene.sample import check_body
+    from helio_jax.workflows.scene_file import load_scene
 
     loaded = load_scene(scene)
     loaded.read_laws()
@@ -65,7 +65,7 @@ def validate(scene: SceneArg) -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of scene files, for editors."""
-    from helio_jax.config import json_schema
+    from helio_jax.workflows.scene_file import json_schema
 
     print(json.dumps(json_schema(), indent=2))
 
@@ -73,7 +73,7 @@ def schema() -> None:
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
     """Check this installation: versions, ray engine, JAX devices, and a small trace."""
-    from helio_jax.doctor import diagnose
+    from helio_jax.workflows.doctor import diagnose
 
     found = diagnose()
     if as_json:
@@ -102,6 +102,6 @@ def fetch_data(
 @app.command()
 def cite() -> None:
     """Print how to cite this program and the papers behind it."""
-    from helio_jax.evaluate.report import CITATION
+    from helio_jax.figures.report import CITATION
 
     print("\n".join(CITATION))

@@ -93,8 +93,8 @@ class Command(TyperCommand):
             mark.check_suffix(label, path)
         outputs = [file for label, mark, path in self._given(ctx, marks, Writes) for file in mark.files(label, path)]
         if outputs:
-            from helio_jax.config import files_read
             from helio_jax.formats.safe import check_outputs
+            from helio_jax.workflows.scene_file import files_read
 
             inputs = []
             for label, mark, path in self._given(ctx, marks, Reads):

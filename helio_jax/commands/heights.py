@@ -40,9 +40,10 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Turn three or more micrographs into a height map."""
-    from helio_jax import pipeline, write
-    from helio_jax.config import load_scene
+    from helio_jax import write
     from helio_jax.formats.hdf5 import read_stack
+    from helio_jax.workflows import pipeline
+    from helio_jax.workflows.scene_file import load_scene
 
     given = load_scene(settings).reconstruct if settings else None
     images = read_stack(stack)
@@ -73,9 +74,9 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same rays."""
-    from helio_jax import pipeline
     from helio_jax.formats.hdf5 import read_height
-    from helio_jax.truth import load_truth
+    from helio_jax.workflows import pipeline
+    from helio_jax.workflows.truth import load_truth
 
     rec = read_height(height)
     found = load_truth(truth, rec, fit_center=fit_center)
@@ -100,9 +101,9 @@ def report(
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
-    from helio_jax import pipeline
     from helio_jax.formats.hdf5 import read_height, read_stack
-    from helio_jax.truth import load_truth
+    from helio_jax.workflows import pipeline
+    from helio_jax.workflows.truth import load_truth
 
     rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
@@ -143,10 +144,10 @@ def measure(
     as_json: AsJson = False,
 ) -> None:
     """Measure on a height map: facets, a profile or step, roughness, a ripple, cracks, vertical edges."""
-    from helio_jax.evaluate.crack_text import table as as_table
-    from helio_jax.evaluate.measure import Wanted, measure_height_map
     from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.formats.safe import atomic_path
+    from helio_jax.measure.crack_text import table as as_table
+    from helio_jax.workflows.measure import Wanted, measure_height_map
 
     wanted = Wanted(
         facets=facets,

@@ -42,7 +42,7 @@ def import_files(
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
     from helio_jax import MicrographSet, import_micrographs, write
-    from helio_jax.config import load_instrument
+    from helio_jax.workflows.scene_file import load_instrument
 
     given = load_instrument(instrument) if instrument else None
     stacks = tuple(import_micrographs(path, given) for path in files)
@@ -84,8 +84,8 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
-    from helio_jax.comparison import compare as compare_with_scene
     from helio_jax.formats.hdf5 import read_stack
+    from helio_jax.workflows.compare import compare as compare_with_scene
 
     found = compare_with_scene(
         read_stack(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
@@ -123,16 +123,17 @@ def align(
     as_json: AsJson = False,
 ) -> None:
     """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
-    from helio_jax import pipeline, write
+    from helio_jax import write
+    from helio_jax.alignment.align import describe
     from helio_jax.errors import SceneError
-    from helio_jax.prepare.align import describe
+    from helio_jax.workflows import pipeline
 
     if auto == (points is not None):
         raise SceneError("align needs either --points FILE.csv or --auto")
     stack, places = pipeline.align(_read_set(scans), points, **set_options(settings))
     write(stack, output)
     if figure:
-        from helio_jax.evaluate.overlay import save_overlay
+        from helio_jax.figures.overlay import save_overlay
 
         save_overlay(stack, places, figure)
     if as_json:
@@ -152,7 +153,7 @@ def pick(
     ],
 ) -> None:
     """Open a window to click the same points in all scans; every click is saved."""
-    from helio_jax.evaluate.pick import pick_points
+    from helio_jax.figures.pick import pick_points
     from helio_jax.formats.points import read_points, write_points
 
     before = read_points(output) if output.exists() else {}
@@ -177,7 +178,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Estimate background, gain, drift and noise of a measured scan; the fit goes on from these estimates."""
-    from helio_jax.pipeline import calibrate_file
+    from helio_jax.workflows.pipeline import calibrate_file
 
     own = {"drift": drift, "lines": lines, "noise_model": noise_model}
     given = set_options(settings, **own, spike_limit=spike_limit, masked_share=masked_share)
@@ -223,7 +224,7 @@ def orient(
     """Find by quick fits how a file's arrays lie and which image is which detector's, and put them right."""
     from helio_jax import write
     from helio_jax.formats.hdf5 import read_stack
-    from helio_jax.orient import OrientSettings, find_orientation
+    from helio_jax.workflows.orient import OrientSettings, find_orientation
 
     names = None if detectors is None else tuple(name.strip() for name in detectors.split(","))
     asked = OrientSettings().changed(**set_options(settings, turn_deg=turn, mirror=mirror, detectors=names))

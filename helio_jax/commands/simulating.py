@@ -53,8 +53,8 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
-    from helio_jax.pipeline import Crew
-    from helio_jax.pipeline import run as run_scene
+    from helio_jax.workflows.pipeline import Crew
+    from helio_jax.workflows.pipeline import run as run_scene
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
     crew = Crew(workers, processes, scheduler)
@@ -86,7 +86,7 @@ def simulate(
     restart: Restart = False,
 ) -> None:
     """Trace the micrographs of a scene and write them to an HDF5 file; if interrupted, give it again to go on."""
-    from helio_jax.pipeline import Crew, SimulateOptions, simulate_file
+    from helio_jax.workflows.pipeline import Crew, SimulateOptions, simulate_file
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
     with Bar("tracing") as bar:
@@ -118,10 +118,10 @@ def rays(
     seed: Seed = None,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
-    from helio_jax.config import load_scene
     from helio_jax.formats.columns import write_columns
     from helio_jax.trace.follow import follow_scene
     from helio_jax.trace.tally import FATES
+    from helio_jax.workflows.scene_file import load_scene
 
     loaded = load_scene(scene, given_options(**{"trace.rays": n, "trace.seed": seed}))
     atoms = follow_scene(loaded, loaded.trace, pixel, view)
@@ -139,10 +139,10 @@ def resume(
     ],
 ) -> None:
     """Go on with what was interrupted or killed; no unit that was finished is traced again."""
-    from helio_jax.pipeline import resume as resume_run
+    from helio_jax.workflows.pipeline import resume as resume_run
 
     if (path / "study.json").is_file():
-        from helio_jax.study import resume_study
+        from helio_jax.workflows.study import resume_study
 
         print(resume_study(path, say=say))
         return
@@ -165,8 +165,8 @@ def study(
     scheduler: Scheduler = None,
 ) -> None:
     """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
-    from helio_jax.pipeline import Crew, SimulateOptions
-    from helio_jax.study import run_study
+    from helio_jax.workflows.pipeline import Crew, SimulateOptions
+    from helio_jax.workflows.study import run_study
 
     options = SimulateOptions(crew=Crew(workers, processes, scheduler), shard=shard, say=say)
     print(run_study(file, output, resume=go_on, options=options))
@@ -182,9 +182,9 @@ def spot(
     as_json: AsJson = False,
 ) -> None:
     """Measure the beam's spot at one or more heights above the reference plane, and draw it."""
-    from helio_jax.config import load_scene
     from helio_jax.errors import SceneError
-    from helio_jax.spot import draw_spot
+    from helio_jax.workflows.scene_file import load_scene
+    from helio_jax.workflows.spot import draw_spot
 
     try:
         at = [float(text) for text in heights.split(",")]
@@ -215,9 +215,9 @@ def plate(
     ] = None,
 ) -> None:
     """Make the watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
-    from helio_jax.config import load_instrument
     from helio_jax.formats.safe import atomic_path
     from helio_jax.scene.drill import drill_plate
+    from helio_jax.workflows.scene_file import load_instrument
 
     angle = None if channel_deg is None else math.radians(channel_deg)
     found = drill_plate(load_instrument(instrument), thickness_um, radius_um, angle)

@@ -1,6 +1,6 @@
 """A scene: instrument, sample and scan, checked against each other. What `simulate` needs and nothing else.
 
-Frames and units: DESIGN.md section 1. A scene file has further tables; `helio_jax.config.SceneFile` adds them.
+Frames and units: DESIGN.md section 1. A scene file has further tables: `helio_jax.workflows.scene_file.SceneFile`.
 """
 
 import math

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from helio_jax import read, write
-from helio_jax.config import load_instrument
 from helio_jax.instrument import Uncertainty
+from helio_jax.workflows.scene_file import load_instrument
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -17,13 +17,14 @@ from typer.core import TyperCommand
 from typer.testing import CliRunner
 
 import helio_jax.__main__  # noqa: F401 (registers the commands)
-from helio_jax import comparison, pipeline, study
 from helio_jax.commands import measured, simulating
 from helio_jax.commands.app import app
 from helio_jax.commands.door import Command, Reads, Writes, marks_of
-from helio_jax.config import files_read
 from helio_jax.errors import SceneError
 from helio_jax.formats.parts import Parts
+from helio_jax.workflows import compare as comparison
+from helio_jax.workflows import pipeline, study
+from helio_jax.workflows.scene_file import files_read
 
 COMMANDS: dict[str, typing.Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 MARKS = {name: marks_of(command.callback) for name, command in COMMANDS.items()}

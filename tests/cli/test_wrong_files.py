@@ -6,11 +6,11 @@ from typer.testing import CliRunner
 
 from helio_jax import MicrographSet, MicrographStack, Reconstruction, write
 from helio_jax.commands.app import app
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, ResumeError
 from helio_jax.formats.hdf5 import describe
 from helio_jax.instrument import Detector, Instrument, Plate
-from helio_jax.pipeline import resume
+from helio_jax.workflows.pipeline import resume
+from helio_jax.workflows.scene_file import load_scene
 
 
 @pytest.fixture(scope="module")

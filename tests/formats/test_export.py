@@ -7,13 +7,13 @@ from scale import SCENE
 from typer.testing import CliRunner
 
 from helio_jax.__main__ import app
-from helio_jax.config import load_scene
 from helio_jax.errors import SceneError
 from helio_jax.formats.export import export
 from helio_jax.formats.hdf5 import write
 from helio_jax.formats.matlab import import_micrographs
 from helio_jax.micrograph import MicrographSet
-from helio_jax.pipeline import record, simulate
+from helio_jax.workflows.pipeline import record, simulate
+from helio_jax.workflows.scene_file import load_scene
 
 SMALL = {"scan.nx": 7, "scan.ny": 5, "scan.pixel_size_um": 300.0, "scan.center_um": [40.0, -30.0], "trace.maps": False}
 

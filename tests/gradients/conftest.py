@@ -2,8 +2,8 @@
 
 import pytest
 
+from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
-from helio_jax.reconstruct.formfactor import SpotGeometry
 
 
 @pytest.fixture(scope="module")

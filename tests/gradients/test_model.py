@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.readout import ScanOrder
 from helio_jax.instrument import Uncertainty
-from helio_jax.reconstruct.background import ScanOrder
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import INSTRUMENT, Prediction, Surface
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
-from helio_jax.reconstruct.uncertainty import linearise
+from helio_jax.inverse.posterior import linearise
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.residuals import INSTRUMENT, Prediction, Surface
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from tests.derivatives import adjoint_products, taylor_remainders
 
 SHAPE, PITCH = (9, 11), 30.0

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.visibility import hidden_form_factor
+from helio_jax.forward.masking import hidden_form_factor
 from tests.derivatives import adjoint_products, taylor_remainders
 
 DX, DY = 12.0, 9.0

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.edges import find_edges, kink_size, one_sided, to_pixels
-from helio_jax.reconstruct.validity import depth_jumps
+from helio_jax.inverse.edges import find_edges, kink_size, one_sided, to_pixels
+from helio_jax.inverse.quality import depth_jumps
 
 NOISE, PITCH = 0.05, 10.0
 

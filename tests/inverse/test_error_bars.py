@@ -8,7 +8,7 @@ from scipy import stats
 
 from benchmarks import error_bars as study
 from benchmarks.reconstruction import Record
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.inverse.settings import ReconstructSettings
 from tests.stats import assert_likely
 
 SIZE = 24

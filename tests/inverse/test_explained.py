@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from helio_jax.reconstruct.validity import ill_explained, reasons_from_fit
+from helio_jax.inverse.quality import ill_explained, reasons_from_fit
 
 SHAPE = (3, 100, 80)
 ALL = np.ones(SHAPE, bool)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.micrograph import MicrographStack
-from helio_jax.truth import true_height
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_height
 
 STEP = Path(__file__).parents[2] / "scenes" / "step.toml"
 

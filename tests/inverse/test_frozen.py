@@ -40,16 +40,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # this very working tree, also where it is run as a script
 
-from helio_jax import pipeline, turned  # noqa: E402
 from helio_jax.arrays import pitch  # noqa: E402
-from helio_jax.config import load_instrument, load_scene  # noqa: E402
+from helio_jax.forward.beam_frame import slopes_of_normal  # noqa: E402
+from helio_jax.forward.form_factor import SpotGeometry  # noqa: E402
+from helio_jax.forward.masking import hidden_form_factor, hidden_response  # noqa: E402
 from helio_jax.instrument import Instrument, Uncertainty  # noqa: E402
+from helio_jax.inverse.residuals import Prediction  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
-from helio_jax.reconstruct.beamframe import slopes_of_normal  # noqa: E402
-from helio_jax.reconstruct.formfactor import SpotGeometry  # noqa: E402
-from helio_jax.reconstruct.model import Prediction  # noqa: E402
-from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
+from helio_jax.workflows import calibrate_rotated as turned  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
+from helio_jax.workflows.scene_file import load_instrument, load_scene  # noqa: E402
 from tests import compilations  # noqa: E402
 
 FILE = Path(__file__).with_name("frozen.npz")

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.render import LEAST_COS, render_single
 from helio_jax.instrument import Uncertainty
-from helio_jax.reconstruct import refine
-from helio_jax.reconstruct.findings import _plain
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Prediction, Surface
-from helio_jax.reconstruct.render import LEAST_COS, render_single
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.shadows import shadow_edges
-from helio_jax.reconstruct.uncertainty import disagreement
+from helio_jax.inverse import fit as refine
+from helio_jax.inverse.instrument_report import _plain
+from helio_jax.inverse.occlusion import shadow_edges
+from helio_jax.inverse.posterior import disagreement
+from helio_jax.inverse.residuals import Prediction, Surface
+from helio_jax.inverse.settings import ReconstructSettings
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])

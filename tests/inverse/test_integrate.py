@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.reconstruct import integrate_bilateral, integrate_jumps, integrate_poisson, integrate_sylvester
-from helio_jax.reconstruct.integrate import integrate_slopes, integrate_with_jumps
+from helio_jax.inverse import integrate_bilateral, integrate_jumps, integrate_poisson, integrate_sylvester
+from helio_jax.inverse.integrate import integrate_slopes, integrate_with_jumps
 
 INTEGRATORS = {
     "weighted": {"method": "weighted"},

@@ -5,19 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
+from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.instrument import Uncertainty
+from helio_jax.inverse.bootstrap import as_at_border, what_is_left_out
+from helio_jax.inverse.linear import solve_linear
+from helio_jax.inverse.nearfield import photometric_heights
+from helio_jax.inverse.residuals import Prediction
+from helio_jax.inverse.samples import also_off_by
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.bootstrap import as_at_border, what_is_left_out
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.linear import solve_linear
-from helio_jax.reconstruct.model import Prediction
-from helio_jax.reconstruct.photometric import photometric_heights
-from helio_jax.reconstruct.samples import also_off_by
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.truth import true_height
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_height
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 N_RAYS = 20_000.0
@@ -59,7 +59,7 @@ def test_deviations_are_those_of_repeated_scans(bshem):
 def test_a_thinned_raster_states_the_same(bshem, monkeypatch):
     """Every second row and column: within 25 %, where samples that keep a pixel's noise would be twice as wide."""
     full = heights(flat_scan(bshem, 0), samples=64)
-    monkeypatch.setattr("helio_jax.reconstruct.bootstrap.MAX_PIXELS", 200)
+    monkeypatch.setattr("helio_jax.inverse.bootstrap.MAX_PIXELS", 200)
     thin = heights(flat_scan(bshem, 0), samples=64)
     assert thin.height_samples.shape == full.height_samples.shape
     mean = [np.sqrt(np.mean(rec.height_std**2)) for rec in (full, thin)]

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.errors import GuardError
+from helio_jax.inverse import methods as solve
+from helio_jax.inverse.levels import GAIN, Levels, at_level, search_levels
+from helio_jax.inverse.regions import find_plateaus, joined, unexplained
+from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct import solve
-from helio_jax.reconstruct.levels import GAIN, Levels, at_level, search_levels
-from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.plateaus import find_plateaus, joined, unexplained
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.truth import true_height
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_height
 
 SHAPE = (40, 60)
 INSIDE = np.zeros(SHAPE, bool)
@@ -197,7 +197,7 @@ def test_a_plateau_that_cannot_be_fitted_is_flagged(bshem, monkeypatch):
             return fit
         raise GuardError("too steep")
 
-    monkeypatch.setattr("helio_jax.reconstruct.refine.fit_heights", fit_heights)
+    monkeypatch.setattr("helio_jax.inverse.fit.fit_heights", fit_heights)
     monkeypatch.setattr(solve, "search_levels", lambda region, surface, *args: Levels(surface, [1], []))
     fit, is_undecided = solve._with_plateaus(
         stack, ReconstructSettings(), None, lambda n: None, None, start, start, None

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
+from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError
+from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.fit import status_of
+from helio_jax.inverse.linear import solve_known_albedo, solve_linear
+from helio_jax.inverse.residuals import Prediction
 from helio_jax.micrograph import MicrographStack
-from helio_jax.prepare.calibrate import CalibrateSettings, calibrate_on_border
-from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.linear import solve_known_albedo, solve_linear
-from helio_jax.reconstruct.model import Prediction
-from helio_jax.reconstruct.refine import status_of
-from helio_jax.truth import true_height
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_height
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 

@@ -4,14 +4,14 @@ import jax
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.background import ScanOrder
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Prediction, Surface
-from helio_jax.reconstruct.refine import fit_heights
-from helio_jax.reconstruct.refiner import LEVEL_STEP, SCALE_STEP, TILT_STEP, Refiner
-from helio_jax.reconstruct.render import render_single
-from helio_jax.reconstruct.rounds import aitken, left_to_go
-from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.readout import ScanOrder
+from helio_jax.forward.render import render_single
+from helio_jax.inverse.convergence import aitken, left_to_go
+from helio_jax.inverse.fit import fit_heights
+from helio_jax.inverse.problem import LEVEL_STEP, SCALE_STEP, TILT_STEP, Refiner
+from helio_jax.inverse.residuals import Prediction, Surface
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 SHAPE, PITCH = (24, 20), 30.0
 

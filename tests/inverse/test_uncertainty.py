@@ -7,19 +7,19 @@ import pytest
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
 
-from helio_jax import pipeline
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.reconstruct.uncertainty import (
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.posterior import (
     Linearised,
     ModelError,
     exact_height_covariance,
     linearise,
     sample_posterior,
 )
-from helio_jax.reconstruct.validity import floating, regions
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.quality import floating, regions
+from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.workflows import pipeline
 
 
 def random_problem(shape=(4, 5), n_parameters=3, n_plateaus=2, seed=0) -> Linearised:

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_instrument, load_scene
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor
 from helio_jax.scene.runout import run_out
 from helio_jax.scene.surfaces import surface_body
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.scene_file import load_instrument, load_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 STEP = SCENES / "step.toml"

@@ -5,15 +5,15 @@ import pytest
 from scale import SCENE, SMALL
 from stats import assert_mean
 
-from helio_jax.config import load_scene
 from helio_jax.errors import SceneError
-from helio_jax.pipeline import simulate
 from helio_jax.scene.shapes import TrenchSample
 from helio_jax.trace.converge import trace_to_target
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.transport import trace_block
+from helio_jax.workflows.pipeline import simulate
+from helio_jax.workflows.scene_file import load_scene
 
 SETTINGS = TraceSettings(rays=16, branches=2, target_error=0.03, max_rays=1024, n_orders=2)
 

@@ -9,7 +9,6 @@ from stats import assert_likely, pooled_chi2
 from typer.testing import CliRunner
 
 from helio_jax.__main__ import app
-from helio_jax.config import load_scene
 from helio_jax.errors import SceneError
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.shapes import FlatSample, TrenchSample
@@ -19,6 +18,7 @@ from helio_jax.trace.follow import Atoms, follow_atoms, follow_scene
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED, FATES
+from helio_jax.workflows.scene_file import load_scene
 
 RUNNER = CliRunner()
 

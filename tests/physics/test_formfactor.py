@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helio_jax.forward.form_factor import SpotGeometry, form_factor_of_height
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
-from helio_jax.reconstruct.formfactor import SpotGeometry, form_factor_of_height
 from helio_jax.trace.direct import form_factors
 
 

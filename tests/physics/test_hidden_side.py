@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
+from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor
-from helio_jax.reconstruct.formfactor import SpotGeometry
 from helio_jax.scene.sample import check_body
 from helio_jax.scene.surfaces import behind_rims, first_hit_spheres, hollowed, surface_body
-from helio_jax.truth import true_surface
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_surface
 
 ROOT = Path(__file__).resolve().parents[2]
 TAN30 = np.tan(np.deg2rad(30.0))

@@ -7,15 +7,15 @@ import jax
 import numpy as np
 import pytest
 
-from helio_jax.config import load_scene
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.radiosity import Radiosity, transfer
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.indirect import Radiosity, transfer
 from helio_jax.trace.denoise import smooth_along_surface
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import first_hits
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.scene_file import load_scene
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 SIDE = Detector(name="side", polar_deg=40.0, half_angle_deg=10.0)
@@ -82,7 +82,9 @@ def predictions(name: str, **changes):
     hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     height, normals = hits.point[:, 2].reshape(grid_x.shape), hits.normal.reshape(*grid_x.shape, 3)
     stack = MicrographStack(np.zeros((3, *height.shape)), x, y, scene.instrument)
-    with mock.patch("helio_jax.predict.UNSEEN_SHARES", (0.0, 0.0)):  # the sheet along the beam, as radiosity has it
+    with mock.patch(
+        "helio_jax.workflows.corrections.UNSEEN_SHARES", (0.0, 0.0)
+    ):  # the sheet along the beam, as radiosity has it
         traced, ours = (
             make_predictor(stack, 2_000_000, scene.flat_size, multiple=model)(height, normals).multiple
             for model in ("traced", "radiosity")

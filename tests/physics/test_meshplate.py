@@ -10,9 +10,7 @@ from scipy.stats import chi2
 from stats import assert_likely, assert_mean
 
 from benchmarks import tracer
-from helio_jax import pipeline
 from helio_jax.__main__ import main
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, MissingDependencyError, SceneError
 from helio_jax.formats.hdf5 import read
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
@@ -26,6 +24,8 @@ from helio_jax.trace.job import Job
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 H = 1000.0
@@ -305,7 +305,7 @@ def test_what_is_refused(tmp_path):
 
 def test_the_mesh_stays_beside_its_instrument(tmp_path):
     """A scene elsewhere extends an instrument file with a plate: the mesh is found beside it. Catches a lost folder."""
-    from helio_jax.config import load_instrument
+    from helio_jax.workflows.scene_file import load_instrument
 
     folder = tmp_path / "instruments"
     folder.mkdir()

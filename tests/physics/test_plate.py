@@ -15,13 +15,13 @@ from scipy.special import j0, k1
 from scipy.stats import chi2
 from stats import assert_likely, assert_mean
 
-from helio_jax.config import load_scene
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.scattering import BroadSpecularLaw, CosineLaw
 from helio_jax.scene.shapes import FlatSample, Sphere, SpheresSample
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED
+from helio_jax.workflows.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 H = 1000.0

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.render import render_single
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.render import render_single
 from helio_jax.scene.shapes import Sphere, SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres
 from helio_jax.trace.run import make_experiment, trace_pixels

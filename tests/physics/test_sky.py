@@ -12,8 +12,6 @@ from pydantic import ValidationError
 from scipy.stats import chi2
 from stats import assert_likely, assert_mean
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.errors import SceneError
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
@@ -22,6 +20,8 @@ from helio_jax.scene.shapes import FlatSample, TrenchSample
 from helio_jax.trace.masks import hidden_form_factor
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 HERE = np.zeros(1)

@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from scipy.special import gamma, j0, kv
 from stats import assert_mean
 
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.instrument import Beam, Detector, Effusive, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
@@ -24,6 +23,7 @@ from helio_jax.trace.direct import form_factors
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows.scene_file import load_scene
 
 H = 1000.0
 HOLE = Detector(name="hole", center_um=(H, 0.0), axes_um=(60.0, 60.0))
@@ -202,7 +202,7 @@ def test_footprint_widths(azimuth):
     grow as 1 / cos t, but the pinhole's disc, which lies in the plate, does not. To 1 %, by 32768 low-discrepancy rays.
     Catches a spot measured across the beam where the plane is meant, axes exchanged, and a height that is not heeded.
     """
-    from helio_jax.evaluate.spot import measure_spot
+    from helio_jax.figures.spot import measure_spot
     from helio_jax.trace.source import footprint
 
     cos = np.cos(np.radians(40.0))
@@ -225,7 +225,7 @@ def test_draw_spot(tmp_path):
 
     Catches: a header that does not hold, heights from the plate downwards, no figure.
     """
-    from helio_jax.spot import draw_spot
+    from helio_jax.workflows.spot import draw_spot
 
     scene = load_scene(Path(__file__).parents[2] / "scenes" / "nano.toml")
     low, high = draw_spot(scene, [0.0, 72.0], tmp_path / "spot.png")

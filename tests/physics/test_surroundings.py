@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from helio_jax.config import load_instrument
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor
 from helio_jax.scene.surfaces import pyramid_body
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.scene_file import load_instrument
 
 ASHEM = Path(__file__).parents[2] / "scenes" / "instruments" / "ashem_normal.toml"
 

@@ -6,10 +6,10 @@ The quadrature knows no beam frame: it integrates over the part of an ellipse be
 import numpy as np
 import pytest
 
+from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.masking import hidden_form_factor, hidden_response
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
-from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.visibility import hidden_form_factor, hidden_response
 from helio_jax.scene.surfaces import first_hit_spheres, surface_body
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.masks import hidden_form_factor as hidden_by_rays

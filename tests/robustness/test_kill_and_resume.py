@@ -12,10 +12,10 @@ import pytest
 from scale import N_UNITS, SCENE, SMALL, assert_same_bits, run_logged
 
 import helio_jax as hx
-from helio_jax import pipeline
 from helio_jax.errors import InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.formats.parts import Parts
 from helio_jax.trace.scan import Crew
+from helio_jax.workflows import pipeline
 
 KILLS = 20
 UNIT_PIXELS = 360 // N_UNITS

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from helio_jax.evaluate.metrics import Region, Truth
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.scores.metrics import Region, Truth
 
 RADIUS, CAP = 1000.0, 720.0
 TAN = np.tan(np.radians(30.0))

@@ -5,20 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
+from helio_jax.alignment.align import AlignSettings, _stage_errors, align_scans, find_motions
+from helio_jax.alignment.automatic import Aligner
+from helio_jax.alignment.control_points import fit_points, rms
+from helio_jax.alignment.correlate import correlate_masked, find_peak
+from helio_jax.alignment.resample import resample
+from helio_jax.alignment.rigid import Rigid, about, fit_rigid, separation
+from helio_jax.alignment.views import View
+from helio_jax.calibration.self_calibration import SelfCalibrateSettings, effective_instrument, self_calibrate
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.evaluate.pick import Picker
+from helio_jax.figures.pick import Picker
 from helio_jax.formats.points import read_points, write_points
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.prepare.align import AlignSettings, _stage_errors, align_scans, find_motions
-from helio_jax.prepare.autoalign import Aligner
-from helio_jax.prepare.correlate import correlate_masked, find_peak
-from helio_jax.prepare.points import fit_points, rms
-from helio_jax.prepare.resample import resample
-from helio_jax.prepare.rigid import Rigid, about, fit_rigid, separation
-from helio_jax.prepare.selfcalibrate import SelfCalibrateSettings, effective_instrument, self_calibrate
-from helio_jax.prepare.views import View
+from helio_jax.workflows import pipeline
 
 PITCH = 20.0
 POLAR = 46.0
@@ -148,7 +148,7 @@ def _quick_fit(picks, views):
     """The same fit without its leave-one-out errors, which take most of the time."""
     from unittest import mock
 
-    with mock.patch("helio_jax.prepare.points._left_out", return_value=math.nan):
+    with mock.patch("helio_jax.alignment.control_points._left_out", return_value=math.nan):
         return fit_points(picks, views)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.linear import solve_linear
+from helio_jax.inverse.linear import solve_linear
 
 POLAR, LEAN = np.radians(46.0), np.radians(60.0)
 

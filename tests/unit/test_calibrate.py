@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from helio_jax.arrays import border_mask
+from helio_jax.calibration.noise_model import NoiseModel, estimate_noise, find_spikes, line_noise
 from helio_jax.errors import InputFileError, SceneError
+from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.micrograph import MicrographStack
-from helio_jax.pipeline import calibrate
-from helio_jax.prepare.faults import NoiseModel, estimate_noise, find_spikes, line_noise
-from helio_jax.reconstruct.background import ScanOrder, drift_modes
+from helio_jax.workflows.pipeline import calibrate
 
 
 def measured(bshem, counts, fast_axis="x", **fields) -> MicrographStack:

@@ -8,11 +8,11 @@ from scipy.stats import chi2 as chi2_law
 from stats import assert_likely
 
 from helio_jax import load_scene, simulate
-from helio_jax.comparison import compare
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.evaluate.agreement import Terms, find_shift, lagged, normalise
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.scores.agreement import Terms, find_shift, lagged, normalise
+from helio_jax.workflows.compare import compare
 
 SCENE = """
 name = "cap"

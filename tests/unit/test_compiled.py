@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from helio_jax.compiled import keep_compiled
+from helio_jax.workflows.compilation_cache import keep_compiled
 
 NAME = "JAX_COMPILATION_CACHE_DIR"
 
@@ -18,7 +18,7 @@ def home(tmp_path, monkeypatch):
     for key in [NAME, "JAX_COMPILATION_CACHE_MAX_SIZE", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"]:
         monkeypatch.setenv(key, "")  # remembered, so that it is restored
         monkeypatch.delenv(key)
-    monkeypatch.setattr("helio_jax.compiled.user_cache_path", lambda name: tmp_path / name)
+    monkeypatch.setattr("helio_jax.workflows.compilation_cache.user_cache_path", lambda name: tmp_path / name)
     return tmp_path
 
 
@@ -26,7 +26,7 @@ def test_one_folder_per_processor_and_the_users_own_choice_wins(home, monkeypatc
     folder = keep_compiled()
     assert folder is not None and folder.is_relative_to(home / "helio_jax") and os.environ[NAME] == str(folder)
     monkeypatch.delenv(NAME)
-    monkeypatch.setattr("helio_jax.compiled._processor", lambda: "another")
+    monkeypatch.setattr("helio_jax.workflows.compilation_cache._processor", lambda: "another")
     other = keep_compiled()
     assert other is not None and other != folder and other.parent == folder.parent
     monkeypatch.setenv(NAME, "")

@@ -11,10 +11,9 @@ import pytest
 from pydantic import BaseModel
 
 import helio_jax as hx
-from helio_jax.config import SceneFile
+from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruct.beamframe import normal_of_slopes, slopes_of_normal
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.scene.scan import Raster
 from helio_jax.scene.scene import Scene
@@ -24,6 +23,7 @@ from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import first_hits
 from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows.scene_file import SceneFile
 
 TAN = math.tan(math.radians(30.0))
 CENTER = (350.0, 200.0)

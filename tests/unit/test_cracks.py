@@ -11,10 +11,10 @@ from stats import assert_likely
 from test_lines import AXIS, GRID_X, GRID_Y, NOISE, PITCH, SIZE, instrument, make_stack, nuisance
 
 from helio_jax.errors import SceneError
-from helio_jax.evaluate.crack_text import table
-from helio_jax.evaluate.cracks import find_cracks
-from helio_jax.evaluate.measure import Wanted, measure_height_map
+from helio_jax.measure.crack_text import table
+from helio_jax.measure.cracks import find_cracks
 from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.workflows.measure import Wanted, measure_height_map
 
 EVERYWHERE = [np.ones((SIZE, SIZE), bool)]
 TURN = math.radians(33.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.edges import bend_of, bent, trapezoid_gap
+from helio_jax.inverse.edges import bend_of, bent, trapezoid_gap
 
 NOISE, PITCH = 0.05, 10.0
 

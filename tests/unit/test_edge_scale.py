@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.beamframe import normal_of_slopes
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.forward.beam_frame import normal_of_slopes
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.settings import ReconstructSettings
 
 
 def noise(geometry, height, gain, sigma):

@@ -7,9 +7,9 @@ import pytest
 from sphere_case import CAP, TAN, make_case
 
 from helio_jax.errors import SceneError
-from helio_jax.evaluate import figures
-from helio_jax.evaluate.metrics import evaluate_height
+from helio_jax.figures import panel as figures
 from helio_jax.reconstruction import REASONS
+from helio_jax.scores.metrics import evaluate_height
 
 PNG = b"\x89PNG"
 

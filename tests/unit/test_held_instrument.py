@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings, RefineSettings
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 
 def test_albedo_is_fitted_while_gains_are_held(bshem):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from helio_jax.detector import Aperture, Detector, cone_ellipse
+from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.instrument import Beam, Instrument, Plate
-from helio_jax.reconstruct.formfactor import SpotGeometry
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from helio_jax.config import load_instrument, load_scene
 from helio_jax.errors import SceneError
 from helio_jax.formats.toml import write_instrument
 from helio_jax.instrument import Uncertainty
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.workflows.scene_file import load_instrument, load_scene
 
 SURE = Uncertainty(polar_deg=5.0, azimuth_deg=3.0, tilt_deg=0.5)
 AIM = np.radians([[4.0, -2.0], [-3.0, 1.0], [2.0, 2.5]])

@@ -8,9 +8,9 @@ from scipy import stats
 from stats import assert_likely
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.evaluate.line_paths import Path, trace_lines
-from helio_jax.evaluate.lines import LineSettings, contrast_of, euler_density, find_lines, kernel
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.measure.line_paths import Path, trace_lines
+from helio_jax.measure.lines import LineSettings, contrast_of, euler_density, find_lines, kernel
 from helio_jax.micrograph import MicrographStack
 
 PITCH, SIZE = 20.0, 80

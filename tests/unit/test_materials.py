@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.scene.files import read_scattering_table
 from helio_jax.scene.sample import MeshSample
@@ -12,6 +10,8 @@ from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import make_experiment
 from helio_jax.trace.scan import trace_scene
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
 
 SCENE = """
 [plate]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.evaluate.facets import find_facets
-from helio_jax.evaluate.measure import Wanted, measure_height_map, reconstructed_area
-from helio_jax.evaluate.roughness import measure_profile, measure_roughness, measure_step
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.measure.facets import find_facets
+from helio_jax.measure.roughness import measure_profile, measure_roughness, measure_step
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.workflows.measure import Wanted, measure_height_map, reconstructed_area
 
 PITCH = 20.0
 TILT = math.degrees(math.acos(1 / math.sqrt(3)))

@@ -8,7 +8,7 @@ import pytest
 from sphere_case import CAP, TAN, first_hit, make_case
 
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.evaluate.metrics import (
+from helio_jax.scores.metrics import (
     SCORE_ROWS,
     Region,
     Truth,

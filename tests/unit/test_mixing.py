@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Surface
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.settings import ReconstructSettings
 
 
 @pytest.mark.parametrize("border", ["free", "flat"])

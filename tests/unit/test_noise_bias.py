@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Model, Surface
-from helio_jax.reconstruct.noisebias import noise_bias
-from helio_jax.reconstruct.refiner import Refiner
-from helio_jax.reconstruct.settings import ReconstructSettings
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.noise_bias import noise_bias
+from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.residuals import Model, Surface
+from helio_jax.inverse.settings import ReconstructSettings
 
 SHAPE = (20, 20)
 

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from helio_jax.alignment.albedo_prior import _OUTLIER, _POLAR_STD, _Fit, _redescending, align_one_albedo
+from helio_jax.alignment.align import align_scans, find_motions
+from helio_jax.alignment.rigid import Rigid, separation
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.prepare.align import align_scans, find_motions
-from helio_jax.prepare.onealbedo import _OUTLIER, _POLAR_STD, _Fit, _redescending, align_one_albedo
-from helio_jax.prepare.rigid import Rigid, separation
 
 PITCH, POLAR = 20.0, math.radians(46.0)
 HILLS = ((-250.0, 120.0, 140.0, 0.9), (200.0, 260.0, 110.0, -0.8), (150.0, -230.0, 170.0, 0.7))

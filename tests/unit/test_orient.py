@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax import import_micrographs, pipeline, read, write
+from helio_jax import import_micrographs, read, write
 from helio_jax.__main__ import main
-from helio_jax.config import load_instrument, load_scene
+from helio_jax.alignment.arrangement import Candidate, group_ties, orders_tried
+from helio_jax.alignment.orientation import ALL_TURNS, Turn, bin_stack, instrument_symmetries, turn_stack
 from helio_jax.errors import GuardError, InputFileError, SceneError
+from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.inverse.consistency import misfit
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.orient import Entry, OrientSettings, Ranking, find_orientation
-from helio_jax.prepare.arrangement import Candidate, group_ties, orders_tried
-from helio_jax.prepare.turn import ALL_TURNS, Turn, bin_stack, instrument_symmetries, turn_stack
-from helio_jax.reconstruct.consistency import misfit
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.settings import ReconstructSettings
 from helio_jax.scene.scan import Raster
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.orient import Entry, OrientSettings, Ranking, find_orientation
+from helio_jax.workflows.scene_file import load_instrument, load_scene
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 QUICK = ReconstructSettings(method="nearfield", integrator="dct_poisson", rounds=3)

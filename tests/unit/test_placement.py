@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from stats import assert_likely
 
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import write
-from helio_jax.pipeline import simulate
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.surfaces import first_hit_spheres
-from helio_jax.truth import true_height
+from helio_jax.workflows.pipeline import simulate
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.truth import true_height
 
 SCENE = """
 [plate]

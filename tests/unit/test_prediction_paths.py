@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.inverse.methods import START_THRIFT, reconstruct_stack
+from helio_jax.inverse.residuals import Prediction
+from helio_jax.inverse.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.predict import make_predictor
-from helio_jax.reconstruct.formfactor import SpotGeometry
-from helio_jax.reconstruct.model import Prediction
-from helio_jax.reconstruct.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
-from helio_jax.reconstruct.solve import START_THRIFT, reconstruct_stack
+from helio_jax.workflows.corrections import make_predictor
 
 
 def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():

@@ -8,9 +8,9 @@ import pytest
 from sphere_case import make_case
 
 from helio_jax.errors import InputFileError, SceneError
-from helio_jax.evaluate.interactive import report_groups
-from helio_jax.evaluate.metrics import evaluate_height
-from helio_jax.evaluate.report import Reference, write_report
+from helio_jax.figures.interactive import report_groups
+from helio_jax.figures.report import Reference, write_report
+from helio_jax.scores.metrics import evaluate_height
 
 PNG = b"\x89PNG\r\n\x1a\n fake"
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -144,7 +144,7 @@ def test_refusals_and_atomic_write(tmp_path, monkeypatch):
         write_report(tmp_path / "r.html", stack, rec, panel_png=tmp_path / "none.png")
     with pytest.raises(SceneError, match="must name one of"):
         Reference("beauty", 1.0)
-    monkeypatch.setattr("helio_jax.evaluate.report.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr("helio_jax.figures.report.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         write_report(tmp_path / "r.html", stack, rec)
     assert list(tmp_path.iterdir()) == []

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from stats import assert_likely, assert_mean, pooled_chi2
 
+from helio_jax.calibration.noise import NoiseSettings, add_noise
+from helio_jax.calibration.response import ScanTime, lagging, slow_drift
 from helio_jax.errors import SceneError
 from helio_jax.micrograph import MicrographStack
-from helio_jax.prepare.noise import NoiseSettings, add_noise
-from helio_jax.prepare.response import ScanTime, lagging, slow_drift
 
 TIME = ScanTime(dwell=0.3, move=0.1, flyback=0.7, fast_axis="x")
 

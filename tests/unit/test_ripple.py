@@ -10,17 +10,17 @@ from stats import assert_likely
 from test_measure import PITCH, make_rec
 
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.evaluate.measure import Wanted, measure_height_map
-from helio_jax.evaluate.regions import inside_polygon, parse_region
-from helio_jax.evaluate.ripple import (
+from helio_jax.instrument import Detector, Instrument, Plate
+from helio_jax.measure.regions import inside_polygon, parse_region
+from helio_jax.measure.ripple import (
     compare_with_images,
     height_ripple,
     image_ripple,
 )
-from helio_jax.evaluate.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
-from helio_jax.instrument import Detector, Instrument, Plate
+from helio_jax.measure.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS
+from helio_jax.workflows.measure import Wanted, measure_height_map
 
 AXIS = (np.arange(60) - 29.5) * PITCH
 TRIANGLE = inside_polygon(parse_region("-450,-450 430,-450 -450,430"), AXIS, AXIS)

@@ -11,9 +11,9 @@ from scipy.integrate import quad
 from scipy.special import gamma, j0, kv
 from stats import assert_mean
 
-from helio_jax.config import load_scene
 from helio_jax.scene.rough import RoughSample, rough_heights, spectrum
 from helio_jax.scene.sample import Sample, check_body
+from helio_jax.workflows.scene_file import load_scene
 
 XI, N = 8.0, 384
 PLAIN = {"kind": "rough", "size_um": 300.0, "rms_um": 2.0, "correlation_length_um": 30.0}

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from helio_jax.config import load_scene
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.pipeline import Crew, SimulateOptions, reconstruct, run, simulate, simulate_file
 from helio_jax.trace.direct import form_factors
 from helio_jax.trace.job import Job
 from helio_jax.trace.units import trace_unit
+from helio_jax.workflows.pipeline import Crew, SimulateOptions, reconstruct, run, simulate, simulate_file
+from helio_jax.workflows.scene_file import load_scene
 
 SCENE = """
 [plate]

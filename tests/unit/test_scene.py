@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax.config import SceneFile, json_schema, load_instrument, load_scene, resolved
+from helio_jax.calibration.noise import NoiseSettings, add_noise
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
-from helio_jax.prepare.noise import NoiseSettings, add_noise
+from helio_jax.workflows.scene_file import SceneFile, json_schema, load_instrument, load_scene, resolved
 
 SCENES = Path(__file__).parents[2] / "scenes"
 MINIMAL = """
@@ -266,7 +266,7 @@ def test_loading_a_scene_is_light():
     """Loading a scene imports no heavy library. Catches: trimesh, SciPy or JAX imported at the top of a module."""
     heavy = ["jax", "numba", "embreex", "trimesh", "scipy", "h5py", "matplotlib"]
     code = (
-        "import sys; from helio_jax.config import load_scene; load_scene(sys.argv[1]); "
+        "import sys; from helio_jax.workflows.scene_file import load_scene; load_scene(sys.argv[1]); "
         f"print([m for m in {heavy} if m in sys.modules])"
     )
     out = subprocess.run(

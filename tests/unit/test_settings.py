@@ -4,11 +4,11 @@ import pytest
 
 from helio_jax.commands.app import set_options
 from helio_jax.errors import SceneError
-from helio_jax.evaluate.measure import Wanted, _settings
-from helio_jax.evaluate.spectrum import RippleSettings
-from helio_jax.pipeline import _with_priors
-from helio_jax.reconstruct.settings import ReconstructSettings
-from helio_jax.turned import _JUMPS
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.measure.spectrum import RippleSettings
+from helio_jax.workflows.calibrate_rotated import _JUMPS
+from helio_jax.workflows.measure import Wanted, _settings
+from helio_jax.workflows.pipeline import _with_priors
 
 
 def test_what_nobody_set_stays_open():

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
-from helio_jax import pipeline
-from helio_jax.config import load_scene, resolved
 from helio_jax.errors import GuardError, InterruptedRun, ResumeError, SceneError
 from helio_jax.formats.toml import to_toml
-from helio_jax.study import load_study, resume_study, run_study
 from helio_jax.trace.scan import Crew
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene, resolved
+from helio_jax.workflows.study import load_study, resume_study, run_study
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 SMALL = """

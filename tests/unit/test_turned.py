@@ -7,14 +7,15 @@ import pytest
 
 from benchmarks.alignment import INSTRUMENT
 from benchmarks.crystal import DRIFTS, FIELD_UM, GAINS, SHARE, Sample, make_sample, record, true_normals
-from helio_jax import reconstruct, turned
-from helio_jax.config import load_instrument
+from helio_jax import reconstruct
+from helio_jax.alignment.resample import resample, scan_times
+from helio_jax.alignment.rigid import Rigid
+from helio_jax.calibration.self_calibration import Relief, SelfCalibrateSettings, self_calibrate
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector
 from helio_jax.micrograph import MicrographStack
-from helio_jax.prepare.resample import resample, scan_times
-from helio_jax.prepare.rigid import Rigid
-from helio_jax.prepare.selfcalibrate import Relief, SelfCalibrateSettings, self_calibrate
+from helio_jax.workflows import calibrate_rotated as turned
+from helio_jax.workflows.scene_file import load_instrument
 
 
 @pytest.fixture(scope="module")

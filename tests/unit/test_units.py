@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from scale import ARRAYS, SCENE, SMALL
 
-from helio_jax import pipeline
-from helio_jax.config import load_scene
 from helio_jax.errors import GuardError, ResumeError
 from helio_jax.formats.parts import Parts
 from helio_jax.scene.surfaces import Body, flat_body
@@ -18,6 +16,8 @@ from helio_jax.trace.job import Job, differences
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.scan import Canvas, trace_scene
 from helio_jax.trace.units import Patch, trace_unit
+from helio_jax.workflows import pipeline
+from helio_jax.workflows.scene_file import load_scene
 
 QUICK = SMALL | {"trace.rays": 16, "trace.paths_per_unit": 16 * 8 * 50}
 

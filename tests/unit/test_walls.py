@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_lines import AXIS, GRID_X, GRID_Y, PITCH, SIZE, instrument
 
-from helio_jax.evaluate.walls import find_walls
+from helio_jax.measure.walls import find_walls
 from helio_jax.reconstruction import REASONS, Reconstruction
 
 TURN = math.radians(40.0)

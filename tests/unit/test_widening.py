@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from helio_jax.reconstruct.rounds import SLOWEST, aitken, left_to_go
-from helio_jax.reconstruct.uncertainty import Posterior
+from helio_jax.inverse.convergence import SLOWEST, aitken, left_to_go
+from helio_jax.inverse.posterior import Posterior
 
 NAMES = ("log_gain[0]", "aim[0, 0]", "aim[1, 0]")
 SHAPE = (4, 5)

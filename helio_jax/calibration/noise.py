@@ -1,0 +1,153 @@
+"""Turn expected counts into noisy ones, as an experiment would have recorded them. Settings table `[noise]`.
+
+Flow: simulated `MicrographStack` (noise "expected") -> the same stack with Poisson counts (noise "poisson"), or with
+all that a measured file would not tell taken away (noise "measured").
+"""
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from helio_jax.calibration.response import ScanTime, lagging, slow_drift
+from helio_jax.errors import SceneError
+from helio_jax.micrograph import MicrographStack
+from helio_jax.settings import Settings
+
+_STREAM = 0x6E6F697365  # keeps the noise's random numbers apart from the tracer's for equal seeds
+_DRIFT_STREAM = 0x6472696674
+_LIMITS = {
+    "background_per_pixel": (lambda v: v < 0, ">= 0 counts"),
+    "gain": (lambda v: v <= 0, "> 0"),
+    "lag_s": (lambda v: v < 0, ">= 0 s"),
+    "drift_per_pixel": (lambda v: v < 0, ">= 0 counts"),
+}
+
+
+class NoiseSettings(Settings):
+    """Counting noise, background, gain, lag and drift of the detectors."""
+
+    enabled: bool = True
+    """Whether `helio run` adds noise before it reconstructs."""
+    background_per_pixel: float | tuple[float, ...] = 0.0
+    """Mean counts per pixel that do not come from the sample: one number, or one per detector."""
+    gain: float | tuple[float, ...] = 1.0
+    """Counts recorded per expected count: one number, or one per detector."""
+    lag_s: float | tuple[float, ...] = 0.0
+    """Time constant of an exponential lag: one number, or one per detector; 0: none [s]."""
+    drift_per_pixel: float | tuple[float, ...] = 0.0
+    """Standard deviation of a slow drift of the background: one number, or one per detector [counts per pixel]."""
+    drift_time_s: float = Field(default=3600.0, gt=0.0, le=1e9)
+    """Correlation time of the drift [s]."""
+    dwell_s: float | None = Field(default=None, gt=0.0, le=1e6)
+    """Counting time of a pixel; needed for lag and drift, it does not change the counts [s]."""
+    move_s: float = Field(default=0.0, ge=0.0, le=1e6)
+    """Time to reach a pixel, without counting [s]."""
+    flyback_s: float = Field(default=0.0, ge=0.0, le=1e6)
+    """Further time to go back to the beginning of a line [s]."""
+    fast_axis: Literal["x", "y"] = "x"
+    """Axis along which the scan moves fastest, from low to high."""
+    as_measured: bool = False
+    """Take away what a measured file would not tell: orders, masks, background, number of atoms."""
+    seed: int = Field(default=1, ge=0, lt=2**63)
+    """Seed of the noise."""
+
+    def problems(self, n_detectors: int) -> list[tuple[str, str]]:
+        """Return (key, what is wrong) for the per-detector lists and the times."""
+        out = []
+        for key, (is_wrong, limit) in _LIMITS.items():
+            values = np.atleast_1d(getattr(self, key))
+            if values.size not in (1, n_detectors):
+                out.append(
+                    (
+                        key,
+                        f"must be one number or one per detector ({n_detectors}), got {values.size}: correct the list",
+                    )
+                )
+            if values.size == 0 or np.any(is_wrong(values)):
+                out.append((key, f"must be {limit}, got {values.tolist()}: choose such values"))
+        needs_time = [key for key in ("lag_s", "drift_per_pixel") if np.any(np.atleast_1d(getattr(self, key)))]
+        if needs_time and self.dwell_s is None:
+            out.append(("dwell_s", f"is needed for noise.{needs_time[0]}: give the counting time of a pixel"))
+        return out
+
+    def per_detector(self, key: str, n_detectors: int) -> np.ndarray:
+        """Return a setting for every detector [detector]."""
+        return np.broadcast_to(np.asarray(getattr(self, key), np.float64), (n_detectors,)).copy()
+
+    @property
+    def time(self) -> ScanTime:
+        """When pixels are counted; without a dwell time, which nothing then depends on, one second each."""
+        return ScanTime(self.dwell_s or 1.0, self.move_s, self.flyback_s, self.fast_axis)
+
+
+def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None = None) -> MicrographStack:
+    """Draw Poisson counts of mean gain * lagging(expected) + background + drift for every observed pixel.
+
+    The variance is that of the data about their unknown truth: the Poisson mean, plus gain^2 times the Monte
+    Carlo variance of the expectation; the drift is not in it. Orders and other components stay expectations, with lag
+    and gain. Applies noise also where `settings.enabled` is False: the caller decides.
+
+    Args:
+        stack: expected counts (noise "expected").
+        settings: background, gain, lag, drift.
+        seed: used in place of `settings.seed`.
+
+    Raises:
+        SceneError: the stack is noisy already, a list does not fit its detectors, or an expectation is negative.
+    """
+    if stack.noise != "expected":
+        raise SceneError(f"noise can be added only to expected counts, got a stack with noise = {stack.noise!r}")
+    n_detectors = stack.shape[0]
+    if problems := settings.problems(n_detectors):
+        raise SceneError("\n".join(f"noise.{key} {text}" for key, text in problems))
+    background, gain, lag, drift = (
+        settings.per_detector(key, n_detectors) for key in ("background_per_pixel", "gain", "lag_s", "drift_per_pixel")
+    )
+    seed = settings.seed if seed is None else seed
+
+    def recorded(images: np.ndarray) -> np.ndarray:
+        """Return images [..., detector, y, x] with lag and gain."""
+        lagged = [lagging(images[..., k, :, :], lag[k], settings.time) for k in range(n_detectors)]
+        return gain[:, None, None] * np.stack(lagged, -3) if lag.any() else gain[:, None, None] * images
+
+    observed = stack.is_observed
+    mean = recorded(stack.counts) + background[:, None, None]
+    if drift.any():
+        shape = slow_drift(mean.shape, settings.drift_time_s, settings.time, [seed, _DRIFT_STREAM])
+        mean = mean + drift[:, None, None] * shape
+    if np.any(mean[observed] < 0):
+        raise SceneError(
+            f"expected counts must be >= 0 to add noise, got {mean[observed].min():g}: trace with more rays or raise "
+            "noise.background_per_pixel"
+        )
+    counts = np.full(mean.shape, np.nan)
+    counts[observed] = np.random.default_rng([seed, _STREAM]).poisson(mean[observed])
+    variance = mean.copy()
+    if stack.variance is not None:
+        variance += gain[:, None, None] ** 2 * stack.variance
+    components = {key: getattr(stack, key) for key in ("by_order", "effuse", "plate")}
+    record = settings.model_dump(mode="json") | {
+        "seed": seed,
+        "law": "poisson(gain * lag(expected) + background + drift)",
+    }
+    noisy = stack.replace(
+        counts=counts,
+        variance=variance,
+        background=background,
+        noise="poisson",
+        dwell=settings.dwell_s,
+        fast_axis=settings.fast_axis,
+        provenance={**stack.provenance, "noise": record},
+        **{key: recorded(image) for key, image in components.items() if image is not None},
+    )
+    return _as_measured(noisy) if settings.as_measured else noisy
+
+
+def _as_measured(stack: MicrographStack) -> MicrographStack:
+    """Return noisy counts with only what an experiment knows; their variance is then taken from the counts."""
+    unknown = ("background", "by_order", "effuse", "plate", "masked", "shadowed", "n_rays")
+    counts = stack.counts
+    return stack.replace(
+        noise="measured", variance=np.where(stack.is_observed, np.maximum(counts, 1.0), 0.0), **dict.fromkeys(unknown)
+    )

@@ -1,0 +1,446 @@
+"""Multiple scattering by radiosity on the height raster, differentiable in heights and normals (JAX).
+
+By reciprocity the multiple scattering of a pixel is the light it would receive if the detectors shone on the sample:
+I_i = sum_j F_ij (g_j(i) + I_j) with the form factor F_ij of point j seen from point i, the chance g_j(i) that an atom
+leaving j is detected directly while the beam is at pixel i, and the point's own multiple scattering I_j. Cosine law.
+
+In the beam frame (x + z tx, y + z ty, z) the surface is one height per raster position and straight lines stay
+straight. A receiver looks along a number of azimuths and marches over the raster: what rises above the horizon so far
+uncovers a strip, whose form factor is known in closed form from its two slopes of sight. So visibility is part of the
+march, near neighbours are no special case, and rows of F sum to the form factor of all below the horizon, at most 1.
+Pixels receive; the cells between them send, with the mean of their corners' multiple scattering. Steep cells are cut
+into levels, which do both: a depth jump is taken for a wall along the beam, as by the tracer's triangulation. Outside
+of the raster lies a flat at z = 0, one strip per azimuth.
+
+Approximations, with measured errors in tests/physics/test_indirect.py: few azimuths; one value per cell or level; a
+level looks from its cell's lowest pixel; what hides a detector from a sender, and orders above 2, are taken with the
+beam at the sender instead of at the pixel. Which strips are visible is planned and then held fixed: at an edge of
+visibility a strip has no width, so the derivative is right all the same. Source: own derivation; Goral et al., SIGGRAPH
+1984 (radiosity); Max, Vis. Comput. 4 (1988) 109 (horizons).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.forward.beam_frame import normal_of_slopes
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.masking import Slices, slice_aperture
+
+MERGE = 1.4
+"""Strips between two powers of this in distance are seen as one ..."""
+GENTLE = 0.5
+"""... if the height changes by less than this within each, in pitches of the raster."""
+LEVEL = 1.0
+"""Height of a steep cell's levels, in pitches of the raster; a cell that is lower has none ..."""
+MAX_LEVELS = 12
+"""... and none has more than this."""
+N_SLICES = 6
+"""Azimuths along which each aperture is tested for being hidden."""
+TOLERANCE = 1e-7
+"""The Neumann series ends when its term is this small against the first one ..."""
+MAX_TERMS = 200
+"""... or after this many terms."""
+_BLOCK = 1 << 14  # most receivers that march together
+_GRAZING = 1e-5  # slope above the own tangent plane from which on something is seen: a plane does not see itself
+_NOWHERE = -1e9  # height outside of the raster, um: never seen
+
+
+class Mix(NamedTuple):
+    """Frozen places on the surface, of height (1 - share) h[first] + share h[second] for flat indices of pixels."""
+
+    first: Any
+    second: Any
+    share: Any
+
+    def of(self, heights: Any) -> Any:
+        """Return the heights there, um, of `heights` [pixel + 1], the last of which is the flat outside."""
+        return (1.0 - self.share) * heights[self.first] + self.share * heights[self.second]
+
+
+class Strips(NamedTuple):
+    """What receivers see, frozen [azimuth, strip]; those of one receiver follow each other outwards without a gap.
+
+    Of every strip: the receiver (beyond the last point: no strip) and the point that it belongs to, its far end, that
+    one's distance and the distance of its middle [um].
+    """
+
+    receiver: Any
+    sender: Any
+    end: Mix
+    distance: Any
+    middle: Any
+
+
+class Plan(NamedTuple):
+    """What is held fixed.
+
+    Attributes:
+        place: where the levels of steep cells get their heights, some to spare [level].
+        cell: number of each level's cell [level].
+        visible: share of each aperture's light that the sample leaves to each sender [sender, detector].
+        strips: what the receivers see.
+    """
+
+    place: Mix
+    cell: Any
+    visible: Any
+    strips: Strips
+
+
+class Cells(NamedTuple):
+    """The raster's cells, frozen: lowest and highest corner, number of levels, number of the first one [cell]."""
+
+    lowest: np.ndarray
+    highest: np.ndarray
+    n_levels: np.ndarray
+    level: np.ndarray
+
+
+class Receivers(NamedTuple):
+    """Pixels, and levels, each at its cell's lowest pixel: flat index, height [um] and normal [receiver]."""
+
+    pixel: np.ndarray
+    height: np.ndarray
+    normal: np.ndarray
+
+    def tangent(self, direction: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
+        """Return the slope of the tangent planes along an azimuth."""
+        return -(self.normal[:, :2] @ direction) / (self.normal @ [-shift[0], -shift[1], 1.0])
+
+
+class Crossings(NamedTuple):
+    """Where a ray crosses the grid lines, by growing distance, um, infinite where the raster has ended [step], static.
+
+    The height is interpolated between two pixels, at rows and columns [step, 2] from the receiver's.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    share: np.ndarray
+    distance: np.ndarray
+
+
+class Radiosity:
+    """The multiple scattering of a surface given on a raster: call it with heights [y, x] and unit normals [y, x, 3].
+
+    The result is the detection probability of order 2 and above [detector, y, x]. `plan` and `multiple` are its two
+    steps; the second is differentiable. Valid for normals that face the beam and heights below the plate.
+
+    Args:
+        geometry: the instrument.
+        x, y: beam positions, um, at least 2 each.
+        substrate_um: side of the flat at z = 0 about the z axis; default: half an image beyond each border.
+        n_azimuths: directions in which a receiver looks; a multiple of 4.
+    """
+
+    def __init__(
+        self,
+        geometry: SpotGeometry,
+        x: np.ndarray,
+        y: np.ndarray,
+        substrate_um: float | None = None,
+        n_azimuths: int = 24,
+    ) -> None:
+        self.geometry, self.shift = geometry, geometry.instrument.beam_shift
+        self.pitch, self.corner = (pitch(y), pitch(x)), np.array([y[0], x[0]])
+        border = max(np.abs(x).max(), np.abs(y).max())
+        self.reach = border + 0.5 * max(np.ptp(x), np.ptp(y)) if substrate_um is None else 0.5 * substrate_um
+        azimuth = 2.0 * np.pi * (np.arange(n_azimuths) + 0.5) / n_azimuths
+        self.directions = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+
+    def __call__(self, height: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return the multiple scattering [detector, y, x]."""
+        return np.asarray(self.multiple(height, normals, self.plan(height, normals)))
+
+    def multiple(self, height: Any, normals: Any, plan: Plan) -> jax.Array:
+        """Return the same for a fixed plan, differentiable."""
+        with jax.enable_x64(True):
+            tables = jax.tree.map(jnp.asarray, (self.directions, plan))
+            return _multiple(jnp.asarray(height), jnp.asarray(normals), *tables, self.geometry, self.pitch)
+
+    def plan(self, height: np.ndarray, normals: np.ndarray) -> Plan:
+        """Return the points of a surface and what each of them sees."""
+        height, instrument = np.asarray(height, np.float64), self.geometry.instrument
+        cells, place, cell = _cut(height, LEVEL * max(self.pitch))
+        with jax.enable_x64(True):
+            z, normal = _receivers(jnp.asarray(height), jnp.asarray(normals), place, cell, self.pitch, self.shift)
+        receivers = Receivers(np.append(np.arange(height.size), place.first), np.asarray(z), np.asarray(normal))
+        pinhole = instrument.pinhole_center[:2]
+        slices = [slice_aperture(aperture, pinhole, N_SLICES) for aperture in instrument.apertures()]
+        visible = np.stack([self._visible_share(height, receivers, part) for part in slices], -1)
+        visible = np.asarray(_spread(visible, height.shape, 1.0))
+        rows = [self._look(height, cells, len(visible) - 1, receivers, e) for e in self.directions]
+        width = _roomy(max(len(row.receiver) for row in rows))
+        strips = jax.tree.map(lambda *row: np.stack([_filled(a, width) for a in row]), *rows)
+        is_strip = np.arange(width) < np.array([[len(row.receiver)] for row in rows])
+        strips = strips._replace(receiver=np.where(is_strip, strips.receiver, len(receivers.pixel)).astype(np.int32))
+        return Plan(place, cell, visible, strips)
+
+    def _visible_share(self, height: np.ndarray, receivers: Receivers, slices: Slices) -> np.ndarray:
+        """Return which share of the light above their own horizon the sample leaves receivers; the beam is at them."""
+        depth, normal = self.geometry.instrument.sample_distance - receivers.height[:, None], receivers.normal[:, None]
+        node, weight = np.polynomial.legendre.leggauss(3)
+        visible, total = np.zeros(len(depth)), np.full(len(depth), 1e-300)
+        for e, near, far, azimuth in zip(*slices, strict=True):
+            tangent = receivers.tangent(e, self.shift)
+            horizon = _march(height, receivers, tangent, _crossings(e, height.shape, self.pitch), 0.0)[0]
+            for light, edge in ((visible, horizon), (total, tangent)):
+                length = (depth / np.maximum(edge[:, None], 1e-9)).clip(near, far) - near
+                u = near + 0.5 * (node + 1.0) * length
+                x, y = (u * e[axis] - depth * self.shift[axis] for axis in (0, 1))
+                light += azimuth * (length * weight * u * _light(normal, x, y, depth, np)).sum(-1)
+        return np.minimum(visible / total, 1.0)
+
+    def _look(self, height, cells: Cells, outside: int, receivers: Receivers, direction: np.ndarray) -> Strips:
+        """Return the strips that receivers see along an azimuth, in the order of the receivers [strip]."""
+        crossings, tangent = _crossings(direction, height.shape, self.pitch), receivers.tangent(direction, self.shift)
+        horizon, codes = _march(height, receivers, tangent, crossings, GENTLE * max(self.pitch))
+        strips = _name(height, cells, receivers, direction[::-1] / self.pitch, crossings, tangent, codes)
+        # the flat outside
+        row, column = np.divmod(receivers.pixel, height.shape[1])
+        x, y = self.corner[1] + column * self.pitch[1], self.corner[0] + row * self.pitch[0]
+        far = np.min([(self.reach * np.sign(e) - v) / e for e, v in zip(direction, (x, y), strict=True)], 0)
+        i = np.flatnonzero((horizon < 0.0) & (-receivers.height > horizon * far))
+        none = np.full(i.size, height.size)
+        middle = 2.0 / (1.0 / far[i] - horizon[i] / receivers.height[i])
+        flat = Strips(i, np.full(i.size, outside), Mix(none, none, 0.0 * middle), far[i], middle)
+        joined = jax.tree.map(lambda *parts: np.concatenate(parts), strips, flat)
+        order = np.argsort(joined.receiver, kind="stable")
+        return jax.tree.map(lambda a: a[order].astype(np.int32 if a.dtype.kind == "i" else np.float64), joined)
+
+
+def _roomy(count: int) -> int:
+    """Return `count` rounded up by at most an eighth, so that compiled code fits surfaces that differ a little."""
+    unit = 1 << max(0, count.bit_length() - 4)
+    return -(-count // unit) * unit
+
+
+def _filled(array: np.ndarray, length: int) -> np.ndarray:
+    """Return an array extended to a length by copies of its last element."""
+    return np.pad(array, (0, length - len(array)), mode="edge")
+
+
+def _cut(height: np.ndarray, tall: float) -> tuple[Cells, Mix, np.ndarray]:
+    """Cut the raster's steep cells into levels; return the cells, and of all levels the places and numbers of cells."""
+    corners = np.stack(_corners(np.arange(height.size).reshape(height.shape))).reshape(4, -1)
+    heights, columns = height.ravel()[corners], np.arange(corners.shape[1])
+    lowest, highest = (corners[f(heights, 0), columns] for f in (np.argmin, np.argmax))
+    n_levels = np.ceil(np.ptp(heights, 0) / tall).astype(int).clip(max=MAX_LEVELS)
+    n_levels[n_levels == 1] = 0
+    first, cell = np.cumsum(n_levels) - n_levels, np.repeat(columns, n_levels)
+    share = (np.arange(len(cell)) - first[cell] + 0.5) / n_levels[cell]
+    room = _roomy(len(cell) + 1)
+    cell, share = _filled(np.append(cell, 0), room), _filled(np.append(share, 0.5), room)
+    return Cells(lowest, highest, n_levels, first), Mix(lowest[cell], highest[cell], share), cell
+
+
+def _corners(image: Any) -> tuple[Any, Any, Any, Any]:
+    """Return an image's [y, x, ...] values at the corners of its cells, four of [y - 1, x - 1, ...]."""
+    return image[:-1, :-1], image[:-1, 1:], image[1:, :-1], image[1:, 1:]
+
+
+def _cell_normals(height, pitches, shift):
+    """Return the unit normals [cell, 3] of the raster's cells, differentiable."""
+    h00, h01, h10, h11 = _corners(height)
+    slopes = 0.5 * (h01 + h11 - h00 - h10) / pitches[1], 0.5 * (h10 + h11 - h00 - h01) / pitches[0]
+    normal = jnp.stack(normal_of_slopes(*slopes, shift), -1).reshape(-1, 3)
+    return normal / jnp.sqrt(jnp.sum(normal**2, -1, keepdims=True))
+
+
+def _receivers(height, normals, place: Mix, cell, pitches, shift):
+    """Return heights [receiver], um, and unit normals [receiver, 3] of pixels and levels, differentiable."""
+    level = _cell_normals(height, pitches, shift)[cell]
+    return jnp.append(height, place.of(height.ravel())), jnp.concatenate([normals.reshape(-1, 3), level])
+
+
+def _spread(values, shape: tuple[int, int], outside: float):
+    """Return what senders (cells: mean of corners; levels; the flat outside) have from receivers' values."""
+    n, rest = shape[0] * shape[1], values.shape[1:]
+    cells = 0.25 * jnp.stack(_corners(values[:n].reshape(*shape, *rest))).sum(0).reshape(-1, *rest)
+    return jnp.concatenate([cells, values[n:], jnp.full((1, *rest), outside)])
+
+
+def _crossings(direction: np.ndarray, shape: tuple[int, int], pitches: tuple[float, float]) -> Crossings:
+    """Return the crossings of a pixel's ray with the grid lines."""
+    step = direction[::-1] / pitches
+    parts = []
+    for axis in (0, 1):
+        distance = np.arange(1, shape[axis] + 1) / abs(step[axis])
+        line, across = np.rint(distance * step[axis]), distance * step[1 - axis]
+        first = np.stack([line, np.floor(across)], -1)[:, :: 1 - 2 * axis].astype(int)
+        inside = np.abs(across) <= shape[1 - axis]
+        parts.append([a[inside] for a in (first, first + [axis, 1 - axis], across % 1.0, distance)])
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.argsort(columns[-1])
+    ended = sum(shape) + 1 - len(order)
+    first, second, share = (np.pad(c[order], ((0, ended), (0, 0))[: c.ndim]) for c in columns[:3])
+    return Crossings(first, second, share, np.append(columns[3][order], np.full(ended, np.inf)))
+
+
+def _march(height, receivers: Receivers, tangent, crossings: Crossings, tall: float) -> tuple[np.ndarray, np.ndarray]:
+    """March over the raster, in single precision; return horizons [receiver] and codes [receiver, step].
+
+    Code: is the surface before the crossing seen: 0 no, 1 yes, 2 yes and it rises or falls by more than `tall`.
+    """
+    margin = [(n + 1, n + 1) for n in height.shape]
+    padded = np.pad(height, margin, constant_values=_NOWHERE).astype(np.float32)
+    to_flat = np.array([padded.shape[1], 1])
+    base = (np.stack(np.divmod(receivers.pixel, height.shape[1]), -1) + np.array(height.shape) + 1) @ to_flat
+    table = (crossings.first @ to_flat, crossings.second @ to_flat, *map(np.float32, crossings[2:]))
+    tangent = tangent + _GRAZING * (1.0 + np.abs(tangent))
+    columns = (base, receivers.height.astype(np.float32), tangent.astype(np.float32))
+    horizon, codes = np.zeros(len(base)), np.zeros((len(base), sum(height.shape) + 1), np.int8)
+    for start in range(0, len(base), _BLOCK):
+        block = slice(start, min(start + _BLOCK, len(base)))
+        n = block.stop - start
+        out = _march_block(padded.ravel(), *(_filled(c[block], _roomy(n)) for c in columns), table, np.float32(tall))
+        horizon[block], codes[block] = np.asarray(out[0])[:n], np.asarray(out[1])[:, :n].T
+    return horizon, codes
+
+
+@jax.jit
+def _march_block(heights, base, own, tangent, table, tall):
+    def visit(state, crossing):
+        horizon, z_before = state
+        first, second, share, distance = crossing
+        z = (1.0 - share) * heights[base + first] + share * heights[base + second]
+        slope = (z - own) / distance
+        is_seen = (slope > horizon) & (distance < jnp.inf)
+        code = is_seen.astype(jnp.int8) * (1 + (jnp.abs(z - z_before) > tall).astype(jnp.int8))
+        return (jnp.where(is_seen, slope, horizon), z), code
+
+    (horizon, _), codes = jax.lax.scan(visit, (tangent, own), table)
+    return horizon, codes
+
+
+def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossings, tangent, codes) -> Strips:
+    """Return what was seen as strips of senders: pieces are joined (see `MERGE`), or cut at their cell's levels."""
+    flat, (ny, nx) = np.append(height, 0.0), height.shape
+    before = np.append(0.0, crossings.distance[:-1])
+    ring = np.floor(np.log(np.maximum(before, 1.0)) / np.log(MERGE))
+    joins = (codes[:, 1:] == 1) & (codes[:, :-1] == 1) & (ring[1:] == ring[:-1])
+    is_seen, whole = codes > 0, np.ones((len(codes), 1), bool)
+    begin = np.nonzero(is_seen & np.concatenate([whole, ~joins], 1))[1]
+    receiver, last = np.nonzero(is_seen & np.concatenate([~joins, whole], 1))
+
+    def at(step: np.ndarray) -> Mix:
+        offset = crossings.first[step], crossings.second[step]
+        first, second = (receivers.pixel[receiver] + o @ [nx, 1] for o in offset)
+        return Mix(first, second, crossings.share[step])
+
+    near, far, end, own = before[begin], crossings.distance[last], at(last), receivers.height[receiver]
+    z = np.where(begin == 0, own, at(begin - 1).of(flat)), end.of(flat)
+    middle = np.stack(np.divmod(receivers.pixel[receiver], nx), -1) + 0.5 * (near + far)[:, None] * per_um
+    number = np.floor(middle).astype(int).clip(0, [ny - 2, nx - 2]) @ [nx - 1, 1]
+    cell = Cells(*(field[number] for field in cells))
+    low, relief, most = flat[cell.lowest], np.ptp(flat[np.stack(cell[:2])], 0), np.maximum(cell.n_levels, 1)
+    share = [(v - low) / np.maximum(relief, 1e-9) for v in z]
+    first, final = (np.floor(most * s).clip(0, most - 1).astype(int) for s in share)
+    n = abs(final - first) + 1
+    i = np.repeat(np.arange(len(n)), n)  # one strip per level
+    k = np.arange(len(i)) - (np.cumsum(n) - n)[i]
+    level, is_last = first[i] + np.sign(final - first)[i] * k, k == n[i] - 1
+    edge = (level + (final > first)[i]) / most[i]
+    part = (edge - share[0][i]) / np.where(is_last, 1.0, (share[1] - share[0])[i])
+    distance = np.where(is_last, far[i], near[i] + part.clip(0.0, 1.0) * (far - near)[i])
+    levels = Mix(cell.lowest[i], cell.highest[i], edge)
+    ends = Mix(*(np.where(is_last, a[i], b) for a, b in zip(end, levels, strict=True)))
+    start = np.where(k == 0, near[i], np.roll(distance, 1))
+    sender = np.where(cell.n_levels[i] > 0, len(cells.level) + cell.level[i] + level, number[i])
+    strips = Strips(receiver[i], sender, ends, distance, 0.5 * (start + distance))
+    # levels below the horizon are not seen
+    top, slope = (z[1] - own) / far, (ends.of(flat) - own[i]) / distance
+    horizon = np.where(receiver == np.roll(receiver, 1), np.roll(top, 1), tangent[receiver])
+    keep = is_last | ((slope > horizon[i]) & (slope < top[i]))
+    return jax.tree.map(lambda a: a[keep], strips)
+
+
+def _light(normal: Any, x: Any, y: Any, depth: Any, xp: Any) -> Any:
+    """Return the light max(n . r, 0) r_z / (pi |r|^4) that a point gets from those of an aperture at r."""
+    facing = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2] * depth
+    return xp.maximum(facing, 0.0) * depth / (np.pi * (x * x + y * y + depth * depth) ** 2)
+
+
+@partial(jax.jit, static_argnums=(4, 5))
+def transfer(height, normals, directions, plan: Plan, geometry: SpotGeometry, pitches):
+    """Return the form factors of strips [azimuth, strip] and the direct light that they bring [receiver, detector].
+
+    The last two arguments, instrument and pitches (y, x) of the raster, um, are static.
+
+    A strip from slope m0 to m1 in a slice of azimuth e and width dphi has the vector form factor
+    (dphi / pi) integral of D / |D|^4 dm with D = (e - m t, m), the direction of slope m; t is the beam shift.
+    """
+    shape, apertures, shift = height.shape, geometry.instrument.apertures(), geometry.instrument.beam_shift
+    heights = jnp.append(height, 0.0)
+    z, normal = _receivers(height, normals, plan.place, plan.cell, pitches, shift)
+    sender_normal = jnp.concatenate([_cell_normals(height, pitches, shift), normal[height.size :], jnp.eye(3)[2:]])
+    position = geometry.position(_spread(z, shape, 0.0))
+    # points of equal weight: right for cubic functions, to 1 % where the sender's own horizon cuts the aperture
+    nodes = np.stack([a.center + np.sqrt(0.5) * (a.rim(8)[0] - a.center) for a in apertures])
+    share = plan.visible * np.array([np.pi * np.prod(a.semi_axes) / nodes.shape[1] for a in apertures])
+    steep = 1.0 + shift[0] ** 2 + shift[1] ** 2
+    across = normal[:, 2] - normal[:, :2] @ jnp.array(shift)
+
+    def primitives(slope, toward):
+        w, k2 = slope - toward, 1.0 / steep - toward**2
+        k, q = jnp.sqrt(k2), w * w + k2
+        zeroth = (w / q + jnp.arctan(w / k) / k) / (2.0 * k2 * steep**2)
+        return jnp.stack([zeroth, toward * zeroth - 0.5 / (q * steep**2)])
+
+    def add(total, row):
+        e, strip = row
+        i, j, toward = strip.receiver, strip.sender, e @ jnp.array(shift) / steep
+        along = normal[:, :2] @ e
+        high = primitives((strip.end.of(heights) - z[i]) / strip.distance, toward)
+        tangent = primitives(-along / across, toward)
+        gain, up = high - jnp.where(i == jnp.roll(i, 1), jnp.roll(high, 1, 1), tangent[:, i])
+        weight = 2.0 / len(directions) * (along[i] * gain + across[i] * up)
+        x, y = (position[axis][j] + strip.middle * e[axis] for axis in (0, 1))
+        rays = nodes[..., 0, None] - x, nodes[..., 1, None] - y
+        light = _light(sender_normal[j], rays[0], rays[1], position[2][j], jnp).sum(1).T
+        received = weight[:, None] * light * share[j]
+        return total.at[i].add(received, mode="drop"), weight
+
+    start = jnp.zeros((len(z), len(apertures)))
+    second, weight = jax.lax.scan(jax.checkpoint(add), start, (directions, plan.strips))
+    return weight, second
+
+
+@partial(jax.jit, static_argnums=(4, 5))
+def _multiple(height, normals, directions, plan: Plan, geometry: SpotGeometry, pitches):
+    weight, second = transfer(height, normals, directions, plan, geometry, pitches)
+
+    def remainder(light):
+        return light - _gather(plan.strips, weight, _spread(light, height.shape, 0.0), len(light))
+
+    total = jax.lax.custom_linear_solve(remainder, second, _neumann, _neumann)
+    return total[: height.size].T.reshape(-1, *height.shape)
+
+
+def _neumann(remainder: Callable[[jax.Array], jax.Array], first: jax.Array) -> jax.Array:
+    """Solve remainder(x) = first, where remainder(x) = x - F x, by the series first + F first + F^2 first + ..."""
+
+    def add(state):
+        total, term, n = state
+        return total + term, term - remainder(term), n + 1
+
+    def is_open(state):
+        return (state[2] < MAX_TERMS) & (jnp.abs(state[1]).max() > TOLERANCE * jnp.abs(first).max())
+
+    return jax.lax.while_loop(is_open, add, (jnp.zeros_like(first), first, 0))[0]
+
+
+def _gather(strips: Strips, weight: jax.Array, light: jax.Array, n: int) -> jax.Array:
+    """Return sum_j F_ij light_j [receiver, detector], n receivers, of the senders' light [sender, detector]."""
+
+    def add(total, row):
+        receiver, sender, w = row
+        return total.at[receiver].add(w[:, None] * light[sender], mode="drop"), None
+
+    return jax.lax.scan(add, jnp.zeros((n, light.shape[1])), (strips.receiver, strips.sender, weight))[0]

@@ -1,0 +1,40 @@
+"""Edges where the beam leaves the sample: behind a rim that falls off steeper than the beam there is a depth jump.
+
+A fit whose instrument is free would rather bend the instrument than tear the surface: if all edges are joined at
+first, angles and offsets make the far side of a hill come down to the ground. So while the instrument is fitted for
+the first time, such edges are cut; afterwards each is joined again if its misfit allows.
+"""
+
+import numpy as np
+
+from helio_jax.inverse.edges import along
+from helio_jax.inverse.regions import WALL, wall_strength
+from helio_jax.inverse.residuals import Surface
+
+_HALF_LENGTHS = (1, 3)
+"""Pixels to both sides, along the edge, over which its change is averaged."""
+STEEP = 1.0
+"""Fall of the beam-frame height along the beam, per raster step of the same length, from which on it may be one."""
+
+
+def shadow_edges(
+    signal: np.ndarray, variance: np.ndarray, surface: Surface, shift: tuple[float, float], axis: int
+) -> np.ndarray:
+    """Return True for edges along an axis (0: y, 1: x) that may lie across a depth jump behind a rim.
+
+    The images change across them as across a wall, and the surface on either side falls steeply along the beam.
+
+    Args:
+        signal, variance: data [detector, y, x], NaN where not observed.
+        surface: to begin with.
+        shift: tan t (cos phi, sin phi) of the beam.
+        axis: of the edges.
+    """
+    component, slope = (shift[0], surface.slope_x) if axis == 1 else (shift[1], surface.slope_y)
+    if component == 0.0:
+        return np.zeros(along(slope, axis)[0].shape, bool)
+    fall = np.maximum(*(-np.sign(component) * end for end in along(slope, axis)))
+    observed = np.isfinite(signal) & np.isfinite(variance)
+    data, spread = np.where(observed, signal, 0.0), np.where(observed, variance, np.nanmax(variance))
+    strength = np.maximum(*(wall_strength(data, spread, axis, half) for half in _HALF_LENGTHS))
+    return (fall * abs(component) > STEEP * np.hypot(*shift)) & (strength > WALL)

@@ -1,0 +1,164 @@
+"""Why a height should not be trusted: too few images, masks, a depth jump, or a region whose level nothing fixes."""
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from helio_jax.inverse.edges import along, ranked, trapezoid_gap
+from helio_jax.inverse.linear import MIN_IMAGES, signal_of
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruction import REASONS
+
+FACET_IMAGES = 2
+"""Data that fix the two slopes of a facet of known albedo."""
+MASK_LIMIT = 0.1
+"""A datum darker than this share of the detector's flat signal counts as masked."""
+INTACT = 0.25
+"""Edges with less weight than this are cut; a pixel with such an edge is at a depth jump, unless the jump is small."""
+SMALLEST_JUMP = 0.1
+"""Misfit of a cut edge, in pitches, below which it is no depth jump: noise cuts one edge in some hundreds."""
+TRUSTED = 0.5
+"""A pixel with a datum of less robust weight than this is not explained by the model."""
+EXPLAINED = 3.0
+"""Mean square residual of a pixel and its eight neighbours, in that of most pixels and at least 1, up to which the
+model explains them: noise alone reaches it in one pixel of a million."""
+_LARGEST = 25.0
+"""A datum counts with this square at most."""
+VEILED = 5.0
+"""A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
+FLOATING = 0.2
+"""A region is floating when its level is uncertain by more than this share of its step to the ground."""
+MIN_REGION = 16
+"""Smaller regions are part of the jump that surrounds them [pixels]."""
+_FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))
+
+
+def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> np.ndarray:
+    """Return why a pixel is not valid, from the data alone (index into REASONS) [y, x].
+
+    Args:
+        stack: the images.
+        min_images: of a pixel that is solved: one for each of its unknowns.
+    """
+    reason = np.zeros(stack.shape[1:], np.uint8)
+    signal, _ = signal_of(stack)
+    flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
+    n_images = stack.is_observed.sum(0)
+    n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
+    reason[n_images - n_dark < FACET_IMAGES] = _MASKED
+    reason[n_images < min_images] = _FEW
+    return reason
+
+
+def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
+    """Return the number of the region of every pixel [y, x]: pixels joined by intact edges; the largest region is 0.
+
+    Args:
+        intact_x, intact_y: what is left of the edges [y, x - 1], [y - 1, x].
+    """
+    shape = (intact_x.shape[0], intact_y.shape[1])
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    is_joined = intact_y >= INTACT, intact_x >= INTACT
+    start, end = (
+        np.concatenate([ends[kept] for ends, kept in zip(side, is_joined, strict=True)])
+        for side in zip(along(pixel, 0), along(pixel, 1), strict=True)
+    )
+    graph = coo_matrix((np.ones(start.size), (start, end)), shape=(pixel.size, pixel.size))
+    return ranked(connected_components(graph, directed=False)[1]).reshape(shape)
+
+
+def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
+    """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
+
+    So are heights that an instrument far from what was stated has bent, or that are not converged, relative to most
+    others, by a large share of all relief: another explanation, or more rounds, would have taken them elsewhere.
+
+    Args:
+        height: [y, x], um.
+        samples: posterior deviations [sample, y, x], um.
+        region: from `regions` [y, x].
+        bent: as in `Posterior` [error, y, x], um.
+    """
+    flags = np.zeros(height.shape, bool)
+    if bent is not None:
+        relative = np.sqrt(((bent - np.median(bent, (1, 2), keepdims=True)) ** 2).sum(0))
+        flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
+    ground = region == 0
+    for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
+        inside = region == number
+        step = abs(float(np.median(height[inside]) - np.median(height[ground])))
+        spread = float(np.std(samples[:, inside].mean(1) - samples[:, ground].mean(1)))
+        flags |= inside & (spread > FLOATING * step)
+    return flags
+
+
+def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch: float, axis: int) -> np.ndarray:
+    """Return True for edges along an axis (0: y, 1: x) that are cut and part heights by more than `SMALLEST_JUMP`.
+
+    Args:
+        height, slope: heights, um, and slopes along the axis [y, x].
+        intact: what is left of the edges.
+        pitch: um.
+    """
+    return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
+
+
+def squares(residuals: np.ndarray) -> np.ndarray:
+    """Return the squares of residuals, limited, so that a few do not speak for all; 0 where there is none."""
+    return np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST)
+
+
+def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+    """Return True where the fit contradicts the images of a pixel and its neighbours together [y, x].
+
+    Heights that a wrong surface bends to, as beside a wall that nobody found, are stated as precise as others; no
+    datum need be far off alone. Data that were not observed, or lie outside, count as explained to one deviation.
+
+    Args:
+        residuals: of the fit, in standard deviations [detector, y, x].
+        is_observed: whether there is a datum [detector, y, x].
+    """
+    square = np.where(is_observed, squares(residuals), 1.0).mean(0)
+    around = uniform_filter(square, 3, mode="constant", cval=1.0)
+    return around > EXPLAINED * max(1.0, float(np.median(around)))
+
+
+def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+    """Return how many data tell of every pixel's facet [y, x].
+
+    Args:
+        model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].
+        is_observed: whether there is a datum [detector, y, x].
+    """
+    return np.sum(is_observed & (model_share < 1.0 - VEILED**-2), axis=0)
+
+
+def reasons_from_fit(
+    reason: np.ndarray,
+    is_explained: np.ndarray,
+    n_telling: np.ndarray,
+    jump_x: np.ndarray,
+    jump_y: np.ndarray,
+    is_floating: np.ndarray,
+) -> np.ndarray:
+    """Add what the fit knows to the reasons from the data [y, x].
+
+    A facet has two slopes: with fewer than two data that tell of it, it is masked.
+
+    Args:
+        reason: from `reasons_from_data` [y, x].
+        is_explained: whether the model explains the pixel's data [y, x].
+        n_telling: from `telling` [y, x].
+        jump_x, jump_y: from `depth_jumps` [y, x - 1], [y - 1, x].
+        is_floating: from `floating` [y, x].
+    """
+    at_jump = np.zeros(reason.shape, bool)
+    for jump, axis in ((jump_x, 1), (jump_y, 0)):
+        for end in along(at_jump, axis):
+            end |= jump
+    out = reason.copy()
+    out[(out == 0) & (at_jump | ~is_explained)] = _JUMP
+    out[(out == 0) & (n_telling < FACET_IMAGES)] = _MASKED
+    out[(out == 0) & is_floating] = _FLOATING
+    return out

@@ -1,0 +1,204 @@
+"""What a surface does beyond direct single scattering, for the fit: the tracer and the horizon march joined.
+
+`make_predictor` gives the callable that `reconstruct` asks for. Masks come from the horizon march, which takes what
+lies behind a rim for a sheet along the beam; multiple scattering is traced (or computed by radiosity). The side that
+the beam does not see may stand anywhere between that sheet and below the rim: both terms are predicted at two places
+(`UNSEEN_SHARES`), their mean is expected, and half their difference is one unknown of the fit.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.errors import GuardError, SceneError
+from helio_jax.forward.beam_frame import slopes_of_normal
+from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.masking import hidden_form_factor, hidden_response
+from helio_jax.forward.radiosity import Radiosity
+from helio_jax.instrument import Instrument
+from helio_jax.inverse.residuals import Prediction
+from helio_jax.micrograph import MicrographStack
+from helio_jax.scene.runout import ground_level, run_out
+from helio_jax.scene.surfaces import behind_rims, hollowed, surface_body
+from helio_jax.trace import masks
+from helio_jax.trace.denoise import passes_for, smooth_along_surface
+from helio_jax.trace.intersect import Hits, Intersector
+from helio_jax.trace.run import make_experiment, trace_pixels
+from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
+
+UNSEEN_SHARES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
+"""Where the unseen side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
+Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
+RAYS = 8
+"""Paths per pixel and branch."""
+SMOOTH_PATHS = 40
+"""The traced image is averaged over neighbours until this many paths count in every pixel."""
+CALM_PITCHES = 0.5
+"""Mean heights that differ from a pixel's by more than this many pitches are not of its facet."""
+MAX_BURIED = 0.05
+"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
+LIFT_PIXELS = 0.1
+"""How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
+
+
+def make_predictor(
+    stack: MicrographStack,
+    n_rays: int,
+    substrate_um: float | None = None,
+    seed: int = 7,
+    workers: int | None = None,
+    multiple: Literal["traced", "radiosity"] = "traced",
+    border: Literal["flat", "free"] = "flat",
+) -> Callable[..., Prediction]:
+    """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
+
+    Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
+    neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
+
+    The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
+    with a `flat` border by the flat z = 0, with a `free` one by what leads from the border to level ground (`run_out`;
+    in radiosity by the flat in either case).
+    Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
+    what is traced, by the cosine law.
+
+    Raises:
+        SceneError: radiosity is asked for below a scattering plate, which it does not know.
+    """
+    if multiple == "radiosity" and stack.instrument.plate.is_scattering:
+        raise SceneError(
+            "reconstruct.refine.multiple = 'radiosity': it knows nothing of what a scattering plate sends back: "
+            "set it to 'traced'"
+        )
+    dx, dy = pitch(stack.x), pitch(stack.y)
+    half = max(np.abs(stack.x).max(), np.abs(stack.y).max())
+
+    @lru_cache(maxsize=1)
+    def about_instrument(given: str) -> tuple[SpotGeometry, _Raster, Radiosity | None]:
+        instrument = Instrument.model_validate_json(given).with_cosine_plate()
+        reach = half + _surroundings(instrument) if substrate_um is None else max(0.5 * substrate_um, 1.001 * half)
+        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat")
+        geometry = SpotGeometry(instrument)
+        return geometry, raster, Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
+
+    def predict(height: np.ndarray, normals: np.ndarray, instrument: Instrument = stack.instrument) -> Prediction:
+        geometry, raster, radiosity = about_instrument(instrument.model_dump_json())
+        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
+        about = (geometry, dx, dy)
+        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
+
+        def response(change: np.ndarray) -> np.ndarray:
+            return np.asarray(hidden_response(height, a, b, *about, change))
+
+        if radiosity is not None:
+            return Prediction(radiosity(height, normals), hidden, response)
+        calm, calm_normals = _without_noise(height, normals, CALM_PITCHES * min(dx, dy))
+        sides = raster.sides(calm, calm_normals)
+        branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
+        settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
+        passes = passes_for(RAYS * branches, SMOOTH_PATHS)
+        traced = [smooth_along_surface(side.multiple(settings), calm_normals, passes) for side in sides]
+        if len(sides) == 1:
+            return Prediction(traced[0], hidden, response, normals=calm_normals)
+        is_masked = np.any(hidden != 0.0, axis=(0, 1))
+        sheet = raster.side(calm, calm_normals, 0.0).hidden(is_masked)
+        freed = [side.hidden(is_masked) - sheet for side in sides]
+        either = [m - np.einsum("kiyx,yxi->kyx", h, normals) for m, h in zip(traced, freed, strict=True)]
+        multiple, unseen = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
+        return Prediction(multiple, hidden + np.mean(freed, axis=0), response, unseen, calm_normals)
+
+    return predict
+
+
+def _surroundings(instrument: Instrument) -> float:
+    """Return how far beyond the image the ground scatters into the detectors [um].
+
+    A steep facet sees little of the far ground, but what lies below the outermost aperture, which it faces, sends much
+    of it up: the ground must go on beyond that by the plate's distance. The rest is below 0.2 % of the multiple
+    scattering of 55 degree flanks below an aperture at 46 degrees; without it 4.5 % are (tests/physics).
+    """
+    outermost = max(math.hypot(*a.center) + max(a.semi_axes) for a in instrument.apertures())
+    return outermost + instrument.sample_distance
+
+
+def _without_noise(height: np.ndarray, normals: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return heights [y, x], um, and unit normals [y, x, 3] averaged over neighbours on the same facet.
+
+    Facets that are rough with noise see one another: on a flat they would add half a per cent of its signal. Where the
+    mean height differs by more than `largest`, neighbours are at another level, and the height stays.
+    """
+    mean = smooth_along_surface(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), normals)
+    calm = np.moveaxis(mean[:3], 0, -1)
+    calm /= np.linalg.norm(calm, axis=-1, keepdims=True)
+    return np.where(np.abs(mean[3] - height) < largest, mean[3], height), calm
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A surface whose unseen side stands at one place: a point for every pixel, and the mesh through them."""
+
+    raster: "_Raster"
+    points: Hits
+    intersector: Intersector
+
+    def multiple(self, settings: TraceSettings) -> np.ndarray:
+        """Return the traced multiple scattering [detector, y, x]."""
+        r = self.raster
+        experiment = make_experiment(self.intersector, r.instrument, settings)
+        x, y = r.x.ravel(), r.y.ravel()
+        try:
+            tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
+        except GuardError as e:
+            found = str(e).split(";")[0]
+            raise GuardError(
+                f"the surface of the fit is too rough or steep to trace multiple scattering from ({found}): check "
+                "background and gains, or use method = 'nearfield'"
+            ) from e
+        return tally.probability()[0][1].reshape(-1, *r.x.shape)
+
+    def hidden(self, is_wanted: np.ndarray) -> np.ndarray:
+        """Return the hidden vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
+        r, p = self.raster, self.points.take(is_wanted.ravel())
+        offset = np.stack(r.instrument.sample_origin(r.x[is_wanted], r.y[is_wanted])[:2], -1)
+        found, _ = masks.hidden_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)
+        out = np.zeros((len(found), 3, *is_wanted.shape))
+        out[:, :, is_wanted] = np.moveaxis(found, -1, 1)
+        return out
+
+
+@dataclass(frozen=True)
+class _Raster:
+    """Beam positions [y, x], how far off the surface points are put, half the side of what is around [um], and whether
+    that is the flat z = 0; else it is level ground, to which the border leads."""
+
+    instrument: Instrument
+    x: np.ndarray
+    y: np.ndarray
+    lift: float
+    reach: float
+    is_flat_around: bool
+
+    def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> _Side:
+        """Return the surface with its unseen side at a share of the way back."""
+        shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
+        at = *self.instrument.surface_position(self.x, self.y, height), height
+        behind = behind_rims(*at, normals, shift, share)
+        if self.is_flat_around:
+            body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
+            body = hollowed(body, at, behind)
+        else:
+            ground = ground_level(height)
+            around, behind = (run_out(*points, ground, self.reach) for points in (at, behind))
+            body = hollowed(surface_body(*around), around, behind)
+        point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
+        return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
+
+    def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
+        """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
+        at = *self.instrument.surface_position(self.x, self.y, height), height
+        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0), at)
+        return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]

@@ -1,0 +1,396 @@
+"""The main job: the only module that joins the stages. Everything here is also public as `helio_jax.NAME`."""
+
+import json
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from helio_jax.alignment.align import AlignSettings, align_scans
+from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
+from helio_jax.calibration.noise import add_noise
+from helio_jax.errors import InputFileError, ResumeError, SceneError
+from helio_jax.figures.before_after import save_before_after
+from helio_jax.figures.panel import panel, save_figure
+from helio_jax.figures.report import write_report
+from helio_jax.formats.hdf5 import read_stack, write
+from helio_jax.formats.parts import Parts
+from helio_jax.formats.points import read_points
+from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
+from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.residuals import Prediction
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.scores.metrics import Scores, Truth, evaluate_height
+from helio_jax.trace.scan import Crew, trace_scene
+from helio_jax.workflows.calibrate_rotated import calibrate_turned, flat_signal
+from helio_jax.workflows.checkpoint import Keeper, Shard, is_finished
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.provenance import with_provenance
+from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
+from helio_jax.workflows.truth import true_height
+
+DEFAULT_CREW = Crew()
+"""Threads of this process, one per CPU."""
+Stage = Callable[[str], Any]
+"""Called with the name of each stage; a context manager that yields its progress callback."""
+RUN_FILES = {
+    "micrographs": "micrographs.h5",
+    "height map": "height.h5",
+    "scores": "scores.json",
+    "report": "report.html",
+    "panel": "report.png",
+}
+"""What `run` writes in its folder."""
+
+
+def _silent(label: str) -> Any:
+    return nullcontext()
+
+
+def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> Micrographs:
+    """Trace a scene's micrographs: expected counts, or analog ones with `estimator="analog"`.
+
+    A stack, or a set of stacks where the scan has several views (distances, rotations).
+
+    Args:
+        scene: from `load_scene`.
+        progress: called with (pixels done, pixels in all).
+        trace: settings of table [trace] that replace the scene's, e.g. rays=2000, seed=1.
+
+    Raises:
+        SceneError: an unknown or impossible setting.
+        GuardError: ray book-keeping failed.
+    """
+    return trace_scene(scene, scene.trace.changed(**trace), progress)
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """How `simulate_file` goes about it; the counts depend on `noise` alone.
+
+    Attributes:
+        noise: add the scene's counting noise and background, if its table [noise] is enabled.
+        crew: who runs the units of work.
+        shard: "i/N": run the i-th of N shares only; who finishes last writes the file.
+        restart: discard what an unfinished run left.
+        progress: called with (pixels done, pixels in all).
+        say: called with messages.
+    """
+
+    noise: bool = False
+    crew: Crew = DEFAULT_CREW
+    shard: str | None = None
+    restart: bool = False
+    progress: Callable[[int, int], None] | None = None
+    say: Callable[[str], None] = lambda text: None
+
+
+def simulate_file(
+    scene_path: str | Path,
+    output: str | Path,
+    *,
+    overrides: dict[str, Any] | None = None,
+    options: SimulateOptions = SimulateOptions(),
+    verb: str = "simulate",
+) -> Micrographs | None:
+    """Trace a scene's micrographs into a file; finished units are kept in OUTPUT.parts until it is written.
+
+    Where such parts are found, the run goes on from there.
+
+    Args:
+        scene_path: of the scene file.
+        output: of the HDF5 file.
+        overrides: settings that win over the scene, dotted keys.
+        options: noise, workers, shards.
+        verb: the command that `resume` gives again: "simulate", or "run" where that is what was asked for.
+
+    Returns:
+        The micrographs; None where other shards are still missing.
+
+    Raises:
+        ResumeError: the parts found are of another scene, surface, seed or version.
+        InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; the message says how to go on.
+        GuardError: ray book-keeping failed.
+    """
+    o, overrides = options, overrides or {}
+    check_outputs(files_read(scene_path, "the scene", overrides), [("output", Path(output))])
+    scene = load_scene(scene_path, overrides)
+    parts = Parts(Path(output))
+    shard = Shard.parse(o.shard) if o.shard else None
+    command = {
+        "verb": verb,
+        "scene": str(Path(scene_path).resolve()),
+        "overrides": overrides,
+        "noise": o.noise,
+        "crew": asdict(o.crew),
+    }
+    keeper = Keeper(parts, command, o.crew, shard, o.restart, o.say)
+    stack = keeper.trace(scene, scene.trace, o.progress)
+    if stack is None:
+        return None
+    stack = with_provenance(record(scene, stack) if o.noise else stack, scene, scene_path)
+    parts.finish(lambda path: write(stack, path))
+    return stack
+
+
+def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], None] = print) -> list[Path]:
+    """Go on with an unfinished simulation (`path`: its file) or run (its folder); return the files written.
+
+    Raises:
+        ResumeError: there is nothing to go on with, or something changed since.
+    """
+    path = Path(path)
+    output = path / "micrographs.h5" if path.is_dir() else path
+    parts = Parts(output)
+    if not parts.exist:
+        if is_finished(output):
+            parts.remove()  # what is left when a process is killed while it cleans up
+            say(f"{output} is complete: nothing to resume")
+            return []
+        raise ResumeError(f"there is no unfinished run of {output}: {parts.folder} does not exist; start it anew")
+    try:
+        c = parts.manifest()["command"]
+        scene, crew = Path(c["scene"]), Crew(**c["crew"])
+        is_run, overrides, noise = c["verb"] == "run", dict(c["overrides"]), bool(c["noise"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise ResumeError(f"{parts.folder}/manifest.json is damaged ({e!r}): remove the folder, start anew") from None
+    if not scene.is_file():
+        raise ResumeError(f"the scene {scene} of {parts.folder} is gone: put it back, or remove the folder")
+    if is_run:
+        return list(run(scene, output.parent, overrides=overrides, stage=stage, crew=crew, say=say).files.values())
+    with stage("tracing") as progress:
+        options = SimulateOptions(noise=noise, crew=crew, progress=progress, say=say)
+        simulate_file(scene, output, overrides=overrides, options=options)
+    return [output]
+
+
+def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
+    """Return micrographs as the scene's experiment would record them: with counting noise, if the scene asks for it.
+
+    Every view has noise of its own.
+    """
+    if isinstance(stack, MicrographSet):
+        noise = (scene.noise.model_copy(update={"seed": scene.noise.seed + i}) for i in range(len(stack.stacks)))
+        views = zip(stack.stacks, noise, strict=True)
+        seen = (add_noise(s, n) if n.enabled and s.noise == "expected" else s for s, n in views)
+        return replace(stack, stacks=tuple(seen))
+    return add_noise(stack, scene.noise) if scene.noise.enabled and stack.noise == "expected" else stack
+
+
+def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
+    """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`).
+
+    Args:
+        stack: measured counts.
+        settings: how; default: its defaults.
+        changes: settings that replace those, e.g. drift=False.
+
+    Raises:
+        SceneError: the stack is calibrated already, or its beam is known (simulated).
+        GuardError: a detector has no signal.
+    """
+    if stack.n_rays is not None:
+        raise SceneError(
+            f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
+            "calibrated already; calibrate the imported file itself"
+        )
+    return calibrate_on_border(
+        stack, flat_signal(stack.instrument), (settings or CalibrateSettings()).changed(**changes)
+    )
+
+
+def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
+    """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
+    picture = Path(output).with_suffix(".png")
+    check_outputs([("path", Path(path))], [("output", Path(output)), ("output: the .png beside it", picture)])
+    before = read_stack(path)
+    after = calibrate(before, **changes)
+    write(after, output)
+    save_before_after(before, after, picture)
+    return after
+
+
+_LIMITS = "robust_limits", "jump_limits"
+"""One schedule in two settings of the same length: who gives one of them gives both."""
+
+
+def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
+    """Return changes of the settings, those added that the stack's calibration asks for and nobody has given."""
+    given = dict(changes.get("refine", {}))
+    calibration = stack.provenance.get("calibrate") or stack.provenance.get("self_calibrate", {})
+    priors = calibration.get("priors", {})
+    taken = settings.refine.model_fields_set | given.keys()
+    if taken & set(_LIMITS):
+        taken |= set(_LIMITS)
+    asked = {key: value for key, value in priors.items() if key not in taken}
+    if not asked and not given:
+        return changes
+    return changes | {"refine": settings.refine.model_dump() | asked | given}
+
+
+def align(
+    scans: MicrographSet, points: str | Path | None = None, **changes: Any
+) -> tuple[MicrographStack, dict[str, tuple[float, float]]]:
+    """Align turned scans, by control points (a CSV file) or automatically; see `prepare.align`.
+
+    Returns:
+        One stack, and where the control points are in its frame [um] (empty without them).
+    """
+    picks = read_points(points) if points is not None else None
+    stack, found = align_scans(scans, picks, AlignSettings().changed(**changes), str(points or ""))
+    return stack, {} if found.points is None else found.points.places
+
+
+def reconstruct(
+    stack: MicrographStack | MicrographSet,
+    method: str | None = None,
+    *,
+    settings: ReconstructSettings | None = None,
+    report: Callable[[int, int, str], None] | None = None,
+    workers: int | None = None,
+    **changes: Any,
+) -> Reconstruction:
+    """Turn micrographs into heights.
+
+    Args:
+        stack: three or more images on one raster.
+        method: "linear", "nearfield" or "refine"; default: the settings' own.
+        settings: table [reconstruct]; default: its defaults.
+        report: called before each round of the refinement with (round, rounds, what is known).
+        workers: threads that trace; default: one per CPU that this process may use.
+        changes: settings that replace those, e.g. integrator="dct_poisson".
+
+    Raises:
+        GuardError: too few images.
+        InputFileError: a set of several scans, which must be aligned first.
+    """
+    one = stack.only()
+    if one.positions is not None:
+        raise InputFileError(
+            f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
+        )
+    wanted = changes | ({"method": method} if method else {})
+    settings = settings or ReconstructSettings()
+    if one.noise == "measured" and one.n_rays is None:
+        is_fit = wanted.get("method", settings.method) == "refine"
+        one = calibrate_turned(one, keeps_multiple=is_fit) if "align" in one.provenance else calibrate(one)
+    chosen = settings.changed(**_with_priors(settings, one, wanted))
+    refine = chosen.refine
+
+    def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
+        about = {"multiple": refine.multiple, "border": chosen.border, "workers": workers}
+        return make_predictor(one, n_rays, refine.substrate_um, **about)
+
+    rec = reconstruct_stack(one, chosen, make_predict, report)
+    others = [f"{name} ({kind})" for name, kind in one.provenance.get("materials", {}).items() if kind != "cosine"]
+    if not others:
+        return rec
+    return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
+
+
+def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
+    """Score a reconstruction against the true heights of the same rays (DATA.md, "How we score spheres")."""
+    return evaluate_height(rec, truth)
+
+
+def write_report_files(
+    path: str | Path,
+    stack: MicrographStack | None,
+    rec: Reconstruction,
+    truth: Truth | None,
+    scores: Scores | None,
+    *,
+    title: str,
+) -> Path:
+    """Write the HTML report and the PNG panel beside it; return the panel's path."""
+    path = Path(path)
+    panel_path = path.with_suffix(".png")
+    save_figure(panel(stack, rec, truth, scores), panel_path)
+    write_report(path, stack, rec, truth, scores, panel_png=panel_path, title=title)
+    return panel_path
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What `run` made: scores, and where the files are."""
+
+    name: str
+    method: str
+    status: str
+    scores: Scores
+    files: dict[str, Path]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a JSON-compatible summary."""
+        files = {key: str(path) for key, path in self.files.items()}
+        return {
+            "name": self.name,
+            "method": self.method,
+            "status": self.status,
+            **self.scores.as_dict(),
+            "files": files,
+        }
+
+
+def run(
+    scene_path: str | Path,
+    folder: str | Path | None = None,
+    *,
+    overrides: dict[str, Any] | None = None,
+    stage: Stage = _silent,
+    crew: Crew = DEFAULT_CREW,
+    restart: bool = False,
+    report: bool = True,
+    say: Callable[[str], None] = lambda text: None,
+) -> RunResult:
+    """Do the main job: simulate, reconstruct, score, report.
+
+    Each file is written as soon as it is known, so that an interrupted run keeps what was finished.
+
+    Args:
+        scene_path: of the scene file.
+        folder: where the files go; default helio-out/NAME.
+        overrides: settings that win over the scene, dotted keys.
+        stage: called with the name of each stage; a context manager that yields its progress callback.
+        crew: who traces.
+        restart: discard what an unfinished run left in the folder.
+        report: write the HTML report and the PNG panel, too.
+        say: called with messages.
+
+    Raises:
+        ResumeError: the folder holds an unfinished run of something else.
+        InterruptedRun, StoppedRun: stopped while tracing; what was finished is kept.
+    """
+    scene = load_scene(scene_path, overrides)
+    if scene.scan.kind != "raster" or scene.scan.n_views > 1:
+        raise SceneError(
+            f"{scene_path}: heights come from one raster, scan.kind is {scene.scan.kind!r} with {scene.scan.n_views} "
+            "view(s): use helio simulate, which writes any scan"
+        )
+    scene.apertures()  # heights need them: told before anything is traced
+    out = Path(folder) if folder else Path("helio-out") / scene.name
+    names = {label: name for label, name in RUN_FILES.items() if report or label not in ("report", "panel")}
+    check_outputs(files_read(scene_path, "the scene", overrides), files_within("-o", out, names.values()))
+    files = {label: out / name for label, name in names.items()}
+    make_folder(out)
+    with stage("simulating micrographs") as progress:
+        options = SimulateOptions(noise=True, crew=crew, restart=restart, progress=progress, say=say)
+        stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
+    assert isinstance(stack, MicrographStack)  # no shards here, and one view
+    with stage("reconstructing heights") as progress:
+        rec = reconstruct(stack, settings=scene.reconstruct, report=progress, workers=crew.workers)
+    write(rec, files["height map"])
+    with stage("scoring and reporting"):
+        truth = true_height(scene, rec)
+        scores = evaluate(rec, truth)
+        with atomic_path(files["scores"]) as part:
+            part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")
+        if report:
+            title = f"{scene.name}: simulated, reconstructed, scored"
+            write_report_files(files["report"], stack, rec, truth, scores, title=title)
+    return RunResult(scene.name, rec.method, rec.status, scores, files)

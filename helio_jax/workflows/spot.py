@@ -1,0 +1,39 @@
+"""The beam's spot: the tracer's beam and its picture joined. Behind `helio spot`."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from helio_jax.errors import SceneError
+from helio_jax.figures.spot import measure_spot, save_spots
+from helio_jax.scene.scene import Scene
+from helio_jax.trace.source import footprint
+
+SPOT_RAYS = 32768
+"""Rays from which the spot is measured and drawn."""
+
+
+def draw_spot(scene: Scene, heights: Sequence[float], path: str | Path | None, seed: int = 1) -> list[dict[str, float]]:
+    """Measure the beam's spot on planes above the reference plane, and draw it.
+
+    Args:
+        scene: from `load_scene`.
+        heights: of the planes [um].
+        path: of the figure, or None.
+        seed: of the random numbers.
+
+    Raises:
+        SceneError: a height is not finite, or not below the plate.
+    """
+    if wrong := [h for h in heights if not math.isfinite(h)]:
+        raise SceneError(f"heights must be finite numbers of um, got {wrong[0]:g}: correct or remove it")
+    if wrong := [h for h in heights if h >= scene.sample_distance]:
+        limit = f"{scene.sample_distance:g} um above the reference plane"
+        raise SceneError(f"heights must lie below the plate, which is {limit}, got {wrong[0]:g} um: choose lower ones")
+    points = footprint(scene.instrument, np.array(heights), SPOT_RAYS, seed, scene.read_rays())
+    spots = [{"height_um": float(h), **measure_spot(p)} for h, p in zip(heights, points, strict=True)]
+    if path is not None:
+        save_spots(points, spots, f"{scene.name}: the beam's spot", Path(path))
+    return spots

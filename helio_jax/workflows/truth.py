@@ -1,0 +1,89 @@
+"""The true surface that a reconstruction is scored against: of a scene, or of another height map. Never in a fit."""
+
+from pathlib import Path
+
+import numpy as np
+
+from helio_jax.errors import SceneError
+from helio_jax.formats.hdf5 import HDF5_SUFFIXES, read_height
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.scene.shapes import SpheresSample
+from helio_jax.scene.surfaces import first_hit_spheres
+from helio_jax.scores.metrics import Region, Truth
+from helio_jax.scores.metrics import fit_center as fit_sphere_center
+from helio_jax.trace.intersect import MISS, Intersector
+from helio_jax.trace.run import first_hits
+from helio_jax.workflows.scene_file import SceneFile, load_scene
+
+SUBSTRATE_RATIO = 1.35
+"""Where a scene does not say: the substrate begins at this many radii of the scored region."""
+
+
+def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
+    """Return the true first hit of the beam axis for every pixel of a reconstruction's raster.
+
+    Raises:
+        SceneError: the beam misses the sample in some pixel.
+    """
+    return true_surface(scene, rec.raster_x, rec.raster_y)
+
+
+def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray) -> Truth:
+    """Return the same for the beam positions x [x] and y [y], um."""
+    grid_x, grid_y = np.meshgrid(x, y)
+    hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
+    n_missed = int(np.sum(hits.surface == MISS))
+    if n_missed:
+        raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or shrink the scan")
+    height = hits.point[:, 2].reshape(grid_x.shape)
+    return Truth(height, hits.normal.reshape(*grid_x.shape, 3), _region(scene, float(height.max())))
+
+
+def _region(scene: SceneFile, top: float) -> Region | None:
+    """Return the scored region of a scene's table [truth], or None where it names none."""
+    t = scene.truth
+    if t.region_radius_um is None:
+        return None
+    return Region(
+        center=t.region_center_um,
+        radius=t.region_radius_um,
+        substrate_radius=t.substrate_radius_um or SUBSTRATE_RATIO * t.region_radius_um,
+        height=t.height_um or top,
+    )
+
+
+def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = False) -> Truth:
+    """Return the truth of a scene file, or of another reconstruction on the same raster.
+
+    Args:
+        path: scene (.toml) or height map (.h5).
+        rec: what will be scored.
+        fit_center: for a scene of one sphere: fit its position first, as for measured data (DATA.md).
+
+    Raises:
+        InputFileError: the file is missing, damaged or of another kind, or on another raster.
+        SceneError: `fit_center` without a scene of one sphere and a scored region.
+    """
+    if Path(path).suffix.lower() in HDF5_SUFFIXES:
+        other = read_height(path)
+        return Truth(other.height, other.normals)
+    scene = load_scene(path)
+    return _fitted_truth(path, scene, rec) if fit_center else true_height(scene, rec)
+
+
+def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
+    """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
+    sample, region = scene.sample, _region(scene, 0.0)
+    if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or sample.is_placed or region is None:
+        raise SceneError(
+            f"{path}: fitting a centre needs a scene with one sphere, which sample.scale, rotate_deg and translate_um "
+            "leave where it is, and truth.region_radius_um"
+        )
+    grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
+    (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift
+
+    def sphere_at(x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+        return first_hit_spheres(grid_x, grid_y, np.array([[x, y, z, radius]]), shift)
+
+    found = fit_sphere_center(rec, lambda x, y: sphere_at(x, y)[0], region)
+    return Truth(*sphere_at(*found.center), found)
