@@ -29,6 +29,10 @@ class GuardError(HelioError):
     exit_code = 4
 
 
+class PredictionError(GuardError):
+    """Masking or multiple scattering cannot be computed for this surface."""
+
+
 class MissingDependencyError(HelioError):
     """An optional package is not installed."""
 

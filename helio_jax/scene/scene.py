@@ -86,8 +86,8 @@ class Scene(Instrument):
 
     @property
     def instrument(self) -> Instrument:
-        """Beam, plate and detectors alone, as a stack carries them."""
-        return Instrument(beam=self.beam, plate=self.plate, detector=self.detector)
+        """The scene without sample and scan, as a micrograph stack carries it."""
+        return Instrument(**{name: getattr(self, name) for name in Instrument.model_fields})
 
     @property
     def base_dir(self) -> Path:

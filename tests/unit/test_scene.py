@@ -10,7 +10,7 @@ import pytest
 
 from helio_jax.calibration.noise import NoiseSettings, add_noise
 from helio_jax.errors import InputFileError, SceneError
-from helio_jax.instrument import Instrument
+from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.scene_file import SceneFile, json_schema, load_instrument, load_scene, resolved
 
@@ -60,6 +60,13 @@ def test_shipped_scenes_validate(path):
 def test_shipped_instruments_load(path):
     """Catches: a typo in an instrument file."""
     assert isinstance(load_instrument(path), Instrument)
+
+
+def test_instrument_of_a_scene_keeps_its_uncertainty(tmp_path):
+    """Every view's instrument carries the table [uncertainty]. Catches a fit that takes uncertain angles as exact."""
+    scene = load_scene(write(tmp_path, MINIMAL + "sample_distances_um = [4000, 5000]\n[uncertainty]\npolar_deg = 2\n"))
+    assert scene.uncertainty == Uncertainty(polar_deg=2.0)
+    assert {i.uncertainty for i in (scene.instrument, *(v.instrument for v in scene.views()))} == {scene.uncertainty}
 
 
 def test_sphere_a_is_the_reference():
