@@ -1,16 +1,16 @@
-"""The command line: `helio` (= `python -m helio_jax`): the commands of the folder `commands`, and exit codes."""
+"""Entry point of the command line `helio` (= `python -m helio_jax`)."""
 
 import sys
 import traceback
 
-from helio_jax.commands import about, heights, measured, simulating  # noqa: F401 (they register their commands)
+from helio_jax.commands import about, heights, measured, simulating  # noqa: F401 (each registers its commands)
 from helio_jax.commands.app import app, say
 from helio_jax.errors import HelioError
 from helio_jax.workflows.compilation_cache import keep_compiled
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line; ends the process with a documented exit code (errors.py)."""
+    """Run the command line and end the process with an exit code of errors.py."""
     keep_compiled()
     try:
         app(args=args, standalone_mode=True)

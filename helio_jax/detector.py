@@ -1,7 +1,6 @@
-"""What catches atoms: apertures in the plate, and cones of directions at infinity.
+"""Detectors: elliptical apertures in the plate, cones of directions at infinity, or parts of the plate's mesh.
 
-A detector of a scene is one of the two; its `opening` is what the tracer and the reconstruction work with.
-Frames and units: instrument.py. Does not know the beam, any sample or ray.
+`Detector` holds the settings; tracer and reconstruction use the resolved `Aperture` or `Cone`. Frames: instrument.py.
 """
 
 import math
@@ -15,24 +14,23 @@ from helio_jax.settings import Settings
 
 @dataclass(frozen=True)
 class Aperture:
-    """A detector aperture resolved to its ellipse on the plate (lab frame, um, radians, SEMI-axes)."""
+    """An ellipse on the plate (lab frame): centre and semi-axes [um], rotation [rad]."""
 
     center: tuple[float, float]
     semi_axes: tuple[float, float]
     rotation: float
 
     def rim(self, n_points: int) -> np.ndarray:
-        """Return `n_points` rim points and tangents, equally spaced in the ellipse's parameter.
+        """Compute rim points and tangents, equally spaced in the ellipse's parameter, counter-clockwise from above.
 
         Returns:
-            Array [2, n_points, 2]: positions (x, y) on the plate [um] and derivatives with respect to the
-            parameter [um/rad], counter-clockwise seen from above.
+            Positions (x, y) on the plate [um] and their derivatives by the parameter [um/rad], [2, n_points, 2].
         """
         s = 2 * np.pi * np.arange(n_points) / n_points
         (a, b), c, d = self.semi_axes, math.cos(self.rotation), math.sin(self.rotation)
-        turn = np.array([[c, -d], [d, c]])
-        points = np.stack([a * np.cos(s), b * np.sin(s)], -1) @ turn.T + np.asarray(self.center)
-        tangents = np.stack([-a * np.sin(s), b * np.cos(s)], -1) @ turn.T
+        rotation = np.array([[c, -d], [d, c]])
+        points = np.stack([a * np.cos(s), b * np.sin(s)], -1) @ rotation.T + np.asarray(self.center)
+        tangents = np.stack([-a * np.sin(s), b * np.cos(s)], -1) @ rotation.T
         return np.stack([points, tangents])
 
 
@@ -45,12 +43,12 @@ class Cone:
 
     @property
     def solid_angle(self) -> float:
-        """Of the cone [sr]."""
+        """Solid angle of the cone [sr]."""
         return 4.0 * math.pi * math.sin(0.5 * self.half_angle) ** 2
 
 
 def axis_frame(axis: np.ndarray) -> np.ndarray:
-    """Return an orthonormal frame [3, 3] whose last row is the unit vector `axis`."""
+    """Construct an orthonormal frame [3, 3] whose last row is the unit vector `axis`."""
     side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
     first = np.cross(side, axis)
     first /= np.linalg.norm(first)
@@ -58,18 +56,14 @@ def axis_frame(axis: np.ndarray) -> np.ndarray:
 
 
 def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: float) -> Aperture:
-    """Cut a circular cone with the plate: the exact ellipse seen under `half_angle` from the nominal spot.
+    """Intersect a circular cone about the nominal spot with the plate; the major axis lies along the azimuth.
 
     Valid for polar + half_angle < pi/2.
 
     Args:
-        polar: angle of the cone's axis to the plate normal [rad].
-        azimuth: azimuth of the axis [rad].
+        polar, azimuth: direction of the cone's axis, `polar` from the plate normal [rad].
         half_angle: half-angle of the cone [rad].
         distance: from the nominal spot to the plate [um].
-
-    Returns:
-        The ellipse, major axis along the azimuth.
 
     Source: own derivation (plane section of a cone), tests/unit/test_instrument.py.
     """
@@ -84,15 +78,14 @@ _KINDS = (
     (("polar_deg", "half_angle_deg"), ("azimuth_deg", "at_infinity")),
     (("part",), ()),
 )
-"""Keys that a detector of each kind needs, and those that it may have."""
+"""Required and optional keys of each kind of detector."""
 
 
 class Detector(Settings):
-    """One detector: an ellipse on the plate, the cone it fills seen from the nominal spot, a cone at infinity, or a
-    part of the plate's mesh.
+    """One detector: an ellipse on the plate, a cone about the nominal spot, a cone at infinity, or a mesh part.
 
-    Where detectors overlap, the first one in the list has what both would catch. Under a mesh plate an atom is caught
-    by the first surface that it meets (of two ellipses in one plane, the first in the list), and by cones at last.
+    Where detectors overlap, the first one in the list counts the atoms. With a plate of kind "mesh" the first surface
+    that an atom hits counts it (of two ellipses in one plane: the first in the list); cones at infinity come last.
     """
 
     name: str = Field(min_length=1, max_length=64)
@@ -104,7 +97,7 @@ class Detector(Settings):
     rotation_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
     """Rotation of the ellipse, counter-clockwise seen from above (default 0) [deg]."""
     height_um: float | None = Field(default=None, ge=0.0, le=1e7)
-    """Height of the ellipse above the underside of a plate of kind "mesh": a surface that counts, behind a channel say
+    """Height of the ellipse above the underside of a plate of kind "mesh", for example at the end of a channel
     (default 0) [um]."""
     polar_deg: float | None = Field(default=None, ge=0.0, lt=90.0)
     """Angle between the cone's axis and the plate normal, seen from the nominal spot [deg]."""
@@ -113,13 +106,13 @@ class Detector(Settings):
     half_angle_deg: float | None = Field(default=None, gt=0.0, le=90.0)
     """Half-angle of the cone [deg]."""
     at_infinity: bool = False
-    """The cone is one of directions, wherever an atom comes from: it catches those that hit nothing any more and fly in
-    a direction within the cone (not with a flat scattering plate)."""
+    """The cone is a range of directions: it counts atoms from any point that leave within the cone and hit nothing
+    else (not with a flat scattering plate)."""
     part: str | None = Field(default=None, min_length=1, max_length=200)
-    """Part of the mesh of a plate of kind "mesh" that counts what hits it: OBJ: its material (usemtl), group or object;
-    GLB: its geometry."""
+    """Part of the mesh of a plate of kind "mesh" that counts the atoms that hit it: name of an OBJ material (usemtl),
+    group or object, or of a GLB geometry."""
     channel: int | None = Field(default=None, ge=1, le=1000)
-    """Channel of a measured file that this aperture feeds (1-based); only used on import."""
+    """Channel of this aperture in a measured file (1-based); only used on import."""
 
     @model_validator(mode="after")
     def _is_of_one_kind(self) -> "Detector":
@@ -138,7 +131,7 @@ class Detector(Settings):
         return self
 
     def _check_cone(self, polar: float, half_angle: float) -> None:
-        """Refuse cones that leave the half space above the sample, or that the plate does not cut in an ellipse."""
+        """Refuse cones that reach below the sample's plane, or whose section with the plate is no ellipse."""
         if self.at_infinity and polar + half_angle > 90.0:
             raise ValueError(
                 f"detector {self.name!r}: polar_deg + half_angle_deg must be <= 90 deg so that the cone stays above "
@@ -152,11 +145,11 @@ class Detector(Settings):
 
     @property
     def needs_mesh(self) -> bool:
-        """Whether it makes sense with a plate of kind "mesh" only."""
+        """Whether it requires a plate of kind "mesh"."""
         return self.part is not None or self.height_um is not None
 
     def opening(self, working_distance: float) -> Aperture | Cone | None:
-        """Return the ellipse on a plate `working_distance` [um] high, the cone at infinity; None: a mesh's part."""
+        """Resolve to the ellipse on a plate at `working_distance` [um], or the cone at infinity; None: a mesh part."""
         if self.part is not None:
             return None
         if self.center_um is not None and self.axes_um is not None:

@@ -1,12 +1,11 @@
-"""Errors a user may meet, each with the exit code the command line ends with.
+"""Expected errors, each with the exit code of the command line. Exit code 1 is reserved for bugs.
 
-Every message names the quantity, the value, the limit and the remedy. Exit code 1 is kept for bugs:
-anything that is not a `HelioError`. This module imports nothing of the package.
+Every message names the quantity, the value, the limit and the remedy.
 """
 
 
 class HelioError(Exception):
-    """Base of all expected errors; `exit_code` is what `helio` returns to the shell."""
+    """Base of all expected errors."""
 
     exit_code = 1
 
@@ -18,13 +17,13 @@ class SceneError(HelioError):
 
 
 class InputFileError(HelioError):
-    """A data file is missing, corrupt, of an unknown kind, or lacks something that is needed."""
+    """A data file is missing, corrupt, incomplete or of an unknown kind."""
 
     exit_code = 3
 
 
 class GuardError(HelioError):
-    """A numerical or ray-counting guard failed: the result would not be trustworthy."""
+    """A numerical or ray-counting check failed: the result would not be reliable."""
 
     exit_code = 4
 
@@ -40,18 +39,18 @@ class MissingDependencyError(HelioError):
 
 
 class ResumeError(HelioError):
-    """A run cannot be continued from what is on disk."""
+    """The files on disk do not allow the run to be resumed."""
 
     exit_code = 6
 
 
 class StoppedRun(HelioError):
-    """The run was stopped from outside (SIGTERM, a batch system's time limit, lost workers); it can go on."""
+    """The run was stopped from outside (SIGTERM, time limit of a batch system, lost workers) and can be resumed."""
 
     exit_code = 75
 
 
 class InterruptedRun(HelioError):
-    """The user stopped the run; what was finished has been saved."""
+    """The user stopped the run; finished work has been saved."""
 
     exit_code = 130

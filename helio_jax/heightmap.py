@@ -1,4 +1,4 @@
-"""Height maps on a regular grid of the sample frame: samples, truths and exports. Does no computation."""
+"""Height maps on a regular grid of the sample frame. No computation."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from helio_jax.errors import InputFileError
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Heights on a regular x, y grid.
+    """Heights on a regular x, y grid (checked when made).
 
     Attributes:
-        height: height above the reference plane [y, x], um; NaN where unknown.
+        height: height above the substrate [y, x], um; NaN where unknown.
         x, y: grid positions in the sample frame [um], increasing, equally spaced.
     """
 

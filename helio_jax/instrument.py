@@ -1,10 +1,8 @@
-"""The microscope: beam, pinhole plate and detector apertures, and the geometry that follows from them.
+"""The microscope: beam, pinhole plate, detectors and the geometry derived from them.
 
-Flows with the micrographs (`MicrographStack.instrument`), so that a stack can be reconstructed without its
-scene. Frames (DESIGN.md section 1): the lab frame has z up from sample to plate and its origin where the beam
-axis is at the design working distance W below the plate; the sample frame has the same axes and z = 0 on
-the sample's reference plane, which stands the sample distance D below the plate.
-Does not know any sample, ray or image.
+Every micrograph stack carries its instrument, so that it can be reconstructed without its scene. Lab frame: z up from
+sample to plate, origin on the beam axis at the design working distance W below the plate (the nominal spot). Sample
+frame: same axes, z = 0 on the substrate, which is the sample distance D below the plate. See docs/conventions.md.
 """
 
 import math
@@ -19,14 +17,14 @@ from helio_jax.settings import Settings, Unit
 
 
 class Effusive(Settings):
-    """Atoms that leave the pinhole by effusion, in all directions: cos^n about the plate normal."""
+    """Effusive beam: atoms that leave the pinhole with a cos^n distribution about the plate normal."""
 
     exponent: float = Field(default=1.0, ge=0.0, le=1000.0)
     """n of cos^n per steradian; 1: a thin orifice."""
     atoms_per_pixel: float = Field(gt=0.0, le=1e18)
-    """Effusive atoms per pixel that `effuse` stands for (as scan.atoms_per_pixel for the beam)."""
+    """Effusive atoms per pixel that the counts `effuse` correspond to (as scan.atoms_per_pixel for the beam)."""
     rays: int = Field(default=64, ge=8, le=10_000_000)
-    """Effusive rays per pixel; with `analog` the whole counts are those of so many atoms."""
+    """Effusive rays per pixel; with the estimator `analog` the counts are those of this number of atoms."""
 
 
 class Beam(Settings):
@@ -41,12 +39,12 @@ class Beam(Settings):
     source: Literal["uniform", "gaussian", "pencil", "rays"] = "uniform"
     """Angular distribution about the beam axis; `pencil` is parallel; `rays`: positions and directions from a file."""
     source_size_mrad: float = Field(default=0.5, ge=0.0, le=500.0)
-    """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; else ignored [mrad]."""
+    """`uniform`: largest polar angle; `gaussian`: standard deviation per axis; otherwise ignored [mrad]."""
     file: str | None = Field(default=None, min_length=1, max_length=4096)
     """`rays`: file of rays (.csv, .npy, .npz), relative to the scene file: position (x, y, z) relative to the pinhole's
-    centre in um, direction (x, y, z) and, if given, weight of every ray; lab axes, z up to the plate's outer side."""
+    centre in um, direction (x, y, z) and optional weight of every ray; lab axes, z up to the plate's outer side."""
     effusive: Effusive | None = None
-    """Effusive beam, traced besides the beam and counted apart; default: none."""
+    """Effusive beam, traced separately and stored separately from the counts; default: none."""
 
     @model_validator(mode="after")
     def _has_a_file_for_rays(self) -> "Beam":
@@ -59,36 +57,36 @@ class Beam(Settings):
 
 
 class Plate(Settings):
-    """The pinhole plate: the plane that holds the pinhole and the detector apertures."""
+    """The pinhole plate, which holds the pinhole and the detector apertures."""
 
     kind: Literal["transparent", "scattering", "mesh"] = "transparent"
-    """`transparent`: atoms that miss every aperture pass through and are gone; `scattering`: its underside sends them
-    back by the law of its material, but for the apertures and the pinhole, which are holes; `mesh`: a solid from a
-    file, with channels, that scatters by the law of its material (trace.estimator = "analog" only)."""
+    """`transparent`: atoms that miss every aperture are lost; `scattering`: its underside scatters by the law of its
+    material, apertures and pinhole are holes; `mesh`: a solid from a file, with channels, that scatters by the law of
+    its material (trace.estimator = "analog" only)."""
     working_distance_um: float = Field(gt=0.0, le=1e7)
-    """Design working distance W: below the pinhole plate, where the apertures are aimed [um]."""
+    """Design working distance W: distance below the plate at which the apertures are aimed [um]."""
     sample_distance_um: float | None = Field(default=None, gt=0.0, le=1e7)
-    """Distance D from the plate to the sample's reference plane (its substrate); default W [um]."""
+    """Distance D from the plate to the substrate (the sample's plane z = 0); default W [um]."""
     radius_um: float | None = Field(default=None, gt=0.0, le=1e8)
     """`scattering`: radius of a disc-shaped plate [um]."""
     size_um: tuple[float, float] | None = None
     """`scattering`: full sides of a rectangular plate along x and y, instead of a radius [um]."""
     center_um: tuple[float, float] | None = None
-    """`scattering`: middle (x, y) of the plate, lab frame (default: straight above the nominal spot) [um]."""
+    """`scattering`: centre (x, y) of the plate, lab frame (default: above the nominal spot) [um]."""
     material: str | None = Field(default=None, min_length=1, max_length=64)
     """`scattering`, `mesh`: name of its material (default: the cosine law)."""
     file: str | None = Field(default=None, min_length=1, max_length=4096)
-    """`mesh`: STL, OBJ, PLY or GLB file, relative to the scene file. Its x, y are the lab frame's (0, 0: straight above
-    the nominal spot), z = 0 the plane of the pinhole, with all of the plate at z >= 0; it moves with the beam."""
+    """`mesh`: STL, OBJ, PLY or GLB file, relative to the scene file. Its x, y are those of the lab frame (0, 0: above
+    the nominal spot), z = 0 is the plane of the pinhole, the whole plate lies at z >= 0; it moves with the beam."""
     unit: Unit | None = None
     """`mesh`: unit of the file's coordinates."""
     part: str | None = Field(default=None, min_length=1, max_length=200)
-    """`mesh`: part of the file that is the plate (see detector.part); others that no detector names are left out
-    (default: all that no detector names is the plate)."""
+    """`mesh`: part of the file that is the plate (see detector.part); parts that no detector names are ignored
+    (default: all parts that no detector names are the plate)."""
     rotate_deg: tuple[float, float, float] | None = None
     """`mesh`: rotations about the fixed x, then y, then z axis (default: none) [deg]."""
     translate_um: tuple[float, float, float] | None = None
-    """`mesh`: shift after turning (default: none) [um]."""
+    """`mesh`: shift after rotation (default: none) [um]."""
 
     @model_validator(mode="after")
     def _has_the_keys_of_its_kind(self) -> "Plate":
@@ -115,7 +113,7 @@ class Plate(Settings):
 
     @property
     def is_scattering(self) -> bool:
-        """Whether atoms that meet the plate come back."""
+        """Whether the plate scatters atoms back."""
         return self.kind != "transparent"
 
     @property
@@ -131,20 +129,20 @@ class Plate(Settings):
 
 
 class Uncertainty(Settings):
-    """How well the geometry is known: standard deviations, which the fit takes for priors; 0: known exactly."""
+    """Prior standard deviations of the geometry in a fit; 0: known exactly."""
 
     sample_distance_um: float = Field(default=0.0, ge=0.0, le=1e5)
-    """Of the distance from the plate to the sample's reference plane [um]."""
+    """Of the distance from the plate to the substrate [um]."""
     tilt_deg: float = Field(default=0.0, ge=0.0, le=10.0)
-    """Of the reference plane's tilt against the plate, about each of x and y [deg]."""
+    """Of the substrate's tilt relative to the plate, about each of x and y [deg]."""
     polar_deg: float = Field(default=0.0, ge=0.0, le=30.0)
-    """Of the angle between each aperture's centre and the plate normal, seen from the nominal spot [deg]."""
+    """Of the polar angle of each aperture's centre, seen from the nominal spot [deg]."""
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=30.0)
-    """Of each aperture's azimuth about the nominal spot [deg]."""
+    """Of the azimuth of each aperture about the nominal spot [deg]."""
 
 
 class Instrument(Settings):
-    """Beam, plate and detectors of one scan, with the geometry derived from them (um, radians)."""
+    """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians)."""
 
     beam: Beam = Beam()
     plate: Plate
@@ -167,7 +165,7 @@ class Instrument(Settings):
                 "'transparent' (without size and material), or remove at_infinity"
             )
         if self.plate.part is not None and self.plate.part in [d.part for d in self.detector]:
-            raise ValueError(f"plate.part = {self.plate.part!r} is a detector's part, too: it can be one of both only")
+            raise ValueError(f"plate.part = {self.plate.part!r} is a detector's part, too: name different parts")
         behind = [d.name for d in self.detector if d.needs_mesh]
         if behind and not self.plate.is_mesh:
             raise ValueError(
@@ -176,8 +174,8 @@ class Instrument(Settings):
             )
         return self
 
-    def with_cosine_plate(self) -> "Instrument":
-        """Return what can be told without the scene: a parallel beam along the axis, and a plate of the cosine law."""
+    def idealised(self) -> "Instrument":
+        """Return the instrument with a parallel beam and a cosine-law plate, which need no file or material."""
         beam = self.beam.model_copy(update={"source": "pencil", "file": None, "effusive": None})
         return self.model_copy(update={"beam": beam, "plate": self.plate.model_copy(update={"material": None})})
 
@@ -194,12 +192,12 @@ class Instrument(Settings):
 
     @property
     def detector_names(self) -> tuple[str, ...]:
-        """Names in array order."""
+        """Names of the detectors, in array order."""
         return tuple(d.name for d in self.detector)
 
     @property
     def beam_shift(self) -> tuple[float, float]:
-        """tan t (cos phi, sin phi): how far the beam axis moves in (x, y) per um of depth."""
+        """Lateral displacement (x, y) of the beam axis per um of depth: tan t (cos phi, sin phi)."""
         t, phi = math.radians(self.beam.incidence_deg), math.radians(self.beam.azimuth_deg)
         return math.tan(t) * math.cos(phi), math.tan(t) * math.sin(phi)
 
@@ -217,10 +215,7 @@ class Instrument(Settings):
         return np.array([-w * tx, -w * ty, w])
 
     def openings(self) -> tuple[Aperture | Cone | None, ...]:
-        """Return the ellipse or cone of every detector, in array order; where two overlap, the earlier one wins.
-
-        None: a part of the plate's mesh.
-        """
+        """Return the ellipse or cone of every detector, in array order; None: a part of the plate's mesh."""
         return tuple(d.opening(self.working_distance) for d in self.detector)
 
     def apertures(self) -> tuple[Aperture, ...]:
@@ -242,21 +237,21 @@ class Instrument(Settings):
         )
 
     def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
-        """Return the instrument with its apertures aimed elsewhere and the sample farther away.
+        """Return the instrument with changed aperture angles and sample distance.
 
-        Each aperture is shifted along its azimuth until its centre is seen from the nominal spot under a polar angle
-        larger by `aim[:, 0]`, and turned about the plate normal through that spot by `aim[:, 1]`.
+        Each aperture is shifted along its azimuth by the change of polar angle of its centre, seen from the nominal
+        spot, and rotated about the plate normal through that spot by the change of azimuth.
 
         Args:
             aim: changes of polar angle and azimuth [detector, 2], rad.
-            distance: change of the sample's distance, um.
+            distance: change of the sample distance, um.
         """
         detectors = []
         for d, a, (polar, azimuth) in zip(self.detector, self.apertures(), aim, strict=True):
-            radius, turn = math.hypot(*a.center), math.atan2(a.center[1], a.center[0]) + azimuth
+            radius, direction = math.hypot(*a.center), math.atan2(a.center[1], a.center[0]) + azimuth
             radius = self.working_distance * math.tan(math.atan2(radius, self.working_distance) + polar)
             ellipse = {
-                "center_um": (radius * math.cos(turn), radius * math.sin(turn)),
+                "center_um": (radius * math.cos(direction), radius * math.sin(direction)),
                 "axes_um": (2.0 * a.semi_axes[0], 2.0 * a.semi_axes[1]),
                 "rotation_deg": math.degrees(math.remainder(a.rotation + azimuth, 2.0 * math.pi)),
             }
@@ -265,33 +260,30 @@ class Instrument(Settings):
         return Instrument(beam=self.beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
 
     def at_distance(self, distance: float) -> "Instrument":
-        """Return the instrument with its plate, as it was drilled, so far [um] from the sample's reference plane."""
+        """Return the instrument, its plate unchanged, at another sample distance [um]."""
         return self.model_copy(update={"plate": self.plate.model_copy(update={"sample_distance_um": distance})})
 
     def spot_position(self, height: Any) -> tuple[Any, Any, Any]:
-        """Return the lab position (x, y, z) [um] of the point at `height` above the reference plane.
+        """Compute the lab position (x, y, z) [um] of the point that the beam hits at `height` above the substrate.
 
-        In a raster scan it depends on the height alone (DESIGN.md section 1). Works on NumPy and JAX arrays.
+        In a raster scan it depends on the height alone. Works on NumPy and JAX arrays.
         """
         tx, ty = self.beam_shift
         drop = self.sample_distance - self.working_distance - height
         return drop * tx, drop * ty, -drop
 
     def directions(self) -> np.ndarray:
-        """Return how far, along x and y, the aperture's centre is per unit of height [detector, 2].
-
-        Seen from where the beam meets the reference plane.
-        """
+        """Compute x / z, y / z of each aperture's centre, seen from the beam's spot on the substrate [detector, 2]."""
         spot = np.array(self.spot_position(0.0)[:2])
         return (np.array([a.center for a in self.apertures()]) - spot) / self.sample_distance
 
     def surface_position(self, x: Any, y: Any, height: Any) -> tuple[Any, Any]:
-        """Return where, in the sample frame, a point of `height` seen at beam position (x, y) lies [um]."""
+        """Compute the sample-frame x, y of the surface point of `height` at beam position (x, y) [um]."""
         tx, ty = self.beam_shift
         return x - height * tx, y - height * ty
 
     def sample_origin(self, x: Any, y: Any) -> tuple[Any, Any, float]:
-        """Return what to add to lab coordinates to get sample coordinates, for beam position (x, y) [um]."""
+        """Compute the offset from lab to sample coordinates at beam position (x, y) [um]."""
         tx, ty = self.beam_shift
         drop = self.sample_distance - self.working_distance
         return x - drop * tx, y - drop * ty, drop

@@ -1,11 +1,11 @@
-"""How the inner loops are compiled (numba): the one place that says so.
+"""The numba compiler options of all inner loops.
 
-Division by zero gives infinity or NaN as in NumPy. Python's way, an exception, is numba's default and costs a factor
-of ten where small functions are called in loops: what may raise has to count the references of every array passed to
-it (an atom's search for its aperture: 120 ns with it, 21 ns without).
+Division by zero gives infinity or NaN, as in NumPy. Numba's default, an exception, is up to ten times slower for small
+functions in loops, because it adds reference counting of every array argument (aperture search of one atom: 120 ns
+with it, 21 ns without).
 """
 
 from numba import njit
 
 kernel = njit(cache=True, nogil=True, error_model="numpy")
-"""Decorator of a function that numba compiles: kept on disk, free of the interpreter's lock."""
+"""Decorator: compile with numba, cache on disk, release the interpreter lock."""

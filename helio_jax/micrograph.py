@@ -1,8 +1,4 @@
-"""Micrographs: what a scan produces, simulated or measured. A noun that flows between the stages.
-
-`MicrographStack` holds the images of one scan, all detectors on one raster; `MicrographSet` several scans of
-one sample, each with its own raster, azimuth and instrument. Conventions: arrays.py. Does no computation.
-"""
+"""Micrographs, simulated or measured. Conventions: arrays.py."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -22,27 +18,25 @@ class MicrographStack:
     Attributes:
         counts: expected or measured counts per pixel [detector, y, x].
         x, y: beam positions [um], increasing, equally spaced.
-        positions: beam positions (x, y) [x, 2], um, of a scan that is no raster: `x` then only counts them, and `y` is
-            a single 0; None for rasters and lines.
         instrument: beam, plate and detectors, in the order of the detector axis.
-        variance: variance of `counts` as data (counting noise included where the counts are noisy), or of the
-            Monte Carlo mean where they are expectations; same shape, or None when unknown.
-        is_observed: True where a count was recorded; None: everywhere.
-        background: counts per pixel that do not come from the sample [detector] or [detector, y, x], if known.
-        by_order: counts by scattering order [order, detector, y, x], the last order being "and above".
-        effuse: counts from the effusive beam, same shape as counts; they are not part of `counts`.
-        plate: the part of `counts` that scattered on the plate at least once before it was detected, same shape.
-        masked: fraction of the aperture's solid angle hidden from the pixel's point by the sample, own horizon
-            included [detector, y, x].
-        shadowed: 1 where the topmost surface point above the raster position cannot be seen by the beam [y, x].
-        n_rays: beam atoms per pixel that the counts stand for (simulated), or None.
+        variance: of `counts`, counting noise included if the counts are noisy; of the Monte Carlo mean if the counts
+            are expectations [detector, y, x]; None: unknown.
+        is_observed: True where a count was recorded [detector, y, x]; None: everywhere.
+        positions: beam positions (x, y) [x, 2], um, of a list of positions; then `x` is their index and `y` a single 0.
+        background: counts per pixel that do not come from the sample [detector] or [detector, y, x]; None: unknown.
+        by_order: counts by scattering order [order, detector, y, x]; the last entry holds its order and all above.
+        effuse: counts from the effusive beam, not included in `counts` [detector, y, x].
+        plate: part of `counts` that scattered on the plate at least once [detector, y, x].
+        masked: fraction of the aperture's solid angle masked by the sample, local horizon included [detector, y, x].
+        shadowed: 1 where the beam does not reach the topmost surface point above the raster position [y, x].
+        n_rays: beam atoms per pixel that the counts correspond to (simulated), or None.
         dwell: dwell time per pixel [s] (measured), or None.
         fast_axis: axis along which the scan moves fastest.
-        sample_rotation: rotation of the sample about the plate normal during this scan [rad].
+        sample_rotation: rotation of the sample about the plate normal [rad].
         noise: "expected" (noise-free expectation), "poisson" (counts) or "measured".
         unit: unit of the counts ("counts", "A").
         name: short name of the scan.
-        provenance: where it came from: scene, files, versions, seed, ray counters (JSON-compatible).
+        provenance: scene, files, versions, seed, ray counters (JSON-compatible).
     """
 
     counts: np.ndarray
@@ -111,29 +105,29 @@ class MicrographStack:
 
     @property
     def signal(self) -> np.ndarray:
-        """Counts without the background, where it is known [detector, y, x]."""
+        """Counts minus the background, if the background is known [detector, y, x]."""
         if self.background is None:
             return self.counts
         return self.counts - (self.background[:, None, None] if self.background.ndim == 1 else self.background)
 
     @property
     def multiple(self) -> np.ndarray | None:
-        """Counts of order 2 and above [detector, y, x], where the orders are known."""
+        """Counts of order 2 and above [detector, y, x], or None if the orders are unknown."""
         return None if self.by_order is None else self.by_order[1:].sum(0)
 
     @property
     def scan_time(self) -> np.ndarray | None:
-        """Time of its own scan at which every pixel was recorded, -1 to 1 [detector, y, x], of aligned scans."""
-        told = self.provenance.get("scan_time")
-        if told is None:
+        """Recording time of every pixel within its scan, -1 to 1 [detector, y, x]; known for aligned scans only."""
+        coefficients = self.provenance.get("scan_time")
+        if coefficients is None:
             return None
         x, y = np.meshgrid(self.x, self.y)
-        return np.stack([a * x + b * y + c for a, b, c in told])
+        return np.stack([a * x + b * y + c for a, b, c in coefficients])
 
-    def shares(self) -> dict[str, float]:
-        """Return what share of all counts (without background) scattered more than once, and met the plate.
+    def count_fractions(self) -> dict[str, float]:
+        """Compute the fractions of all counts (background excluded) from multiple scattering and from the plate.
 
-        The effusive beam's counts, which are not part of them, are given relative to them.
+        The effusive beam is not part of the counts; its counts are given relative to them.
         """
         total = float(np.sum(self.signal[self.is_observed]))
         parts = {"multiple scattering": self.multiple, "scattered on the plate": self.plate}
@@ -143,15 +137,15 @@ class MicrographStack:
 
     @property
     def stacks(self) -> tuple["MicrographStack"]:
-        """This stack alone, as a set of one would give it."""
+        """This stack, so that a stack can be used as a set of one."""
         return (self,)
 
     def only(self, error: type[HelioError] = InputFileError) -> "MicrographStack":
-        """Return this stack, as a set of one would."""
+        """Return this stack, so that a stack can be used as a set of one."""
         return self
 
     def replace(self, **changes: Any) -> "MicrographStack":
-        """Return a copy with some fields changed (and checked again)."""
+        """Return a validated copy with some fields changed."""
         return replace(self, **changes)
 
 
@@ -167,15 +161,15 @@ class MicrographSet:
             raise InputFileError("a micrograph set must hold at least one stack, got none")
 
     def only(self, error: type[HelioError] = InputFileError) -> MicrographStack:
-        """Return the single stack of a set of one; several scans must be aligned first."""
+        """Return the only stack; several scans must be aligned first."""
         if len(self.stacks) != 1:
             raise error(
                 f"this step needs one stack on one raster, got a set of {len(self.stacks)} scans "
-                f"({', '.join(s.name for s in self.stacks)}): align turned scans first (helio align), or "
+                f"({', '.join(s.name for s in self.stacks)}): align rotated scans first (helio align), or "
                 "take one in Python: helio_jax.read(FILE).stacks[0]"
             )
         return self.stacks[0]
 
 
 Micrographs = MicrographStack | MicrographSet
-"""What a scan gives: one stack, or one for each of its views."""
+"""One stack, or one stack per view of a scan."""

@@ -1,7 +1,7 @@
-"""The result of a reconstruction: a height for every pixel of the raster, in the beam frame. A noun.
+"""The result of a reconstruction: one height per pixel of the raster, in the beam frame.
 
-Height [y, x] belongs to beam position (raster_x[j], raster_y[i]); the surface point itself lies at
-(x[y, x], y[y, x]), which oblique incidence shifts by -h tan t. Overhangs and shadows are jumps. No computation.
+Height [i, j] belongs to beam position (raster_x[j], raster_y[i]). The surface point lies at (x[i, j], y[i, j]), shifted
+by -h tan t at oblique incidence. Overhangs and shadowed regions appear as depth jumps.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ REASONS = (
     "outside the data",
     "floating",
 )
-"""What the integers of `Reconstruction.reason` mean."""
+"""Meaning of the integers of `Reconstruction.reason`."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,19 @@ class Reconstruction:
     """Heights of the surface seen by the beam (frozen, checked when made).
 
     Attributes:
-        height: above the reference plane [y, x], um.
+        height: above the substrate [y, x], um.
         raster_x, raster_y: beam positions [um].
         instrument: of the scan that was reconstructed.
         method: "linear", "nearfield" or "refine".
         normals: unit surface normals, up [y, x, 3].
-        albedo: relative reflectivity, flat = 1 [y, x].
-        height_std: standard deviation of each height [um], or None where the method gives none.
+        albedo: relative reflectivity, substrate = 1 [y, x].
+        height_std: standard deviation of each height [y, x], um, or None if the method gives none.
         height_samples: joint posterior deviations of all heights [sample, y, x], um, or None; see `spread`.
-        is_valid: True where the height rests on enough data [y, x].
+        is_valid: True where enough data determine the height [y, x].
         reason: index into `REASONS` [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
-        gain, offset: per detector, fitted or assumed: data = gain * model + offset.
-        status: a sentence: how the method ended.
+        gain, offset: fitted or assumed, data = gain * model + offset [detector].
+        status: one sentence on how the method ended.
         provenance: JSON-compatible.
     """
 
@@ -82,9 +82,9 @@ class Reconstruction:
             "gain": (n_detectors,),
             "offset": (n_detectors,),
         }
-        for name, wanted in shapes.items():
+        for name, expected in shapes.items():
             if getattr(self, name) is not None:
-                put(name, as_float_array(name, getattr(self, name), wanted, error))
+                put(name, as_float_array(name, getattr(self, name), expected, error))
         for name, kind in (("is_valid", bool), ("reason", np.uint8)):
             value = np.asarray(getattr(self, name))
             if value.shape != shape:
@@ -94,10 +94,10 @@ class Reconstruction:
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
 
     def spread(self, number: Callable[[np.ndarray], float]) -> tuple[float, float]:
-        """Return a number derived from the heights and its standard deviation; the latter is NaN without samples.
+        """Compute a number derived from the heights, and its posterior standard deviation (NaN without samples).
 
         Args:
-            number: from heights [y, x], um, e.g. the mean of one terrace minus that of another.
+            number: function of the heights [y, x], um, for example the height difference of two terraces.
         """
         value = float(number(self.height))
         if self.height_samples is None:
@@ -119,14 +119,14 @@ class Reconstruction:
 
     @property
     def has_relief(self) -> np.ndarray:
-        """True where heights mean something beside one another: valid, or floating together [y, x]."""
+        """True where height differences are meaningful: valid, or floating with an unknown common level [y, x]."""
         return self.is_valid | (self.reason == REASONS.index("floating"))
 
     def beam_positions(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the beam positions (x, y) [n, 2], um, of places in pixels (column, row) [n, 2]."""
+        """Convert pixel coordinates (column, row) [n, 2] to beam positions (x, y) [n, 2], um."""
         first, step = zip(*((axis[0], pitch(axis)) for axis in (self.raster_x, self.raster_y)), strict=True)
         return np.array(first) + pixels * step
 
     def replace(self, **changes: Any) -> "Reconstruction":
-        """Return a copy with some fields changed (and checked again)."""
+        """Return a validated copy with some fields changed."""
         return replace(self, **changes)

@@ -1,8 +1,7 @@
-"""Base of every settings model (scene tables): frozen, strict about unknown keys, in user units.
+"""Base of every settings model (table of a scene file), and length units.
 
-Field names carry the unit (`_um`, `_deg`, `_mrad`); everything computed from them is in micrometres and
-radians. Each setting is declared once, in a model beside the code that uses it, with default, range and
-meaning; `config.py` only composes these models into a scene file.
+Field names carry the unit (`_um`, `_deg`, `_mrad`); properties computed from them are in micrometres and radians. Each
+setting is declared once, beside the code that uses it; `workflows/scene_file.py` composes the models.
 """
 
 from typing import Any, Literal, Self
@@ -18,14 +17,14 @@ Unit = Literal["nm", "um", "mm", "cm", "m", "inch"]
 
 
 class Settings(BaseModel):
-    """A frozen table of settings; unknown keys and non-finite numbers are refused."""
+    """A frozen table of settings that refuses unknown keys and non-finite numbers."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
     def changed(self, **changes: Any) -> Self:
-        """Return a copy with some values replaced, checked again; what nobody has set still counts as not set.
+        """Return a validated copy with some values replaced; fields that were not set stay unset.
 
         Raises:
             SceneError: an unknown setting, or a value that is out of its range.
@@ -33,5 +32,5 @@ class Settings(BaseModel):
         try:
             return type(self).model_validate(self.model_dump(exclude_unset=True) | changes)
         except ValidationError as e:
-            told = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}, got {p['input']!r}" for p in e.errors())
-            raise SceneError(f"setting not accepted: {told}") from None
+            text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}, got {p['input']!r}" for p in e.errors())
+            raise SceneError(f"setting not accepted: {text}") from None

@@ -47,7 +47,9 @@ def validate(scene: SceneArg) -> None:
     loaded = load_scene(scene)
     loaded.read_laws()
     loaded.read_rays()
-    body = check_body(loaded.build_body(), loaded.sample.shape(loaded.base_dir) if loaded.sample.is_tilted else None)
+    body = check_body(
+        loaded.build_body(), loaded.sample.build_shape(loaded.base_dir) if loaded.sample.is_tilted else None
+    )
     for key, value in body.items():
         print(f"  {key}: {value}")
     if body["n_open_edges"] and not body["n_inner_open_edges"]:

@@ -101,7 +101,7 @@ def simulate(
                 print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel in the mean", end="")
                 missed = one.provenance.get("n_above_target")
                 print("" if missed is None else f"; {missed} of {nx * ny} pixels are above the target error")
-            for name, share in one.shares().items():
+            for name, share in one.count_fractions().items():
                 print(f"  {name}: {share:.2%} of the counts")
 
 

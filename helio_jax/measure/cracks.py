@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from helio_jax.arrays import as_json, pitch, undirected_deg
+from helio_jax.arrays import as_json, line_angle_deg, pitch
 from helio_jax.errors import SceneError
 from helio_jax.measure.crack_profiles import CrackSettings, measure_line
 from helio_jax.measure.line_paths import Path, trace_lines
@@ -198,7 +198,7 @@ def _without_doubles(cracks: list[Crack], near: float) -> list[Crack]:
 def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, seen: dict[str, Any]) -> Crack:
     """Return a crack from its path [pixels] and what was measured across it."""
     points = rec.beam_positions(seen.pop("points"))
-    direction = undirected_deg(points[-1] - points[0])
+    direction = line_angle_deg(points[-1] - points[0])
     unknown: dict[str, Any] = {
         "width_um": math.nan,
         "width_std_um": math.nan,

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import as_json, pitch, undirected_deg
+from helio_jax.arrays import as_json, line_angle_deg, pitch
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.settings import Settings
 
@@ -181,7 +181,7 @@ def _measure(
         end=(float(ends[1, 0]), float(ends[1, 1])),
         length_um=length * step,
         length_std_um=step * math.sqrt(2.0),
-        direction_deg=undirected_deg(along),
+        direction_deg=line_angle_deg(along),
         falls_deg=math.degrees(math.atan2(across[1], across[0])),
         width_um=width * step,
         step_um=value,

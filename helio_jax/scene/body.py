@@ -1,7 +1,7 @@
-"""What every sample becomes: triangles and exact spheres, each with the name of its material.
+"""Geometry of a sample: triangles and exact spheres, each with the name of its material.
 
-Sample frame: z up, z = 0 on the reference plane, micrometres. The scene says which law a material's name stands for
-(scattering.py); a body only knows which name is where. Builders are in surfaces.py.
+Sample frame: z up, z = 0 on the substrate, micrometres. The scene maps material names to scattering laws
+(scattering.py); surfaces.py builds the geometry.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from helio_jax.arrays import as_float_array
 from helio_jax.errors import SceneError
 
 COSINE = "cosine"
-"""Name of the material that every surface has where a scene says nothing else: re-emission by the cosine law."""
+"""Name of the default material: re-emission by the cosine law."""
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,9 @@ class Body:
     Attributes:
         vertices: positions [n, 3], um.
         faces: vertex indices [m, 3], counter-clockwise seen from the vacuum.
-        spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically, beside the triangles.
+        spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically.
         materials: names of the materials.
-        face_material: which of `materials` each face has [m]; default: the first.
-        sphere_material: which each sphere has [s]; default: the first.
+        face_material, sphere_material: index into `materials` of each face [m] and sphere [s]; default: the first.
     """
 
     vertices: np.ndarray
@@ -44,9 +43,7 @@ class Body:
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
             raise SceneError(f"faces must be integers of the shape any x 3, got {faces.dtype} {faces.shape}")
         if faces.size and (faces.min() < 0 or faces.max() >= len(self.vertices)):
-            raise SceneError(
-                f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}: correct them"
-            )
+            raise SceneError(f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}")
         put("faces", faces.astype(np.int64))
         for name in ("vertices", "spheres"):
             if not np.all(np.isfinite(getattr(self, name))):
@@ -57,29 +54,29 @@ class Body:
             given = getattr(self, name)
             index = np.zeros(n, np.int64) if given is None else np.asarray(given, np.int64)
             if index.shape != (n,) or (n and not 0 <= index.min() <= index.max() < len(self.materials)):
-                raise SceneError(f"{name} must be {n} numbers of the {len(self.materials)} materials, got {index!r}")
+                raise SceneError(f"{name} must be {n} indices of the {len(self.materials)} materials, got {index!r}")
             put(name, index)
 
-    def painted(self, face: str, sphere: Sequence[str] = ()) -> "Body":
-        """Return the body with one material on all faces, and one for each sphere (default: the faces')."""
+    def with_material(self, face: str, sphere: Sequence[str] = ()) -> "Body":
+        """Return the body with one material on all faces, and one per sphere (default: that of the faces)."""
         names = tuple(dict.fromkeys((face, *sphere)))
         index = np.array([names.index(name) for name in sphere], np.int64) if sphere else None
         return replace(self, materials=names, face_material=None, sphere_material=index)
 
     def transformed(self, rotation: np.ndarray, scale: float, shift: tuple[float, float, float]) -> "Body":
-        """Return the body scaled about the origin, turned by a rotation matrix [3, 3], then moved [um]."""
+        """Return the body scaled about the origin, rotated by a matrix [3, 3], then shifted [um]."""
         vertices = rotation.dot((self.vertices * scale).T).T + np.asarray(shift)
         centers = rotation.dot((self.spheres[:, :3] * scale).T).T + np.asarray(shift)
         return replace(self, vertices=vertices, spheres=np.column_stack([centers, self.spheres[:, 3] * scale]))
 
     def moved(self, shift: tuple[float, float, float]) -> "Body":
-        """Return the body at another place [um]."""
+        """Return the body shifted [um]."""
         spheres = self.spheres + np.array([*shift, 0.0])
         return replace(self, vertices=self.vertices + np.asarray(shift), spheres=spheres)
 
     @classmethod
     def join(cls, bodies: Sequence["Body"]) -> "Body":
-        """Return one body of several."""
+        """Join several bodies into one."""
         names = tuple(dict.fromkeys(name for body in bodies for name in body.materials))
         maps = [np.array([names.index(name) for name in body.materials]) for body in bodies]
         first = np.cumsum([0, *(len(body.vertices) for body in bodies)])
@@ -99,7 +96,7 @@ class Body:
 
     @property
     def normals(self) -> np.ndarray:
-        """Unit normal of every face, out of the solid [m, 3]; zero for a face without area."""
+        """Unit outward normal of every face [m, 3]; zero for a face without area."""
         t = self.triangles
         n = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
         length = np.linalg.norm(n, axis=1, keepdims=True)
@@ -116,5 +113,5 @@ class Body:
 
     @property
     def max_height(self) -> float:
-        """Height of the highest point above the reference plane [um]."""
+        """Height of the highest point above the substrate [um]."""
         return float(self.bounds[1, 2])

@@ -1,7 +1,7 @@
-"""Make the mesh of a pinhole plate from a few dimensions: a solid with one channel for each aperture and the pinhole.
+"""Generate the mesh of a pinhole plate: a watertight solid with a channel for each aperture and the pinhole.
 
-The only door to manifold3d, which makes the solid watertight whatever the channels do to one another. Plate frame:
-scene/plates.py. The result names its parts: the solid, and at the upper end of every channel a surface that counts.
+The only import of manifold3d. Plate frame: scene/plates.py. Parts of the result: the solid, and one detecting surface
+at the upper end of every channel.
 """
 
 import json
@@ -16,13 +16,13 @@ from helio_jax.errors import MissingDependencyError, SceneError
 from helio_jax.instrument import Instrument
 
 SEGMENTS = 128
-"""Sides of the polygon that stands for an ellipse or a disc, of the same area."""
+"""Sides of the polygon, of equal area, that represents an ellipse or a disc."""
 SOLID_NAME = "plate_solid"
 """Part of the OBJ file that scatters."""
-_ROOM = 1.25
-"""Radius of the plate by default, in distances of the farthest edge of a channel from its middle."""
-_OVERLAP = 1e-9
-"""Volume of the plate that two channels may share, by rounding."""
+_RADIUS_RATIO = 1.25
+"""Default radius of the plate over the distance of the farthest channel edge from its centre."""
+_ROUNDING = 1e-9
+"""Overlap volume of two channels, over the volume of the plate, that counts as rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class DrilledPlate:
 
     Attributes:
         vertices, faces: of the solid, watertight [n, 3], [m, 3].
-        ends: rim of every channel's upper end, counter-clockwise seen from above, by detector [SEGMENTS, 3].
+        ends: rim of the upper end of every detector's channel, counter-clockwise from above [SEGMENTS, 3].
     """
 
     vertices: np.ndarray
@@ -39,7 +39,7 @@ class DrilledPlate:
     ends: dict[str, np.ndarray]
 
     def obj(self, comment: str = "") -> str:
-        """Return it as an OBJ file: the solid, and for each detector a part of its name, the surface that counts."""
+        """Format as an OBJ file: the solid, and for each detector a part of its name."""
         lines = [f"# {line}" for line in comment.splitlines()]
         start = 1
         rims = [(name, rim, _fan(len(rim))) for name, rim in self.ends.items()]
@@ -50,7 +50,7 @@ class DrilledPlate:
         return "\n".join(lines) + "\n"
 
     def tables(self, file: str) -> str:
-        """Return the tables of a scene that uses the file."""
+        """Format the tables of a scene that uses the file."""
         text = [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "um"\npart = "{SOLID_NAME}"']
         text += [f"[[detector]]\nname = {json.dumps(name)}\npart = {json.dumps(name)}" for name in self.ends]
         return "\n\n".join([*text, '[trace]\nestimator = "analog"'])
@@ -58,13 +58,13 @@ class DrilledPlate:
 
 @dataclass(frozen=True)
 class _Bore:
-    """A straight channel: its outline in the underside [n, 2], and how far it leans per um of height (x, y)."""
+    """A straight channel: its outline in the underside [n, 2], and its lateral shift (x, y) per um of height."""
 
     name: str
     outline: np.ndarray
     lean: tuple[float, float]
 
-    def at(self, z: float) -> np.ndarray:
+    def outline_at(self, z: float) -> np.ndarray:
         """Return the outline at a height [n, 3], um."""
         return np.column_stack([self.outline + z * np.asarray(self.lean), np.full(len(self.outline), z)])
 
@@ -72,20 +72,20 @@ class _Bore:
 def drill_plate(
     instrument: Instrument, thickness: float, radius: float | None = None, angle: float | None = None
 ) -> DrilledPlate:
-    """Make a plate with channels for an instrument's apertures and pinhole.
+    """Generate a plate with channels for an instrument's apertures and pinhole.
 
-    A channel has its aperture for cross-section parallel to the plate, all the way, and leans away from the point
-    straight below the pinhole's nominal spot; the pinhole's runs along the beam.
+    The cross-section of a channel parallel to the plate is its aperture at all heights. Its axis leans radially away
+    from the point above the nominal spot; the pinhole's channel follows the beam.
 
     Args:
-        instrument: apertures, pinhole and, of a flat scattering plate, its outline.
+        instrument: apertures, pinhole and, for a flat scattering plate, its outline.
         thickness: of the plate, um.
-        radius: of the disc, um; default: the outline of a scattering plate, else a disc with room for all channels.
-        angle: between channels and plate normal, rad; default: each looks at the nominal spot.
+        radius: of the disc, um; default: the outline of a scattering plate, or a disc that contains all channels.
+        angle: between channels and plate normal, rad; default: each channel points at the nominal spot.
 
     Raises:
-        SceneError: the plate has no thickness, a channel leaves it sideways or meets another one, a detector is not an
-            aperture in a flat plate or has no name for a part of a mesh.
+        SceneError: thickness or angle out of range; a channel leaves the plate sideways or meets another one; a
+            detector is no aperture in a flat plate, or its name cannot name a mesh part.
         MissingDependencyError: manifold3d is not installed.
     """
     if not 0.0 < thickness <= 1e6:
@@ -103,12 +103,12 @@ def drill_plate(
     solid = block - manifold3d.Manifold.batch_boolean(tools, manifold3d.OpType.Add)
     mesh = solid.to_mesh64()
     names = set(instrument.detector_names)
-    ends = {b.name: b.at(thickness) for b in bores if b.name in names}
+    ends = {b.name: b.outline_at(thickness) for b in bores if b.name in names}
     return DrilledPlate(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), ends)
 
 
 def _bores(instrument: Instrument, angle: float | None) -> list[_Bore]:
-    """Return the channels of all detectors and of the pinhole."""
+    """Construct the channels of all detectors and of the pinhole."""
     out = []
     for detector, a in zip(instrument.detector, instrument.apertures(), strict=True):
         if detector.name == SOLID_NAME or not detector.name.isprintable() or detector.name != detector.name.strip():
@@ -125,7 +125,7 @@ def _bores(instrument: Instrument, angle: float | None) -> list[_Bore]:
 
 
 def _polygon(aperture: Aperture, n: int = SEGMENTS) -> np.ndarray:
-    """Return a polygon of an ellipse's area [n, 2], counter-clockwise."""
+    """Approximate an ellipse by a polygon of equal area [n, 2], counter-clockwise."""
     points, center = aperture.rim(n)[0], np.asarray(aperture.center)
     return center + (points - center) * math.sqrt(2.0 * math.pi / n / math.sin(2.0 * math.pi / n))
 
@@ -139,12 +139,13 @@ def _outline(instrument: Instrument, bores: list[_Bore], thickness: float, radiu
             return np.array([[x - a, y - b], [x + a, y - b], [x + a, y + b], [x - a, y + b]])
         return _polygon(Aperture((x, y), (a, b), 0.0))
     if radius is None:
-        radius = _ROOM * max(float(np.hypot(*b.at(z)[:, :2].T).max()) for b in bores for z in (0.0, thickness))
+        rims = (b.outline_at(z)[:, :2] for b in bores for z in (0.0, thickness))
+        radius = _RADIUS_RATIO * max(float(np.hypot(*rim.T).max()) for rim in rims)
     return _polygon(Aperture((0.0, 0.0), (radius, radius), 0.0))
 
 
 def _prism(manifold3d: Any, outline: np.ndarray, lean: tuple[float, float], low: float, high: float) -> Any:
-    """Return a leaning prism between two heights, whose cross-section at z = 0 is the outline."""
+    """Construct a sheared prism between two heights, whose cross-section at z = 0 is the outline."""
     upright = manifold3d.CrossSection([outline]).extrude(high - low).translate([0.0, 0.0, low])
     return upright.transform(np.array([[1.0, 0.0, lean[0], 0.0], [0.0, 1.0, lean[1], 0.0], [0.0, 0.0, 1.0, 0.0]]))
 
@@ -154,10 +155,10 @@ def _check(manifold3d: Any, bores: list[_Bore], tools: list[Any], block: Any, th
     for i, (bore, tool) in enumerate(zip(bores, tools, strict=True)):
         what = f"the channel of {bore.name!r}" if bore.name else "the pinhole's channel"
         slab = tool.trim_by_plane([0.0, 0.0, 1.0], 0.0).trim_by_plane([0.0, 0.0, -1.0], -thickness)
-        if (slab - block).volume() > _OVERLAP * block.volume():
+        if (slab - block).volume() > _ROUNDING * block.volume():
             raise SceneError(f"{what} leaves the plate at its rim: enlarge the radius, or make the plate thinner")
         for other, second in zip(bores[:i], tools[:i], strict=True):
-            if (slab ^ second).volume() > _OVERLAP * block.volume():
+            if (slab ^ second).volume() > _ROUNDING * block.volume():
                 with_what = f"that of {other.name!r}" if other.name else "the pinhole's"
                 raise SceneError(
                     f"{what} meets {with_what} within the plate: make the plate thinner, or change the channels' angle"
@@ -165,6 +166,6 @@ def _check(manifold3d: Any, bores: list[_Bore], tools: list[Any], block: Any, th
 
 
 def _fan(n: int) -> np.ndarray:
-    """Return the triangles of a convex polygon [n - 2, 3], as it is run through."""
+    """Triangulate a convex polygon of `n` corners [n - 2, 3], keeping its orientation."""
     k = np.arange(1, n - 1)
     return np.stack([np.zeros_like(k), k, k + 1], 1)

@@ -1,7 +1,6 @@
-"""Reading of the files a sample may name: bounded bytes, and height maps from .npz and text grids.
+"""Read the files that a scene names: height maps, positions, scattering tables. Meshes: sample.py.
 
 Files are untrusted: sizes are limited before anything is read, no pickle, every failure names the file.
-Meshes are read in sample.py, the door to trimesh.
 """
 
 import io
@@ -25,7 +24,7 @@ def read_bytes(path: Path, max_mb: float, error: type[HelioError] = InputFileErr
     """Read a whole file of at most `max_mb` megabytes.
 
     Raises:
-        error: missing, not a regular file, unreadable, empty or too large; the message names the file.
+        error: missing, not a regular file, unreadable, empty or too large.
     """
     try:
         if not path.exists():
@@ -48,7 +47,7 @@ def read_height_map(path: Path, unit: float, pixel_size: float | None) -> Height
     Args:
         path: of the file.
         unit: length of the file's unit [um].
-        pixel_size: grid pitch of a text file [um]; not for .npz, which has its own axes.
+        pixel_size: grid pitch of a text file [um]; not used for .npz, which has its own axes.
 
     Raises:
         InputFileError: as `read_bytes`; unknown kind; missing arrays; wrong shapes; not numbers.
@@ -73,7 +72,7 @@ def read_height_map(path: Path, unit: float, pixel_size: float | None) -> Height
 def read_arrays(
     path: Path, data: bytes, max_mb: float, needed: tuple[str, ...], optional: tuple[str, ...] = ()
 ) -> list[np.ndarray]:
-    """Return named arrays of an .npz in float64: all that are needed, then those of the optional ones that are there.
+    """Read named arrays of an .npz in float64: all needed ones, then the optional ones that exist.
 
     Raises:
         InputFileError: no readable .npz, larger than `max_mb` megabytes once unpacked, pickled, or an array is missing.
@@ -98,14 +97,14 @@ def read_arrays(
 
 
 def read_table(path: Path, data: bytes, what: str, *, separator: str | None = ",", titles: str = "") -> np.ndarray:
-    """Return the numbers of a text file [line, column]; # begins a comment.
+    """Parse the numbers of a text file [line, column]; # begins a comment.
 
     Args:
         path: for messages.
         data: the file's bytes, UTF-8.
-        what: what it should be, for messages.
+        what: expected content, for messages.
         separator: between the numbers of a line; None: white space.
-        titles: a first line of titles that is skipped, if it says exactly this but for spaces.
+        titles: a first line that equals this text, spaces ignored, is skipped.
 
     Raises:
         InputFileError: not UTF-8, not numbers, or lines of different lengths.
@@ -115,12 +114,11 @@ def read_table(path: Path, data: bytes, what: str, *, separator: str | None = ",
         has_titles = bool(titles and lines) and lines[0].replace(" ", "") == titles
         return np.loadtxt(lines[has_titles:], delimiter=separator, ndmin=2)
     except (UnicodeDecodeError, ValueError) as e:
-        remedy = "put a # before a line of titles"
-        raise InputFileError(f"{path}: is not {what} ({e}): {remedy}") from None
+        raise InputFileError(f"{path}: is not {what} ({e}): put a # before a line of titles") from None
 
 
 def _read_grid(path: Path, data: bytes, kind: str) -> np.ndarray:
-    """Return a text grid [y, x]; separators are commas (.csv) or white space."""
+    """Parse a text grid [y, x]; separators are commas (.csv) or white space."""
     grid = read_table(path, data, "a grid of numbers", separator="," if kind == ".csv" else None)
     if min(grid.shape) < 2:
         raise InputFileError(f"{path}: a grid needs at least 2 x 2 values, got {grid.shape}")
@@ -142,7 +140,7 @@ def read_positions(path: Path) -> np.ndarray:
     if points.ndim != 2 or not len(points) or points.shape[1] != 2 or not np.all(np.isfinite(points)):
         raise InputFileError(
             f"{path}: must hold two finite numbers (x, y in um) on each line, got {len(points)} lines of "
-            f"{points.shape[-1] if points.size else 0}"
+            f"{points.shape[-1] if points.size else 0} numbers"
         )
     return points
 
@@ -151,7 +149,7 @@ def read_scattering_table(path: Path) -> tuple[tuple[np.ndarray, np.ndarray, np.
     """Read intensities per steradian on a full grid: columns ([incidence,] theta, phi, intensity), angles in degrees.
 
     Returns:
-        Axes incidence [i], theta [t] and phi [p] (0 to pi: the other half is its mirror image; or 0 to 2 pi), rad, and
+        Axes incidence [i], theta [t] and phi [p] (0 to pi, the other half is the mirror image; or 0 to 2 pi), rad, and
         the intensity [i, t, p].
 
     Raises:
@@ -179,7 +177,7 @@ def read_scattering_table(path: Path) -> tuple[tuple[np.ndarray, np.ndarray, np.
         raise InputFileError(f"{path}: incidence and theta must lie within 0 to 90 deg, with two theta at least")
     if phi.size < 2 or phi[0] != 0 or not (phi[-1] == 180 or 180 < phi[-1] <= 360):
         raise InputFileError(
-            f"{path}: phi must start at 0 and run to 180 deg (mirrored) or round to at most 360 deg, got "
+            f"{path}: phi must run from 0 to 180 deg (mirrored) or from 0 to at most 360 deg, got "
             f"{phi[0]:g} to {phi[-1]:g} deg"
         )
     if phi[-1] not in (180.0, 360.0):

@@ -1,6 +1,6 @@
-"""Samples given by a map of heights: a grid from a file or from Python, or a reconstruction written by helio.
+"""Samples given by heights: a height map from a file or from Python, or a reconstruction written by helio.
 
-Models of the `[sample]` table; sample.py joins them with the others. Both become triangulated sheets (surfaces.py).
+Models of the `[sample]` table. Both become triangulated sheets (surfaces.py).
 """
 
 from collections.abc import Callable
@@ -16,29 +16,42 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_height_map
-from helio_jax.scene.shapes import Length, PaintedSample
+from helio_jax.scene.shapes import Length, MaterialSample
 from helio_jax.settings import UNITS_UM, Unit
 
 
-class HeightMapSample(PaintedSample):
+class MapSample(MaterialSample):
+    """Base of samples given by heights: an optional substrate around the map."""
+
+    file: str = Field(min_length=1, max_length=4096)
+    """File name, relative to the scene file."""
+    size_um: Length | None = None
+    """Side of a substrate around the map; default: none [um]."""
+    level_um: float | None = None
+    """Height of that substrate; default: the median height of the map's border [um]."""
+
+    def _triangulate(
+        self, x: np.ndarray, y: np.ndarray, height: np.ndarray, beam_shift: tuple[float, float] = (0.0, 0.0)
+    ) -> Body:
+        """Triangulate heights [y, x] and join the border to the substrate along the beam."""
+        reach = None if self.size_um is None else 0.5 * self.size_um
+        body = surfaces.surface_body(x, y, height, reach, level=self.level_um, beam_shift=beam_shift)
+        return body.with_material(self.material)
+
+
+class HeightMapSample(MapSample):
     """A height map from a file (.npz with x, y, height; .csv, .txt, .tsv: a grid), or from Python: `of`."""
 
     kind: Literal["height_map"] = "height_map"
-    file: str = Field(min_length=1, max_length=4096)
-    """File name, relative to the scene file."""
     pixel_size_um: Length | None = None
     """Grid pitch of a text file, whose rows start at the lowest y; the grid is then centred [um]."""
     unit: Unit = "um"
     """Unit of the lengths in the file (of the heights alone for a text file)."""
-    size_um: Length | None = None
-    """Side of a flat around the map; default: none [um]."""
-    level_um: float | None = None
-    """Height of that flat; default: the median height of the map's border [um]."""
     _map: HeightMap | None = PrivateAttr(None)
 
     @classmethod
     def of(cls, height_map: HeightMap, size_um: float | None = None) -> "HeightMapSample":
-        """Make a sample of a height map in memory; `file` then holds the fingerprint of its data."""
+        """Make a sample of a height map in memory; `file` then holds the hash of its data."""
         import hashlib
 
         digest = hashlib.sha256(b"".join(a.tobytes() for a in (height_map.x, height_map.y, height_map.height)))
@@ -48,10 +61,10 @@ class HeightMapSample(PaintedSample):
 
     @property
     def shape_top(self) -> float | None:
-        """Height of the highest point, None before the file is read [um]."""
+        """Height of the highest point; None for a file [um]."""
         return None if self._map is None else float(np.max(self._map.height))
 
-    def shape(self, base_dir: Path = Path()) -> Body:
+    def build_shape(self, base_dir: Path = Path()) -> Body:
         """Read the file, if any, and triangulate it.
 
         Raises:
@@ -60,8 +73,7 @@ class HeightMapSample(PaintedSample):
         height_map = self._map
         if height_map is None and self.file.startswith("memory:"):
             raise InputFileError(
-                f"sample.file = {self.file!r}: this height map was given from Python and is stored in no file: save it "
-                "as .npz and name that file"
+                f"sample.file = {self.file!r}: this height map exists in Python only: save it as .npz and name the file"
             )
         if height_map is None:
             height_map = read_height_map(base_dir / self.file, UNITS_UM[self.unit], self.pixel_size_um)
@@ -70,36 +82,28 @@ class HeightMapSample(PaintedSample):
                 f"{self.file}: a sample's heights must be finite, got {int(np.sum(~np.isfinite(height_map.height)))} "
                 "gaps: fill them first"
             )
-        x, y = np.meshgrid(height_map.x, height_map.y)
-        reach = None if self.size_um is None else 0.5 * self.size_um
-        return surfaces.surface_body(x, y, height_map.height, reach, level=self.level_um).painted(self.material)
+        return self._triangulate(*np.meshgrid(height_map.x, height_map.y), height_map.height)
 
 
-class ReconstructionSample(PaintedSample):
-    """A height map that helio reconstructed (.h5): every pixel at the x, y of its own surface point.
+class ReconstructionSample(MapSample):
+    """A height map written by `helio reconstruct` (.h5): every pixel at the x, y of its surface point.
 
-    What the beam of that scan did not see is a sheet along it. A scene that is not read from a file has no reader.
+    Regions that are shadowed in that scan are closed by a sheet along its beam.
     """
 
     kind: Literal["reconstruction"] = "reconstruction"
-    file: str = Field(min_length=1, max_length=4096)
-    """File written by `helio reconstruct`, relative to the scene file."""
     use: Literal["all", "valid"] = "all"
-    """`all`: all heights; `valid`: those that are not marked valid are gaps."""
+    """`all`: all heights; `valid`: pixels that are not marked valid are gaps."""
     gaps: Literal["refuse", "fill"] = "refuse"
-    """What becomes of pixels without a height: `fill` interpolates linearly between those with one."""
-    size_um: Length | None = None
-    """Side of a flat around the map; default: none [um]."""
-    level_um: float | None = None
-    """Height of that flat; default: the median height of the map's border [um]."""
+    """Treatment of pixels without a height: `fill` interpolates linearly."""
     _read: Callable[[Path], Reconstruction] | None = PrivateAttr(None)
 
     def model_post_init(self, context: Any) -> None:
-        """Take the reader that the loader of the scene offers (config.py): files of other stages are not read here."""
+        """Take the file reader from the scene loader, for scene/ may not import formats/."""
         if context and "read_reconstruction" in context:
             self._read = context["read_reconstruction"]
 
-    def shape(self, base_dir: Path = Path()) -> Body:
+    def build_shape(self, base_dir: Path = Path()) -> Body:
         """Read the file, fill its gaps and triangulate it.
 
         Raises:
@@ -112,12 +116,10 @@ class ReconstructionSample(PaintedSample):
         rec = self._read(base_dir / self.file)
         height = self._without_gaps(rec)
         x, y = rec.instrument.surface_position(*np.meshgrid(rec.raster_x, rec.raster_y), height)
-        reach = None if self.size_um is None else 0.5 * self.size_um
-        shift = rec.instrument.beam_shift
-        return surfaces.surface_body(x, y, height, reach, level=self.level_um, beam_shift=shift).painted(self.material)
+        return self._triangulate(x, y, height, rec.instrument.beam_shift)
 
     def _without_gaps(self, rec: Reconstruction) -> np.ndarray:
-        """Return the heights [y, x], gaps filled."""
+        """Return the heights [y, x] with gaps filled."""
         has_height = np.isfinite(rec.height) & (rec.is_valid | (self.use == "all"))
         n_gaps = int(np.sum(~has_height))
         if n_gaps and self.gaps == "refuse":
@@ -127,21 +129,21 @@ class ReconstructionSample(PaintedSample):
             )
         if n_gaps > has_height.size - 4:
             raise InputFileError(
-                f"{self.file}: only {has_height.size - n_gaps} pixels have a height: none to fill from"
+                f"{self.file}: only {has_height.size - n_gaps} pixels have a height, at least 4 are needed to fill gaps"
             )
         return _filled(rec.height, has_height) if n_gaps else rec.height
 
 
 def _filled(height: np.ndarray, is_known: np.ndarray) -> np.ndarray:
-    """Return heights [y, x] with the unknown ones interpolated linearly, outside all known ones by the nearest."""
+    """Interpolate unknown heights [y, x] linearly; outside the hull of the known ones take the nearest."""
     from scipy.interpolate import griddata
 
-    known, wanted = np.argwhere(is_known), np.argwhere(~is_known)
+    known, unknown = np.argwhere(is_known), np.argwhere(~is_known)
     out = height.copy()
     try:
-        values = griddata(known, height[is_known], wanted, method="linear")
+        values = griddata(known, height[is_known], unknown, method="linear")
     except ValueError:  # scipy's QhullError: all known pixels lie on one line
-        values = np.full(len(wanted), np.nan)
-    nearest = griddata(known, height[is_known], wanted, method="nearest")
+        values = np.full(len(unknown), np.nan)
+    nearest = griddata(known, height[is_known], unknown, method="nearest")
     out[~is_known] = np.where(np.isfinite(values), values, nearest)
     return out

@@ -1,13 +1,11 @@
-"""Scattering laws in the .mtl file beside an OBJ mesh, so that a CAD part brings its materials along.
-
-Among the optical keys of a material (`newmtl NAME`), which are skipped, it may say
+"""Scattering laws from the .mtl file of an OBJ mesh. Below `newmtl NAME`, besides optical keys, which are ignored:
 
     helio_law broad_specular
     helio_sigma_deg 20
     helio_diffuse_fraction 0.5
 
-helio_law is the `kind` of a table [material.NAME] of a scene, every other helio_KEY one of its keys with a value as in
-TOML (a single word needs no quotes). A scene's table [material.NAME] wins over the file's material of that name.
+helio_law is the `kind` of a scene's table [material.NAME], every other helio_KEY one of its keys, with a value as in
+TOML (a single word needs no quotes). A scene's table [material.NAME] overrides the file's material of that name.
 """
 
 import re
@@ -31,13 +29,7 @@ _PREFIX = "helio"
 
 @dataclass(frozen=True)
 class FileLaw:
-    """A law from a .mtl file.
-
-    Attributes:
-        name: of the material in the file.
-        law: the settings.
-        folder: at which the law's own file names start.
-    """
+    """A law from a .mtl file: name of its material there, settings, and the folder of the law's own file names."""
 
     name: str
     law: Any
@@ -45,9 +37,9 @@ class FileLaw:
 
 
 def mtl_files(obj: Path, data: bytes) -> tuple[list[Path], list[str]]:
-    """Return the .mtl files that an OBJ file names (mtllib) and that lie beside it, and the names of those that do not.
+    """Find the .mtl files that an OBJ file names (mtllib): paths of existing ones, names of missing ones.
 
-    Folders in the names are left out: files are untrusted, and what is looked for lies beside the OBJ.
+    Folders in the names are ignored: files are untrusted, only files beside the OBJ are read.
     """
     found, missing = [], []
     for line in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, re.MULTILINE):
@@ -59,10 +51,10 @@ def mtl_files(obj: Path, data: bytes) -> tuple[list[Path], list[str]]:
 
 
 def used_laws(obj: Path, data: bytes) -> dict[str, FileLaw]:
-    """Return the laws of the materials that an OBJ file uses, by the names that its .mtl files give them.
+    """Read the laws of the materials that an OBJ file uses, by the names of the materials.
 
     Raises:
-        InputFileError: a .mtl file cannot be read, or what it says of a law is wrong.
+        InputFileError: a .mtl file cannot be read or holds a wrong law.
     """
     used = {
         name.decode("utf-8", "replace")
@@ -75,7 +67,7 @@ def used_laws(obj: Path, data: bytes) -> dict[str, FileLaw]:
 
 
 def read_mtl(path: Path) -> dict[str, FileLaw]:
-    """Read the laws of a .mtl file: those of its materials that have a helio_law.
+    """Read the laws of all materials of a .mtl file that have helio_law.
 
     Raises:
         InputFileError: as `read_bytes`; an unknown law or key, a value out of range: with file and line.
@@ -97,20 +89,20 @@ def read_mtl(path: Path) -> dict[str, FileLaw]:
 
 
 def _check_place(path: Path, number: int, word: str, name: str, keys: dict[str, tuple[int, str]]) -> None:
-    """Refuse a key that stands where no material is, stands there twice, or is misspelt."""
+    """Refuse a key without a material, a repeated key, or a misspelt one."""
     key = word.removeprefix(f"{_PREFIX}_")
     where = f"{path}, line {number}: {word}"
     if not word.startswith(f"{_PREFIX}_") or key == "kind":
-        raise InputFileError(f"{where}: keys are written helio_law and helio_KEY, in small letters: correct it")
+        raise InputFileError(f"{where}: keys are written helio_law and helio_KEY, in lower case: correct it")
     if name in ("", COSINE):
-        wrong = "stands before any newmtl NAME" if not name else f"{COSINE!r} stands for the cosine law itself"
+        wrong = "stands before any newmtl NAME" if not name else f"{COSINE!r} is reserved for the cosine law"
         raise InputFileError(f"{where}: {wrong}: put it below a newmtl NAME of another name")
     if key in keys:
         raise InputFileError(f"{where}: {name!r} has it already in line {keys[key][0]}: remove one of them")
 
 
 def _law(path: Path, name: str, keys: dict[str, tuple[int, str]]) -> Any:
-    """Return the law that the keys of a material (line number and text each) describe."""
+    """Construct the law from the keys of a material (line number and text of each)."""
     first = min(number for number, _ in keys.values())
     if "law" not in keys:
         raise InputFileError(
@@ -126,7 +118,7 @@ def _law(path: Path, name: str, keys: dict[str, tuple[int, str]]) -> Any:
 
 
 def _sentence(problem: Any, kind: str, keys: dict[str, tuple[int, str]]) -> str:
-    """Say which line is wrong, and how."""
+    """Format the error message: line, key, reason."""
     inner = [str(part) for part in problem["loc"] if part != kind]
     key = inner[0] if inner else "law"
     if problem["type"] == "union_tag_invalid":
@@ -141,7 +133,7 @@ def _sentence(problem: Any, kind: str, keys: dict[str, tuple[int, str]]) -> str:
 
 
 def _value(text: str) -> Any:
-    """Return a value as in TOML; what is none is a text."""
+    """Parse a value as in TOML; anything else is a text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -1,7 +1,7 @@
-"""A plate from a mesh file: a solid with channels, and the parts of it that count atoms.
+"""A plate from a mesh file: a solid with channels, and its detecting parts.
 
-Plate frame: x, y of the lab, z = 0 in the plane of the pinhole and z up, um; all of the mesh lies at z >= 0.
-The tracer moves it with the beam (trace/meshplate.py).
+Plate frame: x, y of the lab, z = 0 in the plane of the pinhole, z up, um; the whole mesh lies at z >= 0. The tracer
+moves it with the beam (trace/meshplate.py).
 """
 
 from dataclasses import replace
@@ -20,15 +20,15 @@ from helio_jax.settings import UNITS_UM
 MAX_PLATE_MB = 200.0
 """Largest mesh file of a plate."""
 SOLID = "the plate"
-"""Material of a plate's faces that do not count atoms."""
+"""Material of the plate's faces that do not detect atoms."""
 
 
 def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = Path()) -> Body:
-    """Read the mesh of a plate, in its frame; its materials are `SOLID` and the names of the parts that count atoms.
+    """Read the mesh of a plate, plate frame; its materials are `SOLID` and the names of the detecting parts.
 
     Raises:
-        InputFileError: the file is missing, too large, unreadable, lacks a part, is of absurd size, reaches below the
-            plane of the pinhole, is inside out, or is nothing but parts that count.
+        InputFileError: the file is missing, too large, unreadable, or lacks a part; the plate has an implausible size,
+            reaches below the plane of the pinhole, is inside out, or has detecting parts only.
     """
     assert plate.file is not None and plate.unit is not None  # by the plate's validator
     path = base_dir / plate.file
@@ -47,7 +47,7 @@ def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = P
     extent = float((high - low).max())
     if not least <= extent <= most:
         raise InputFileError(
-            f"{path}: the plate is {extent:g} um across, sensible are {least:g} to {most:g} um: check plate.unit (now "
+            f"{path}: the plate is {extent:g} um across, plausible are {least:g} to {most:g} um: check plate.unit (now "
             f"{plate.unit!r})"
         )
     if low[2] < -1e-6 * extent:
@@ -65,5 +65,5 @@ def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = P
 
 
 def check_solid(body: Body) -> dict:
-    """Report on the faces of a plate that do not count atoms, as `check_body` does."""
+    """Report on the faces of a plate that do not detect atoms, as `check_body`."""
     return check_body(replace(body, faces=body.faces[body.face_material == 0], face_material=None))

@@ -1,7 +1,7 @@
-"""Reading of a beam's rays from a file: where every atom starts and which way it flies.
+"""Read the rays of a beam from a file: start and direction of every atom.
 
-Lab axes, relative to the pinhole's centre: z points up, away from the sample, so directions point down. Files are
-untrusted (files.py): bounded, no pickle, every failure names the file.
+Lab axes, relative to the pinhole's centre; z points up, away from the sample, so directions point down. Files are
+untrusted, see files.py.
 """
 
 import io
@@ -14,7 +14,7 @@ from helio_jax.scene.files import read_arrays, read_bytes, read_table
 
 MAX_RAYS_MB = 256.0
 """Largest file of rays, and largest content of an .npz after decompression."""
-_COLUMNS = "x, y, z [um], x, y, z of the direction and, if wanted, weight"
+_COLUMNS = "x, y, z [um], x, y, z of the direction and optionally weight"
 
 
 def read_rays(path: Path) -> np.ndarray:
@@ -25,7 +25,7 @@ def read_rays(path: Path) -> np.ndarray:
 
     Raises:
         InputFileError: as `read_bytes`; another kind of file; not numbers; other columns; a ray that starts below the
-            plate or does not fly down; no weight > 0.
+            plate or does not point down; no weight > 0.
     """
     kind = path.suffix.lower()
     if kind not in (".csv", ".npy", ".npz"):
@@ -48,13 +48,13 @@ def read_rays(path: Path) -> np.ndarray:
             i = int(np.argmax(is_wrong))
             raise InputFileError(f"{path}: every ray {what}; ray {i + 1} is {rows[i].tolist()}: correct or remove it")
     if not rows[:, 6].sum() > 0.0:
-        raise InputFileError(f"{path}: all {len(rows)} weights are 0: give one ray at least a weight > 0")
+        raise InputFileError(f"{path}: all {len(rows)} weights are 0: give at least one ray a weight > 0")
     rows[:, 3:6] /= length[:, None]
     return rows
 
 
 def _read_numpy(path: Path, data: bytes, kind: str) -> np.ndarray:
-    """Return the rows of a NumPy file."""
+    """Read the rows of a NumPy file."""
     try:
         if kind == ".npz":
             return np.column_stack(read_arrays(path, data, MAX_RAYS_MB, ("position", "direction"), ("weight",)))

@@ -1,7 +1,7 @@
 """Random rough samples: a Gaussian, self-affine surface of given rms height, correlation length and Hurst exponent.
 
-Spectrum per area of wave vectors, W(k) = rms^2 xi^2 / (2 pi) (1 + a k^2 xi^2)^-(1 + H) up to k_c = pi / resolution,
-with a = (1 - (1 + a k_c^2 xi^2)^-H) / (2 H), which makes its integral rms^2. Without the cut-off the autocorrelation is
+Spectral density W(k) = rms^2 xi^2 / (2 pi) (1 + a k^2 xi^2)^-(1 + H) up to k_c = pi / resolution, with
+a = (1 - (1 + a k_c^2 xi^2)^-H) / (2 H), so that its integral is rms^2. Without the cut-off the autocorrelation is
 rms^2 2^(1-H) / Gamma(H) (s r / xi)^H K_H(s r / xi), s = sqrt(2 H): rms^2 exp(-r / xi) for H = 1/2.
 Source: Palasantzas, Phys. Rev. B 48 (1993) 14472, eqs. 3 and 4; autocorrelation: own derivation (Hankel transform),
 tests/unit/test_rough.py.
@@ -16,31 +16,31 @@ from pydantic import Field, model_validator
 
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
-from helio_jax.scene.shapes import Length, SampleModel
+from helio_jax.scene.shapes import Length, SubstrateSample
 
 MAX_POINTS = 1500
-"""Points along one side at most: 4.5 million triangles."""
-_STREAM = 0x726F756768  # keeps these random numbers apart from others of equal seeds
+"""Largest number of points along one side: 4.5 million triangles."""
+_STREAM = 0x726F756768  # separates these random numbers from others with the same seed
 _MARGIN = 6.0
-"""Correlation lengths added before the periodic surface is cut, so that opposite borders are independent."""
+"""Margin of the periodic surface that is cut off, so that opposite borders are independent [correlation lengths]."""
 
 
-class RoughSample(SampleModel):
-    """A random rough square in a flat at z = 0, about which its heights are normal with mean zero."""
+class RoughSample(SubstrateSample):
+    """A random rough square in the substrate z = 0, with normally distributed heights of mean zero."""
 
     kind: Literal["rough"] = "rough"
     rms_um: Length
-    """Root mean square height of this very surface about its mean [um]."""
+    """Root mean square height of the drawn surface about its mean [um]."""
     correlation_length_um: Length
     """Lateral correlation length xi: beyond it heights are independent [um]."""
     hurst: float = Field(default=0.7, gt=0.0, le=1.0)
     """Hurst exponent: jagged (near 0) to smooth (1) below the correlation length."""
     seed: int = Field(default=1, ge=0, lt=2**63)
-    """Another seed gives another surface."""
+    """Seed of the random numbers."""
     patch_um: Length | None = None
-    """Side of the rough square; default: the whole flat. A wall joins it to the flat around [um]."""
+    """Side of the rough square; default: the whole substrate. A wall joins it to the substrate around [um]."""
     resolution_um: Length | None = None
-    """Distance of the grid points, the finest roughness there is; default: an eighth of the correlation length [um]."""
+    """Distance of the grid points, the finest roughness; default: an eighth of the correlation length [um]."""
 
     @model_validator(mode="after")
     def _is_representable(self) -> "RoughSample":
@@ -69,15 +69,15 @@ class RoughSample(SampleModel):
 
     @property
     def step(self) -> float:
-        """Distance of the grid points that is asked for [um]."""
+        """Nominal distance of the grid points [um]."""
         return self.correlation_length_um / 8.0 if self.resolution_um is None else self.resolution_um
 
     @property
     def shape_top(self) -> float | None:
-        """Height of the highest point: known only once built."""
+        """Unknown before the surface is drawn."""
         return None
 
-    def shape(self, base_dir: Path = Path()) -> Body:
+    def build_shape(self, base_dir: Path = Path()) -> Body:
         """Draw and triangulate the surface."""
         n_cells = math.ceil(self.side / self.step - 1e-9)
         axis = (np.arange(n_cells + 1) - 0.5 * n_cells) * (self.side / n_cells)
@@ -85,18 +85,16 @@ class RoughSample(SampleModel):
             n_cells + 1, self.side / n_cells, self.rms_um, self.correlation_length_um, self.hurst, self.seed
         )
         reach = None if self.side == self.size_um else 0.5 * self.size_um
-        return surfaces.surface_body(*np.meshgrid(axis, axis), height, reach, level=0.0).painted(self.material)
+        return surfaces.surface_body(*np.meshgrid(axis, axis), height, reach, level=0.0).with_material(self.material)
 
 
 def rough_heights(n: int, step: float, rms: float, correlation_length: float, hurst: float, seed: int) -> np.ndarray:
-    """Return heights [n, n] of a random surface, um: mean 0 and root mean square `rms` exactly.
+    """Draw heights [n, n] of a random surface, um, with mean 0 and root mean square `rms` exactly.
 
     Args:
         n: points along each side.
         step: distance of neighbouring points [um].
-        rms: root mean square height [um].
-        correlation_length: xi [um].
-        hurst: H, above 0 and at most 1.
+        rms, correlation_length, hurst: rms height [um], xi [um] and H.
         seed: of the random numbers.
     """
     from scipy.fft import next_fast_len
@@ -111,13 +109,12 @@ def rough_heights(n: int, step: float, rms: float, correlation_length: float, hu
 
 
 def spectrum(k: np.ndarray, cutoff: float, correlation_length: float, hurst: float) -> np.ndarray:
-    """Return W(k) of a surface of rms 1 [um^2]: its integral over all wave vectors (d kx d ky) is 1.
+    """Compute W(k) of a surface of rms 1 [um^2]; its integral over all wave vectors (d kx d ky) is 1.
 
     Args:
         k: lengths of wave vectors [rad/um].
-        cutoff: k_c, above which there is nothing [rad/um].
-        correlation_length: xi [um].
-        hurst: H.
+        cutoff: k_c, above which W is zero [rad/um].
+        correlation_length, hurst: xi [um] and H.
     """
     a, reach = 1.0 / (2.0 * hurst), (cutoff * correlation_length) ** 2
     for _ in range(200):  # a contraction: converges from above

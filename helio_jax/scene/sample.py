@@ -1,9 +1,8 @@
-"""Sample models: what is imaged. Settings table `[sample]`, chosen by `kind`; the only door to trimesh.
+"""Sample models, the table `[sample]`, selected by `kind`; mesh samples and the import of trimesh.
 
-The samples given by numbers are in shapes.py and rough.py, height maps in maps.py, meshes here. Each turns itself into
-a `Body` with `build(base_dir)`: sample frame, z up, z = 0 on the reference plane, um. trimesh is imported where
-it is needed, so loading a scene stays cheap. Files are untrusted: size and number of faces are limited, contents
-are checked, every failure is an `InputFileError` that names the file.
+Parametric samples are in shapes.py and rough.py, height maps in maps.py. `build(base_dir)` of each gives a `Body`:
+sample frame, z up, z = 0 on the substrate, um. Files are untrusted: size and number of faces are limited, contents are
+checked, every failure is an `InputFileError` that names the file.
 """
 
 from dataclasses import replace
@@ -24,7 +23,7 @@ from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.shapes import (
     FlatSample,
     Length,
-    PaintedSample,
+    MaterialSample,
     PyramidSample,
     SpheresSample,
     StepSample,
@@ -34,32 +33,31 @@ from helio_jax.settings import UNITS_UM, Settings, Unit
 
 MAX_FACES = 5_000_000
 MESH_EXTENT_UM = (1e-2, 1e6)
-"""Smallest and largest sensible extent of a mesh [um]."""
+"""Smallest and largest plausible extent of a mesh [um]."""
 
 
-class MeshSample(PaintedSample):
-    """A triangle mesh from a file, scaled, then turned about x, y, z (in this order), then moved."""
+class MeshSample(MaterialSample):
+    """A triangle mesh from a file."""
 
     kind: Literal["mesh"] = "mesh"
     file: str = Field(min_length=1, max_length=4096)
     """STL, OBJ, PLY or GLB file, relative to the scene file. (GLB has its y axis up: rotate_deg = [90, 0, 0].)"""
     unit: Unit
-    """Unit of the file's coordinates (STL and OBJ do not say; GLB is in m)."""
+    """Unit of the file's coordinates (STL and OBJ do not state it; GLB is in m)."""
     flat_size_um: Length | None = None
-    """Side of a flat added at z = 0 under the placed mesh; the mesh's faces in that plane are left out [um]."""
+    """Side of a substrate added at z = 0 under the placed mesh; the mesh's faces in that plane are removed [um]."""
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
     materials: dict[str, str] = Field(default={}, max_length=1000)
-    """Material by the name of a part: OBJ: its material (usemtl), group or object; GLB: its geometry. Other parts of an
-    OBJ have the laws that the .mtl file beside it gives their materials (helio_law ...), if it does."""
+    """Material by the name of a part (OBJ material, group or object; GLB geometry). Other parts of an OBJ take their
+    laws from the .mtl file beside it (helio_law ...), if it defines any."""
 
     @property
     def material_names(self) -> tuple[str, ...]:
-        """Names of all materials that the sample asks for."""
         return (self.material, *self.materials.values())
 
-    def shape(self, base_dir: Path = Path()) -> Body:
-        """Read and check the mesh; its lengths stay in the file's unit.
+    def build_shape(self, base_dir: Path = Path()) -> Body:
+        """Read and check the mesh, in the file's unit.
 
         Raises:
             InputFileError: the file is missing, too large, unreadable, empty or non-finite.
@@ -67,13 +65,13 @@ class MeshSample(PaintedSample):
         laws = self.file_laws(base_dir)
         own = tuple(law.name for law in laws.values())
         vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials), own)
-        wanted = (*self.material_names, *laws)
-        names = tuple(dict.fromkeys(wanted))
-        index = np.array([names.index(name) for name in wanted])[parts]
+        by_part = (*self.material_names, *laws)
+        names = tuple(dict.fromkeys(by_part))
+        index = np.array([names.index(name) for name in by_part])[parts]
         return Body(vertices, faces, materials=names, face_material=index)
 
     def file_laws(self, base_dir: Path = Path()) -> dict[str, FileLaw]:
-        """Return the laws in the .mtl beside an OBJ of parts that `materials` does not name, by "NAME (FILE)".
+        """Read the laws of parts that `materials` does not name from the .mtl beside an OBJ, by "NAME (FILE)".
 
         Raises:
             InputFileError: the mesh or the .mtl is missing or wrong.
@@ -85,33 +83,33 @@ class MeshSample(PaintedSample):
         return {f"{name} ({self.file})": law for name, law in laws.items() if name not in self.materials}
 
     def warnings(self, base_dir: Path = Path()) -> list[str]:
-        """Return which .mtl files are named by the OBJ and not there."""
+        """List .mtl files that the OBJ names and that do not exist."""
         path = base_dir / self.file
         missing = mtl_files(path, read_bytes(path, self.max_file_mb))[1] if path.suffix.lower() == ".obj" else []
         return [
-            f"{path.name} names {name}, which is not beside it: laws that it may give are unknown, all parts "
-            "but those in sample.materials have sample.material"
+            f"{path.name} names {name}, which is not beside it: its laws are unknown, all parts except those in "
+            "sample.materials have sample.material"
             for name in missing
         ]
 
     def build(self, base_dir: Path = Path()) -> Body:
-        """Read, check and place the mesh, and put the flat under it.
+        """Read, check and place the mesh, and add the substrate.
 
         Raises:
-            InputFileError: as `shape`; the mesh is of absurd size.
+            InputFileError: as `build_shape`; the mesh has an implausible size.
         """
-        mesh = self.put(self.shape(base_dir), UNITS_UM[self.unit])
+        mesh = self.place_body(self.build_shape(base_dir), UNITS_UM[self.unit])
         extent, (low, high) = float(np.ptp(mesh.triangles.reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
         if not low <= extent <= high:
             raise InputFileError(
-                f"{base_dir / self.file}: the mesh is {extent:g} um across, sensible are {low:g} to {high:g} um: check "
-                f"sample.unit (now {self.unit!r}) and sample.scale (now {self.scale:g})"
+                f"{base_dir / self.file}: the mesh is {extent:g} um across, plausible are {low:g} to {high:g} um: "
+                f"check sample.unit (now {self.unit!r}) and sample.scale (now {self.scale:g})"
             )
         if self.flat_size_um is None:
             return mesh
         is_free = np.any(np.abs(mesh.triangles[..., 2]) > 1e-6 * extent, axis=1)
         mesh = replace(mesh, faces=mesh.faces[is_free], face_material=mesh.face_material[is_free])
-        return Body.join([mesh, surfaces.flat_body(self.flat_size_um).painted(self.material)])
+        return Body.join([mesh, surfaces.flat_body(self.flat_size_um).with_material(self.material)])
 
 
 Single = (
@@ -129,68 +127,63 @@ Single = (
 
 
 class PlacedSample(Settings):
-    """A sample among several; like any other it may be scaled, turned and moved by its own keys."""
+    """A sample among several."""
 
     sample: Annotated[Single, Field(discriminator="kind")]
-    """The sample, with its own flat and materials."""
+    """The sample, with its own placement, substrate and materials."""
     shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Further shift of the sample [um]."""
 
 
 class SeveralSamples(PlaceableSample):
-    """Several samples at once; their flats should not overlap: the highest surface hides the others."""
+    """Several samples at once; their substrates should not overlap: the highest surface covers the others."""
 
     kind: Literal["several"] = "several"
     parts: tuple[PlacedSample, ...] = Field(min_length=1, max_length=1000)
-    """The samples and where they stand."""
+    """The samples and their shifts."""
 
     @model_validator(mode="after")
     def _is_placed_as_a_whole(self) -> "SeveralSamples":
         for i, part in enumerate(self.parts):
             if part.sample.place != "as-given":
                 raise ValueError(
-                    f"parts[{i}].sample.place must be 'as-given', got {part.sample.place!r}: only the whole can be "
-                    "placed by the plate: move the key to [sample]"
+                    f"parts[{i}].sample.place must be 'as-given', got {part.sample.place!r}: only all samples together "
+                    "can be placed relative to the plate: move the key to [sample]"
                 )
         return self
 
     @property
     def material_names(self) -> tuple[str, ...]:
-        """Names of all materials that the samples ask for."""
         return tuple(name for part in self.parts for name in part.sample.material_names)
 
     @property
     def shape_top(self) -> float | None:
-        """Height of the highest point whose height is known [um]."""
         tops = [part.sample.top + part.shift_um[2] for part in self.parts if part.sample.top is not None]
         return max(tops, default=None)
 
     def file_laws(self, base_dir: Path = Path()) -> dict[str, FileLaw]:
-        """Return the laws that the samples' files bring along (errors as theirs)."""
         return {name: law for part in self.parts for name, law in part.sample.file_laws(base_dir).items()}
 
     def warnings(self, base_dir: Path = Path()) -> list[str]:
-        """Return what is probably not meant about the samples' files."""
         return [text for part in self.parts for text in part.sample.warnings(base_dir)]
 
-    def shape(self, base_dir: Path = Path()) -> Body:
-        """Build and join the samples (errors as theirs)."""
+    def build_shape(self, base_dir: Path = Path()) -> Body:
         return Body.join([part.sample.build(base_dir).moved(part.shift_um) for part in self.parts])
 
 
 Sample = Annotated[Single | SeveralSamples, Field(discriminator="kind")]
-"""Any sample; `kind` tells which."""
+"""Any sample, selected by `kind`."""
 
 
 def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
-    An open sheet is fine: a flat with structure is open along its outer border. `is_watertight` is asked of closed
-    meshes; `n_inner_open_edges` counts open edges away from the bounding box's sides, where rays would leak.
+    An open sheet is allowed: a substrate with structure is open along its outer border. `n_inner_open_edges` counts
+    open edges away from the sides of the bounding box, where rays would leak.
 
     Args:
-        body: where it stands.
-        untilted: of a tilted sample: the same before it was turned, whose bounding box has the border on its sides.
+        body: after placement.
+        untilted: the body before a tilt, whose outer border lies on the sides of its bounding box.
     """
     import trimesh
 
@@ -227,14 +220,17 @@ def load_mesh(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read a mesh in file units; equal vertices are merged, a closed mesh must not be inside out.
 
-    `names` of parts must be in the file; `own` are materials of an OBJ (usemtl), for parts that `names` does not name.
+    Args:
+        path: STL, OBJ, PLY or GLB file.
+        max_mb: largest file [MB].
+        names: parts that the file must contain.
+        own: materials of an OBJ (usemtl) to find among its other parts.
 
     Returns:
-        Vertices [n, 3], faces [m, 3], and of each face 1 + the number of its name in `names` and then `own`, 0: none
-        of them [m].
+        Vertices [n, 3], faces [m, 3], and 1 + the index of each face's part in (*names, *own), 0: another part [m].
 
     Raises:
-        InputFileError: the file is unreadable or holds no sensible mesh, or has no part of one of the names.
+        InputFileError: the file is unreadable, holds no valid mesh, or lacks a part.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in ("stl", "obj", "ply", "glb"):
@@ -266,7 +262,7 @@ def load_mesh(
     has_area = clean.nondegenerate_faces(height=0.0)
     clean.update_faces(has_area)
     if not len(clean.faces):
-        raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit absurd")
+        raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit is wrong")
     if clean.is_watertight and clean.volume < 0:
         raise InputFileError(
             f"{path}: the mesh is inside out (volume < 0): flip its normals in the program that made it"
@@ -275,7 +271,7 @@ def load_mesh(
 
 
 def _split(data: bytes, kind: str, names: tuple[str, ...], own: tuple[str, ...]) -> list[tuple[bytes, str]]:
-    """Return the text of an OBJ file once for each of its named parts, with that part's faces only; else all."""
+    """Split an OBJ file into one text per named part, with the faces of that part; other kinds stay whole."""
     if kind != "obj" or not (names or own):
         return [(data, "")]
     rest: list[bytes] = []
@@ -295,7 +291,7 @@ def _split(data: bytes, kind: str, names: tuple[str, ...], own: tuple[str, ...])
 
 
 def _pieces(data: bytes, kind: str, label: str) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """Return vertices, faces and name of every geometry of a file, placed in its scene; `label` overrides the names."""
+    """Read vertices, faces and name of every geometry of a file, in its scene; `label` overrides the names."""
     import io
 
     import trimesh

@@ -1,7 +1,7 @@
-"""Scans: which beam positions a micrograph is made of, and how often. Settings table `[scan]`, chosen by `kind`.
+"""Scans: the beam positions of a micrograph. Settings table `[scan]`, selected by `kind`.
 
-Convention: a beam position is where the beam axis meets the sample's plane z = 0, sample frame (arrays.py). A scan of
-any kind may be repeated at several distances and rotations: its views (views.py).
+A beam position is where the beam axis meets the substrate plane z = 0, sample frame (arrays.py). A scan of any kind may
+be repeated at several distances and rotations: its views (views.py).
 """
 
 import math
@@ -17,41 +17,41 @@ from helio_jax.scene.files import read_positions
 from helio_jax.settings import Settings
 
 MAX_PIXELS = 4096**2
-"""Largest scan, in pixels of all its views."""
+"""Largest number of pixels of a scan, all views together."""
 MAX_VIEWS = 1000
-"""Most views of one scan."""
+"""Largest number of views of a scan."""
 
 
 class Scan(Settings):
-    """What all scans share: what a pixel's counts stand for, and the views."""
+    """Base of all scans: dose per pixel, and views."""
 
     atoms_per_pixel: float = Field(default=35_000.0, gt=0.0, le=1e18)
-    """Beam atoms per pixel that the counts stand for (not the number of traced rays)."""
+    """Beam atoms per pixel that the counts correspond to (not the number of traced rays)."""
     sample_distances_um: tuple[Annotated[float, Field(gt=0.0, le=1e7)], ...] = Field(default=(), max_length=MAX_VIEWS)
-    """z stack: the scan at each of these distances from the plate to the plane z = 0, beam positions (the points that
-    the beam meets) unchanged: the sample moves along the beam; default: plate.sample_distance_um [um]."""
+    """z stack: the scan at each of these distances from the plate to the plane z = 0, with unchanged beam positions
+    (the sample moves along the beam); default: plate.sample_distance_um [um]."""
     rotations_deg: tuple[Annotated[float, Field(ge=-360.0, le=360.0)], ...] = Field(default=(), max_length=MAX_VIEWS)
     """The scan at each of these rotations, counter-clockwise seen from above [deg]."""
     rotate: Literal["sample", "detectors"] = "sample"
-    """What turns: the sample under the scan, or all detector apertures about the point above the nominal spot."""
+    """What rotates: the sample under the scan, or all detector apertures about the point above the nominal spot."""
     about: Literal["normal", "beam"] = "normal"
-    """About the plate normal, or about the beam axis (the sample only, if the beam is oblique: it then tilts)."""
+    """Axis of rotation: plate normal or beam (oblique beam: the sample only, which then tilts)."""
     axis_um: tuple[float, float] = (0.0, 0.0)
-    """Where the sample's axis of rotation meets the plane z = 0 [um]."""
+    """Point in the plane z = 0 on the sample's axis of rotation [um]."""
 
     @property
     def n_views(self) -> int:
-        """How many times the positions are scanned."""
+        """Number of views."""
         return max(1, len(self.sample_distances_um)) * max(1, len(self.rotations_deg))
 
     def view_problems(self, beam: Beam) -> list[str]:
-        """Return what is wrong with the views, each as "key: what: remedy"."""
+        """List errors of the views, each as "key: error: remedy"."""
         out = []
         if self.n_views > MAX_VIEWS:
             out.append(f"scan.rotations_deg: at most {MAX_VIEWS} views, got {self.n_views}: split the scan")
         if self.rotate == "detectors" and self.about == "beam" and beam.incidence_deg > 0:
             out.append(
-                f"scan.about: detectors in the plate cannot turn about a beam at {beam.incidence_deg:g} deg: "
+                f"scan.about: detectors in the plate cannot rotate about a beam at {beam.incidence_deg:g} deg: "
                 'set scan.about = "normal" or scan.rotate = "sample"'
             )
         if self.rotate == "detectors" and any(self.axis_um):
@@ -59,26 +59,26 @@ class Scan(Settings):
         return out
 
     def problem(self, beam: Beam) -> str | None:
-        """Return why these positions cannot be combined with `beam`, or None."""
+        """Return why the positions cannot be combined with `beam`, or None."""
         return None
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the axes of the scan's images: beam positions x [x] and y [y], um (a list: see there)."""
+        """Compute the axes of the scan's images: beam positions x [x] and y [y], um."""
         raise NotImplementedError
 
     def points(self, beam: Beam, ids: np.ndarray, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x, y of some pixels [n], numbered row by row, um."""
+        """Compute the beam positions x, y of some pixels [n], numbered row by row, um."""
         x, y = self.positions(beam, base_dir)
         return x[ids % x.size], y[ids // x.size]
 
     @property
     def spacing(self) -> float | None:
-        """Distance of neighbouring pixels across the beam [um], where there is one."""
+        """Distance of neighbouring pixels across the beam [um], or None."""
         return None
 
 
 class Raster(Scan):
-    """A regular raster, centred on `center_um`; x grows with the column, y with the row."""
+    """A regular raster, centred on `center_um`; x increases with the column, y with the row."""
 
     kind: Literal["raster"] = "raster"
     nx: int = Field(ge=1, le=65536)
@@ -88,10 +88,10 @@ class Raster(Scan):
     pixel_size_um: float = Field(gt=0.0, le=1e5)
     """Distance between neighbouring pixels; see `pitch` [um]."""
     pitch: Literal["beam", "sample"] = "beam"
-    """`beam`: pixel size measured across the beam, so it is pixel_size / cos t on the sample along the beam's
-    azimuth (which must be a multiple of 90 deg); `sample`: equal in x and y on the sample."""
+    """`beam`: pixel size measured across the beam; on the sample it is pixel_size / cos t along the beam's azimuth
+    (which must be a multiple of 90 deg); `sample`: equal in x and y on the sample."""
     center_um: tuple[float, float] = (0.0, 0.0)
-    """Beam position of the raster's middle [um]."""
+    """Beam position of the raster's centre [um]."""
 
     @model_validator(mode="after")
     def _is_small_enough(self) -> "Raster":
@@ -104,7 +104,6 @@ class Raster(Scan):
         return self
 
     def problem(self, beam: Beam) -> str | None:
-        """Return why this raster cannot be combined with `beam`, or None."""
         if self.pitch == "beam" and beam.incidence_deg > 0 and beam.azimuth_deg % 90 != 0:
             return (
                 f"'beam' needs beam.azimuth_deg to be a multiple of 90, got {beam.azimuth_deg:g}: "
@@ -113,7 +112,6 @@ class Raster(Scan):
         return None
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x [x] and y [y], um."""
         stretch = 1.0 / math.cos(math.radians(beam.incidence_deg)) if self.pitch == "beam" else 1.0
         is_along_x = beam.azimuth_deg % 180 == 0
         step_x = self.pixel_size_um * (stretch if is_along_x else 1.0)
@@ -124,7 +122,6 @@ class Raster(Scan):
 
     @property
     def spacing(self) -> float | None:
-        """Pixel size [um]."""
         return self.pixel_size_um
 
 
@@ -133,14 +130,14 @@ class Line(Scan):
 
     kind: Literal["line"] = "line"
     along: Literal["x", "y", "beam"]
-    """`x`, `y`: across the sample; `beam`: the distance from the plate changes and the beam meets the same point: one
-    view of one pixel for each distance."""
+    """`x`, `y`: across the sample; `beam`: the sample distance changes at a constant beam position, one view of one
+    pixel for each distance."""
     n: int = Field(ge=1, le=65536)
     """Points."""
     step_um: float = Field(gt=0.0, le=1e5)
     """Distance of neighbouring points; along the beam: of neighbouring sample distances [um]."""
     center_um: tuple[float, float] = (0.0, 0.0)
-    """Beam position of the line's middle [um]."""
+    """Beam position of the line's centre [um]."""
 
     @model_validator(mode="after")
     def _is_one_line(self) -> "Line":
@@ -152,34 +149,31 @@ class Line(Scan):
 
     @property
     def n_views(self) -> int:
-        """How many times the positions are scanned."""
         return super().n_views * (self.n if self.along == "beam" else 1)
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x [x] and y [y], um: one of both has a single element."""
         steps = self.steps
         x, y = (np.array([c]) for c in self.center_um)
         return (x + steps, y) if self.along == "x" else (x, y + steps) if self.along == "y" else (x, y)
 
     @property
     def steps(self) -> np.ndarray:
-        """Distances from the middle of the line [n], um."""
+        """Distances from the centre of the line [n], um."""
         return (np.arange(self.n) - 0.5 * (self.n - 1)) * self.step_um
 
     @property
     def spacing(self) -> float | None:
-        """Distance of neighbouring points, where they are on the sample [um]."""
         return None if self.along == "beam" else self.step_um
 
 
 class PositionList(Scan):
-    """Any positions, in any order: images of one row, whose x only counts them; see `MicrographStack.positions`."""
+    """Any positions, in any order: images of one row whose x is an index; see `MicrographStack.positions`."""
 
     kind: Literal["list"] = "list"
     file: str | None = Field(default=None, min_length=1, max_length=4096)
     """Text file (.csv) relative to the scene file: x and y in um of one beam position on each line."""
     points_um: tuple[tuple[float, float], ...] = Field(default=(), max_length=100_000)
-    """The positions (x, y) themselves, instead of a file [um]."""
+    """The positions (x, y), instead of a file [um]."""
     _found: tuple[Path, np.ndarray] | None = PrivateAttr(None)
 
     @model_validator(mode="after")
@@ -192,7 +186,7 @@ class PositionList(Scan):
         """Return the positions [n, 2], um; a file is read once.
 
         Raises:
-            InputFileError: the file is missing or holds anything else than positions.
+            InputFileError: the file is missing or does not hold positions.
         """
         if self.file is None:
             return np.array(self.points_um)
@@ -205,20 +199,19 @@ class PositionList(Scan):
         return self._found[1]
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers of the positions, from 0, and a single 0: the axes of images of one row."""
+        """Return the index of every position, and a single 0: the axes of images of one row."""
         return np.arange(len(self.read(base_dir)), dtype=float), np.zeros(1)
 
     def points(self, beam: Beam, ids: np.ndarray, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x, y of some of the list [n], um."""
         x, y = self.read(base_dir)[ids].T
         return x, y
 
 
 AnyScan = Annotated[Raster | Line | PositionList, Field(discriminator="kind")]
-"""Any scan; `kind` tells which."""
+"""Any scan, selected by `kind`."""
 
 
-def named_kind(tables: Any) -> Any:
-    """Return a scene's tables with scan.kind = "raster" where it is not said."""
+def with_scan_kind(tables: Any) -> Any:
+    """Return a scene's tables with scan.kind = "raster" if the key is missing."""
     scan = tables.get("scan") if isinstance(tables, dict) else None
     return {**tables, "scan": {"kind": "raster", **scan}} if isinstance(scan, dict) else tables

@@ -1,9 +1,9 @@
-"""Scattering laws: how a surface sends atoms on. Tables `[material.NAME]` of a scene, chosen by `kind`.
+"""Scattering laws of surfaces. Tables `[material.NAME]` of a scene, selected by `kind`.
 
-Every law leaves an atom somewhere on the vacuum side: directions that a lobe would send below the surface are drawn
-again, so its density is cut at the horizon and normalised. A law says what it is made of as `Term`s, each a share of
-the atoms with one distribution; trace/laws.py draws from them. `compat = "shem-ray-tracing"` repeats known faults of
-the program SHeM Ray Tracing, inferred from its counts (DATA.md), so that its files compare; never use it for physics.
+Directions that a lobe would send below the surface are drawn again: its density is cut at the horizon and normalised. A
+law is a sum of `Term`s, each a fraction of the atoms with one distribution; trace/laws.py samples them.
+`compat = "shem-ray-tracing"` reproduces known errors of the program SHeM Ray Tracing, inferred from its counts, to
+compare with its files; never use it for physics.
 """
 
 import math
@@ -19,35 +19,35 @@ from helio_jax.scene.files import read_scattering_table
 from helio_jax.settings import Settings
 
 Compat = Literal["none", "shem-ray-tracing"]
-"""Whose faults to repeat."""
+"""Program whose errors are reproduced."""
 DEBYE_WALLER = 278.5085
 """2W = this * E T / (M Theta^2) * |change of the unit direction|^2 with meV, K, u: 6 m_He / k_B in u K / meV."""
 
 
 class Shape(IntEnum):
-    """Distributions of a `Term`, and what its numbers are."""
+    """Distributions of a `Term`, and the meaning of its `numbers`."""
 
     COSINE = 0
     SPECULAR = 1
     UNIFORM = 2  # cosine of the cone's half-angle
-    LOBE = 3  # width [rad], +1 about the specular direction, -1 about the way back
+    LOBE = 3  # width [rad], +1: about the specular direction, -1: about the backscattering direction
     COSINE_LOBE = 4
-    DIFFRACTION = 5  # width of broadened peaks, 1 if the lattice turns with the face; rows: order, order, weight, width
+    DIFFRACTION = 5  # width of broadened peaks, 1: lattice rotates with the face; rows: order, order, weight, width
     ROUGH = 6  # roughness
     TABLE = 7  # table: intensity [incidence, theta, phi] on axes
 
 
 @dataclass(frozen=True)
 class Term:
-    """A share of the atoms and how they leave.
+    """A fraction of the atoms and the distribution of their directions.
 
     Attributes:
-        shape: of the distribution.
-        share: of the atoms; what the shares of a law lack to 1 sticks to the surface.
-        numbers: see `Shape`.
+        shape: kind of distribution.
+        share: fraction of the atoms; the fractions of a law add up to its albedo, the other atoms stick.
+        numbers: parameters, see `Shape`.
         rows: diffraction peaks [n, 4].
         lattice: the two vectors of a diffraction lattice in wavelengths [2, 3].
-        attenuation: B of the Debye-Waller factor exp(-B |u_out - u_in|^2); what it takes leaves by the cosine law.
+        attenuation: B of the Debye-Waller factor exp(-B |u_out - u_in|^2); attenuated atoms leave by the cosine law.
         axes: incidence, theta and phi of a table [rad].
         intensity: of a table, per steradian [incidence, theta, phi].
     """
@@ -67,13 +67,13 @@ COSINE_LAW = (Term(Shape.COSINE, 1.0),)
 
 
 class LawModel(Settings):
-    """What all laws share."""
+    """Base of all laws."""
 
     albedo: float = Field(default=1.0, gt=0.0, le=1.0)
-    """Share of the atoms that leave again; the others stick and are counted as stopped."""
+    """Fraction of the atoms that leave again; the others stick and are counted as stopped."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of; relative file names start at `base_dir`."""
+        """Resolve the law into terms; relative file names start at `base_dir`."""
         raise NotImplementedError
 
 
@@ -101,37 +101,35 @@ class CosineLaw(LawModel):
     kind: Literal["cosine"] = "cosine"
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
         return (Term(Shape.COSINE, self.albedo),)
 
 
 class UniformLaw(LawModel):
-    """The same per steradian everywhere within a cone about the normal."""
+    """Constant intensity per steradian within a cone about the normal."""
 
     kind: Literal["uniform"] = "uniform"
     half_angle_deg: float = Field(default=90.0, gt=0.0, le=90.0)
     """Half-angle of the cone [deg]."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
         return (Term(Shape.UNIFORM, self.albedo, (math.cos(math.radians(self.half_angle_deg)),)),)
 
 
-class DiffuseRest(LawModel):
-    """A lobe with a diffuse background."""
+class DiffuseBackgroundLaw(LawModel):
+    """Base of laws with a lobe and a diffuse background."""
 
     diffuse_fraction: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Share of the atoms that leave by the cosine law instead of the lobe."""
+    """Fraction of the atoms that leave by the cosine law instead of the lobe."""
 
-    def with_rest(self, shape: Shape, numbers: tuple[float, ...] = (), **more) -> tuple[Term, ...]:
-        """Return the diffuse term, if any, and the lobe's."""
+    def lobe_terms(self, shape: Shape, numbers: tuple[float, ...] = (), **more) -> tuple[Term, ...]:
+        """Return the term of the lobe, after that of the diffuse background, if any."""
         lobe = Term(shape, self.albedo * (1.0 - self.diffuse_fraction), numbers, **more)
         diffuse = self.albedo * self.diffuse_fraction
         return (Term(Shape.COSINE, diffuse), lobe) if diffuse else (lobe,)
 
 
-class Coherent(DiffuseRest):
-    """A coherent lobe, which thermal vibrations attenuate."""
+class CoherentLaw(DiffuseBackgroundLaw):
+    """Base of laws with a coherent lobe, which thermal vibrations attenuate."""
 
     debye_waller: DebyeWaller | None = None
     """Thermal attenuation, or none."""
@@ -142,8 +140,8 @@ class Coherent(DiffuseRest):
         return 0.0 if self.debye_waller is None else self.debye_waller.attenuation
 
 
-class GaussianLobe(DiffuseRest):
-    """A lobe cos(theta) exp(-g^2 / (2 s^2)) per steradian, g the angle to its axis."""
+class GaussianLobeLaw(DiffuseBackgroundLaw):
+    """Base of laws with a lobe cos(theta) exp(-g^2 / (2 s^2)) per steradian, g the angle to its axis."""
 
     sigma_deg: float = Field(ge=1.0, le=180.0)
     """Width s of the lobe [deg]."""
@@ -156,85 +154,80 @@ class GaussianLobe(DiffuseRest):
         return math.radians(self.sigma_deg) * (1.0 if self.compat == "none" else 0.5)
 
 
-class SpecularLaw(Coherent):
-    """A perfect mirror."""
+class SpecularLaw(CoherentLaw):
+    """Mirror reflection."""
 
     kind: Literal["specular"] = "specular"
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
-        return self.with_rest(Shape.SPECULAR, attenuation=self.attenuation)
+        return self.lobe_terms(Shape.SPECULAR, attenuation=self.attenuation)
 
 
-class BroadSpecularLaw(GaussianLobe, Coherent):
+class BroadSpecularLaw(GaussianLobeLaw, CoherentLaw):
     """A Gaussian lobe about the specular direction."""
 
     kind: Literal["broad_specular"] = "broad_specular"
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
-        return self.with_rest(Shape.LOBE, (self.sigma, 1.0), attenuation=self.attenuation)
+        return self.lobe_terms(Shape.LOBE, (self.sigma, 1.0), attenuation=self.attenuation)
 
 
-class BackscatteringLaw(GaussianLobe):
-    """A Gaussian lobe about where the atom came from."""
+class BackscatteringLaw(GaussianLobeLaw):
+    """A Gaussian lobe about the direction from which the atom came."""
 
     kind: Literal["backscattering"] = "backscattering"
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
-        return self.with_rest(Shape.LOBE, (self.sigma, -1.0))
+        return self.lobe_terms(Shape.LOBE, (self.sigma, -1.0))
 
 
-class CosineSpecularLaw(DiffuseRest):
+class CosineSpecularLaw(DiffuseBackgroundLaw):
     """A cosine lobe about the specular direction, cut at the horizon."""
 
     kind: Literal["cosine_specular"] = "cosine_specular"
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
-        return self.with_rest(Shape.COSINE_LOBE)
+        return self.lobe_terms(Shape.COSINE_LOBE)
 
 
 class RoughDiffuseLaw(LawModel):
     """The energy-preserving Oren-Nayar model (EON): a diffuse surface that is rough below the beam's spot.
 
     Source: Portsmouth, Kutz, Hill, "EON: A practical energy-preserving rough diffuse BRDF", JCGT 14 (2025) 1, with
-    the multiple scattering's albedo 1: every atom leaves.
+    albedo 1 of the multiple scattering, so that every atom leaves.
     """
 
     kind: Literal["rough_diffuse"] = "rough_diffuse"
     roughness: float = Field(ge=0.0, le=1.0)
-    """r of the model: 0 is the cosine law; about the standard deviation of the facets' slope angle over pi/2."""
+    """r of the model: about the standard deviation of the facets' slope angle over pi/2; 0 is the cosine law."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
         return (Term(Shape.ROUGH, self.albedo, (self.roughness,)),)
 
 
-class DiffractionLaw(Coherent):
-    """2-D diffraction: the direction's part along the surface changes by wavelength * (n b1 + m b2).
+class DiffractionLaw(CoherentLaw):
+    """2-D diffraction: the direction's component along the surface changes by wavelength * (n b1 + m b2).
 
-    b1, b2 are reciprocal (without 2 pi) to the lattice on the face. Peaks are Gaussian in the direction's part along
-    the surface. Orders are given by a Gaussian envelope or as a table of intensities.
+    b1, b2 are reciprocal (without 2 pi) to the lattice on the face. Peaks are Gaussian in the direction's component
+    along the surface. Orders are given by a Gaussian envelope or as a table of intensities.
     """
 
     kind: Literal["diffraction"] = "diffraction"
     wavelength_nm: float = Field(gt=0.0, le=10.0)
     """Wavelength of the atoms [nm]."""
     lattice_nm: tuple[tuple[float, ...], tuple[float, ...]]
-    """The surface lattice's two vectors: x, y, z in the sample frame, projected onto the face; or x, y on a horizontal
-    face, turned with every other face by the shortest way from its normal to z [nm]."""
+    """The two vectors of the surface lattice: x, y, z in the sample frame, projected onto the face; or x, y on a
+    horizontal face, rotated to every other face by the shortest rotation from z to its normal [nm]."""
     max_order: tuple[int, int] = (6, 6)
     """Largest |n| and |m|."""
     order_sigma: float = Field(default=2.0, gt=0.0, le=1000.0)
-    """Standard deviation s of the orders: their weight is exp(-(n^2 + m^2) / (2 s^2))."""
+    """Standard deviation s of the orders, whose weight is exp(-(n^2 + m^2) / (2 s^2))."""
     peaks: tuple[tuple[int, int, Annotated[float, Field(ge=0.0)]], ...] | None = Field(None, max_length=10_000)
-    """Instead of the Gaussian: [n, m, intensity] of every peak; only the ratios of the intensities count."""
+    """Instead of the Gaussian: [n, m, intensity] of every peak, normalised to the sum of the intensities."""
     peak_sigma: float = Field(default=0.0, ge=0.0, le=0.5)
     """Standard deviation of a peak in direction cosines along the surface; 0: exact."""
     compat: Compat = "none"
-    """`shem-ray-tracing`: its order weights."""
+    """`shem-ray-tracing`: its weights of the orders."""
 
     @model_validator(mode="after")
     def _has_lattice_and_orders(self) -> "DiffractionLaw":
@@ -247,12 +240,12 @@ class DiffractionLaw(Coherent):
         if not all(0 <= n <= 50 for n in self.max_order):
             raise ValueError(f"max_order must be two numbers from 0 to 50, got {list(self.max_order)}")
         if self.peaks is not None and not sum(p[2] for p in self.peaks) > 0:
-            raise ValueError("peaks must have one intensity > 0 at least: add peaks, or leave the key out")
+            raise ValueError("peaks must have at least one intensity > 0: add peaks, or remove the key")
         return self
 
     @property
-    def _is_turned(self) -> bool:
-        """Whether the lattice turns with the face."""
+    def _rotates_with_face(self) -> bool:
+        """Whether the lattice rotates with the face."""
         return len(self.lattice_nm[0]) == 2
 
     @property
@@ -261,29 +254,28 @@ class DiffractionLaw(Coherent):
         return np.array([(*v, 0.0)[:3] for v in self.lattice_nm])
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
         n, m, weight = (np.array(column, float) for column in self._weights())
         width = np.full(n.shape, self.peak_sigma)
-        if self.compat != "none" and (self.peaks is not None or not self._is_turned):
+        if self.compat != "none" and (self.peaks is not None or not self._rotates_with_face):
             width[(n == 0) & (m == 0)] = 0.0
         rows = np.stack([n, m, weight / weight.sum(), width], 1)[weight > 1e-12 * weight.max()]
         lattice = self.vectors / self.wavelength_nm
-        return self.with_rest(
+        return self.lobe_terms(
             Shape.DIFFRACTION,
-            (self.peak_sigma, float(self._is_turned)),
+            (self.peak_sigma, float(self._rotates_with_face)),
             rows=rows,
             lattice=lattice,
             attenuation=self.attenuation,
         )
 
     def _weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return orders and weights of the peaks.
+        """Compute orders and weights of the peaks.
 
-        The forms of `compat` were inferred from the counts of one set each (reference/distributions): lattice of two
-        numbers: (n^2 + m^2) / 2 is cut to an integer. Of three numbers: min(1, (r^2 + c) exp(-r^2 / (2 s^2))) with
-        r = |n| + |m| and c = 0.05 (0.0513 +- 0.0018 fitted), order (0, 0) not broadened. Table: the first intensity
-        counts twice, what then exceeds 1 in all is cut off the last ones, order (0, 0) is not broadened. Other
-        parameters may behave otherwise, and the thermal sets hold too few atoms in peaks to tell the forms apart.
+        The forms of `compat` were inferred from the counts of one data set each; other parameters may behave
+        otherwise. Lattice of two numbers: (n^2 + m^2) / 2 is truncated to an integer. Of three numbers:
+        min(1, (r^2 + c) exp(-r^2 / (2 s^2))) with r = |n| + |m| and c = 0.05 (0.0513 +- 0.0018 fitted), order (0, 0)
+        not broadened. Table: the first intensity counts twice, the cumulative sum is cut at 1, order (0, 0) not
+        broadened.
         """
         is_compat = self.compat != "none"
         if self.peaks is not None:
@@ -295,24 +287,24 @@ class DiffractionLaw(Coherent):
         n, m = (a.ravel() for a in np.meshgrid(n, m, indexing="ij"))
         if not is_compat:
             return n, m, np.exp(-0.5 * (n**2 + m**2) / self.order_sigma**2)
-        if self._is_turned:
+        if self._rotates_with_face:
             return n, m, np.exp(-((n**2 + m**2) // 2) / self.order_sigma**2)
         square = (np.abs(n) + np.abs(m)) ** 2
         return n, m, np.minimum(1.0, (square + 0.05) * np.exp(-0.5 * square / self.order_sigma**2))
 
 
-class TableLaw(DiffuseRest):
+class TableLaw(DiffuseBackgroundLaw):
     """Intensities per steradian from a file, measured or computed.
 
     The file is text with columns theta, phi, intensity, or incidence, theta, phi, intensity, on a full grid: angles
-    in degrees, theta to the normal, phi from the plane of incidence (0 forward, 180 back). Between the nodes
-    the intensity is linear in each angle, between incidences densities are mixed; beyond the last ones they stay.
-    Where phi covers only 0 to 180, the other half is its mirror image. Outside of the given theta there is nothing.
+    in degrees, theta from the normal, phi from the plane of incidence (0 forward, 180 back). Intensities are
+    interpolated linearly in each angle, densities linearly between incidences and constant beyond the last ones.
+    If phi covers only 0 to 180, the other half is the mirror image. Outside the given theta the intensity is zero.
     """
 
     kind: Literal["table"] = "table"
     file: str = Field(min_length=1, max_length=4096)
-    """Text file (.csv: commas; else white space), relative to the scene file."""
+    """Text file (.csv: commas; otherwise white space), relative to the scene file."""
 
     def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
         """Read the file.
@@ -321,51 +313,10 @@ class TableLaw(DiffuseRest):
             InputFileError: the file is missing or holds no full grid of intensities.
         """
         axes, intensity = read_scattering_table(base_dir / self.file)
-        return self.with_rest(Shape.TABLE, axes=axes, intensity=intensity)
+        return self.lobe_terms(Shape.TABLE, axes=axes, intensity=intensity)
 
 
-PureLaw = Annotated[
-    CosineLaw
-    | UniformLaw
-    | SpecularLaw
-    | BroadSpecularLaw
-    | BackscatteringLaw
-    | CosineSpecularLaw
-    | RoughDiffuseLaw
-    | DiffractionLaw
-    | TableLaw,
-    Field(discriminator="kind"),
-]
-"""Any law but a mixture."""
-
-
-class MixturePart(Settings):
-    """One law of a mixture."""
-
-    weight: float = Field(gt=0.0, le=1e6)
-    """How often it happens, relative to the others."""
-    law: PureLaw
-    """What happens."""
-
-
-class MixtureLaw(LawModel):
-    """Several laws by turns, with an albedo."""
-
-    kind: Literal["mixture"] = "mixture"
-    parts: tuple[MixturePart, ...] = Field(min_length=1, max_length=100)
-    """The laws and their weights."""
-
-    def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
-        """Return what the law is made of."""
-        total = sum(part.weight for part in self.parts)
-        return tuple(
-            replace(term, share=term.share * self.albedo * part.weight / total)
-            for part in self.parts
-            for term in part.law.terms(base_dir)
-        )
-
-
-Law = Annotated[
+PureLaw = (
     CosineLaw
     | UniformLaw
     | SpecularLaw
@@ -375,7 +326,34 @@ Law = Annotated[
     | RoughDiffuseLaw
     | DiffractionLaw
     | TableLaw
-    | MixtureLaw,
-    Field(discriminator="kind"),
-]
-"""Any law; `kind` tells which."""
+)
+"""Any law except a mixture."""
+
+
+class MixturePart(Settings):
+    """One law of a mixture."""
+
+    weight: float = Field(gt=0.0, le=1e6)
+    """Relative frequency of the law."""
+    law: Annotated[PureLaw, Field(discriminator="kind")]
+    """The law."""
+
+
+class MixtureLaw(LawModel):
+    """A mixture of several laws."""
+
+    kind: Literal["mixture"] = "mixture"
+    parts: tuple[MixturePart, ...] = Field(min_length=1, max_length=100)
+    """The laws and their weights."""
+
+    def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
+        total = sum(part.weight for part in self.parts)
+        return tuple(
+            replace(term, share=term.share * self.albedo * part.weight / total)
+            for part in self.parts
+            for term in part.law.terms(base_dir)
+        )
+
+
+Law = Annotated[PureLaw | MixtureLaw, Field(discriminator="kind")]
+"""Any law, selected by `kind`."""

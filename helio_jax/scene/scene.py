@@ -1,6 +1,6 @@
-"""A scene: instrument, sample and scan, checked against each other. What `simulate` needs and nothing else.
+"""A scene: instrument, sample and scan, checked for consistency. Frames and units: docs/conventions.md.
 
-Frames and units: DESIGN.md section 1. A scene file has further tables: `helio_jax.workflows.scene_file.SceneFile`.
+A scene file has further tables, see `helio_jax.workflows.scene_file.SceneFile`.
 """
 
 import math
@@ -18,12 +18,12 @@ from helio_jax.scene.plates import check_solid, read_plate
 from helio_jax.scene.rays import read_rays
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.sample import Sample
-from helio_jax.scene.scan import AnyScan, PositionList, named_kind
+from helio_jax.scene.scan import AnyScan, PositionList, with_scan_kind
 from helio_jax.scene.scattering import Law, Term
 from helio_jax.scene.views import View, views_of
 
-FINER = 4.0
-"""Truth should have this many points per pixel at least, or it is one that the fit could represent."""
+MIN_POINTS_PER_PIXEL = 4.0
+"""A coarser rough surface could be represented exactly by a fit on the pixel grid, which is no honest test."""
 _MAX_DISTANCE = 1e7  # as plate.sample_distance_um
 
 
@@ -33,19 +33,19 @@ class Scene(Instrument):
     name: str = Field(default="scene", min_length=1, max_length=200)
     """Short name, shown in figures and files; default: of a scene file, its name without .toml."""
     description: str = Field(default="", max_length=10_000)
-    """What the scene is and where its numbers come from."""
+    """Description of the scene and the sources of its numbers."""
     sample: Sample
-    """What is imaged."""
+    """The sample."""
     scan: AnyScan
-    """Which beam positions."""
+    """The beam positions."""
     material: dict[str, Law] = Field(default={}, max_length=1000)
-    """Scattering laws by the names that the sample uses for its materials."""
+    """Scattering laws by the names of the sample's materials."""
     _base_dir: Path = PrivateAttr(default_factory=Path)
 
     @model_validator(mode="before")
     @classmethod
     def _names_the_scan(cls, tables: Any) -> Any:
-        return named_kind(tables)
+        return with_scan_kind(tables)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scene":
@@ -54,7 +54,7 @@ class Scene(Instrument):
         return self
 
     def _problems(self) -> list[str]:
-        """Return what does not fit together, each as "key: what is wrong: what to do"."""
+        """List inconsistencies, each as "key: error: remedy"."""
         problems = []
         users = dict.fromkeys(self.sample.material_names, "sample: its")
         for name, whose in {self.plate.material or COSINE: "plate.material: its", **users}.items():
@@ -69,48 +69,48 @@ class Scene(Instrument):
         problems += self.scan.view_problems(self.beam)
         if self.plate.is_mesh and self.scan.rotations_deg and self.scan.rotate == "detectors":
             problems.append(
-                "scan.rotate = 'detectors': the detectors of a plate of kind 'mesh' do not turn without it: turn the "
-                "sample the other way instead (scan.rotate = 'sample')"
+                "scan.rotate = 'detectors': the detectors of a plate of kind 'mesh' do not rotate without it: rotate "
+                "the sample the other way instead (scan.rotate = 'sample')"
             )
         if self.sample.place != "as-given" and self.scan.sample_distances_um:
             problems.append("scan.sample_distances_um: sets what sample.place sets: remove one of the keys")
         if (problem := self.scan.problem(self.beam)) is not None:
             problems.append(f"scan.pitch: {problem}")
-        elif not isinstance(self.scan, PositionList) and not self._overlaps_flat():
+        elif not isinstance(self.scan, PositionList) and not self._overlaps_substrate():
             problems.append(
                 f"scan.center_um: the raster about {list(self.scan.center_um)} um lies wholly beside the sample, whose "
-                f"flat ends {0.5 * self.flat_size:g} um from {list(self.sample.translate_um[:2])} um: move "
+                f"substrate ends {0.5 * self.substrate_size:g} um from {list(self.sample.translate_um[:2])} um: move "
                 "scan.center_um or enlarge sample.size_um"
             )
         return problems
 
     @property
     def instrument(self) -> Instrument:
-        """The scene without sample and scan, as a micrograph stack carries it."""
+        """Beam, plate, detectors and their uncertainty, as a micrograph stack carries them."""
         return Instrument(**{name: getattr(self, name) for name in Instrument.model_fields})
 
     @property
     def base_dir(self) -> Path:
-        """Folder at which the sample's relative file names start."""
+        """Folder of relative file names."""
         return self._base_dir
 
-    def at(self, base_dir: Path) -> Self:
+    def with_base_dir(self, base_dir: Path) -> Self:
         """Return a copy whose relative file names start at `base_dir`."""
         copy = self.model_copy()
         copy._base_dir = Path(base_dir)
         return copy
 
     @property
-    def flat_size(self) -> float:
-        """Side of the flat around the sample's structure; infinity where only a file tells or it is tilted [um]."""
+    def substrate_size(self) -> float:
+        """Side of the substrate around the sample [um]; infinity if a file defines it or the sample is tilted."""
         return math.inf if self.sample.is_tilted else self.sample.shape_size * self.sample.scale
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x [x] and y [y], um (of a list: see `PositionList.positions`)."""
+        """Compute the beam positions x [x] and y [y], um (of a list: see `PositionList.positions`)."""
         return self.scan.positions(self.beam, self.base_dir)
 
     def points(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions x, y of pixels [n], numbered row by row, um."""
+        """Compute the beam positions x, y of pixels [n], numbered row by row, um."""
         return self.scan.points(self.beam, ids, self.base_dir)
 
     @property
@@ -120,7 +120,7 @@ class Scene(Instrument):
         return y.size, x.size
 
     def views(self) -> tuple[View, ...]:
-        """Return the views of the scan: one, unless it is repeated at several distances or rotations."""
+        """Construct the views of the scan: one, unless it is repeated at several distances or rotations."""
         return views_of(self.scan, self.instrument)
 
     def build_body(self) -> Body:
@@ -128,7 +128,7 @@ class Scene(Instrument):
 
         Raises:
             InputFileError: the sample's file is missing or wrong.
-            SceneError: the sample is too high for the plate, or does not stand where its key `place` says.
+            SceneError: the sample touches the plate, or is not placed as its key `place` states.
         """
         body = self.sample.build(self.base_dir)
         if body.max_height >= self.sample_distance:
@@ -136,13 +136,13 @@ class Scene(Instrument):
         gap = self.sample_distance - body.max_height
         if self.sample.place != "as-given" and not math.isclose(gap, self.working_distance, rel_tol=1e-9):
             raise SceneError(
-                f"sample.place = {self.sample.place!r} wants its top {self.working_distance:g} um below the plate, "
+                f"sample.place = {self.sample.place!r} requires its top {self.working_distance:g} um below the plate, "
                 f"plate.sample_distance_um = {self.sample_distance:g} puts it {gap:g} um below: remove one of the keys"
             )
         return body
 
-    def settled(self) -> Self:
-        """Return the scene with the plate's sample distance that `sample.place` asks for, if it is not given.
+    def with_sample_distance(self) -> Self:
+        """Return the scene with the plate's sample distance computed from `sample.place`, if it is not given.
 
         Raises:
             InputFileError: the sample's file is missing or wrong.
@@ -159,23 +159,23 @@ class Scene(Instrument):
 
     @property
     def used_materials(self) -> dict[str, Law]:
-        """Scattering laws of the materials that sample and plate use, by name, but for the default one.
+        """Scattering laws of the materials that sample and plate use, by name, except the default one.
 
         Raises:
-            InputFileError: a file of the sample that brings laws along (.mtl) is missing or wrong.
+            InputFileError: a file of the sample that defines laws (.mtl) is missing or wrong.
         """
         return {name: law for name, (law, _) in self._used_laws().items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
-        """Return the scattering laws of the materials that sample and plate use, and read their files.
+        """Resolve the scattering laws of the materials that sample and plate use, and read their files.
 
         Raises:
-            InputFileError: the table of a law, or a file of the sample that brings laws along, is missing or wrong.
+            InputFileError: the table of a law, or a file of the sample that defines laws, is missing or wrong.
         """
         return {name: law.terms(folder) for name, (law, folder) in self._used_laws().items()}
 
     def _used_laws(self) -> dict[str, tuple[Law, Path]]:
-        """Return the laws in use and the folders at which their file names start, by the materials' names."""
+        """Return the laws in use and the folders of their relative file names, by the materials' names."""
         names = {*self.sample.material_names, self.plate.material}
         out = {name: (law, self.base_dir) for name, law in self.material.items() if name in names}
         for name, found in self.sample.file_laws(self.base_dir).items():
@@ -184,7 +184,7 @@ class Scene(Instrument):
         return out
 
     def read_rays(self) -> np.ndarray | None:
-        """Return position [um], unit direction and weight of the beam's rays [n, 7], where it is made of such.
+        """Read position [um], unit direction and weight of the beam's rays [n, 7]; None: no file of rays.
 
         Raises:
             InputFileError: the file of the rays is missing or wrong.
@@ -192,7 +192,7 @@ class Scene(Instrument):
         return None if self.beam.file is None else read_rays(self.base_dir / self.beam.file)
 
     def read_plate(self) -> Body | None:
-        """Return the plate's mesh, where it is one: see `scene.plates`.
+        """Read the plate's mesh (see `scene.plates`); None: a flat plate.
 
         Raises:
             InputFileError: the file is missing or wrong, or lacks a part that a detector names.
@@ -200,7 +200,7 @@ class Scene(Instrument):
         return read_plate(self.plate, self.detector, self.base_dir) if self.plate.is_mesh else None
 
     def warnings(self) -> list[str]:
-        """Return what is allowed but probably not meant, for `helio validate`."""
+        """List probable mistakes, for `helio validate`."""
         out = []
         pinhole, openings, w = self.pinhole_center[:2], self.openings(), self.working_distance
         for detector, opening in zip(self.detector, openings, strict=True):
@@ -215,63 +215,63 @@ class Scene(Instrument):
                 if _catches(first, _sights(second, w), w).any() or _catches(second, _sights(first, w), w).any():
                     names = self.detector_names
                     out.append(f"detectors {names[j]!r} and {names[i]!r} overlap: atoms there count for {names[j]!r}")
-        reach = max(float(np.abs(a).max()) for a in self._positions_on_flat())
-        if reach > 0.5 * self.flat_size:
+        reach = max(float(np.abs(a).max()) for a in self._positions_on_substrate())
+        if reach > 0.5 * self.substrate_size:
             out.append(
-                f"the raster reaches {reach:g} um from the middle of the flat, which ends at {0.5 * self.flat_size:g} "
-                "um: its rim misses it"
+                f"the raster reaches {reach:g} um from the centre of the substrate, which ends at "
+                f"{0.5 * self.substrate_size:g} um: its border misses the sample"
             )
         if isinstance(self.sample, RoughSample) and (step := self.sample.step * self.sample.scale) > (
-            coarsest := (self.scan.spacing or math.inf) / FINER
+            coarsest := (self.scan.spacing or math.inf) / MIN_POINTS_PER_PIXEL
         ):
             out.append(
-                f"the rough surface has a point every {step:g} um: to be finer than what a fit of its pixels can tell, "
-                f"set sample.resolution_um to at most {coarsest:g} um"
+                f"the rough surface has a point every {step:g} um, too coarse to test a fit on this raster: set "
+                f"sample.resolution_um to at most {coarsest:g} um"
             )
         if (plate := self.read_plate()) is not None and not check_solid(plate)["is_watertight"]:
             out.append(
-                f"{self.plate.file}: the plate is not closed: atoms that enter its solid are lost; a part that no "
-                "detector names belongs to it (a channel's end, say) unless plate.part names what is the plate"
+                f"{self.plate.file}: the plate is not closed: atoms that enter its solid are lost; parts that no "
+                "detector names belong to the plate (such as a channel's end) unless plate.part names the plate"
             )
         return out + self._plate_warnings(openings) + self.sample.warnings(self.base_dir)
 
     def _plate_warnings(self, openings: tuple[Aperture | Cone | None, ...]) -> list[str]:
-        """Return what is probably not meant about a scattering plate's outline."""
+        """List probable mistakes in a scattering plate's outline."""
         if self.plate.kind != "scattering":
             return []
         out = []
-        middle, half = (np.array(pair) for pair in self.plate.outline)
+        center, half = (np.array(pair) for pair in self.plate.outline)
         rims = {
             f"detector {d.name!r}: its aperture": a.rim(64)[0]
             for d, a in zip(self.detector, openings, strict=True)
             if isinstance(a, Aperture)
         }
         for what, points in {**rims, "the pinhole": self.pinhole_center[None, :2]}.items():
-            share = np.abs(points - middle) / half
-            reach = np.hypot(*share.T) if self.plate.radius_um is not None else share.max(1)
+            relative = np.abs(points - center) / half
+            reach = np.hypot(*relative.T) if self.plate.radius_um is not None else relative.max(1)
             if reach.max() > 1.0:
                 out.append(f"{what} reaches beyond the plate's outline: there is no plate around it")
-        if (end := (np.abs(middle) + half).max()) > 0.5 * self.flat_size:
+        if (end := (np.abs(center) + half).max()) > 0.5 * self.substrate_size:
             out.append(
-                f"the plate reaches {end:g} um, the flat ends at {0.5 * self.flat_size:g} um: "
-                "atoms that the plate sends down beside the flat are gone"
+                f"the plate reaches {end:g} um, the substrate ends at {0.5 * self.substrate_size:g} um: "
+                "atoms that the plate scatters beside the substrate are lost"
             )
         return out
 
-    def _positions_on_flat(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions from the middle of the flat [um]."""
+    def _positions_on_substrate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the beam positions relative to the centre of the substrate [um]."""
         is_list = isinstance(self.scan, PositionList)
         x, y = self.points(np.arange(self.image_shape[1])) if is_list else self.positions()
         return x - self.sample.translate_um[0], y - self.sample.translate_um[1]
 
-    def _overlaps_flat(self) -> bool:
-        """Whether any beam position can lie on the flat (whichever way that is turned)."""
-        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in self._positions_on_flat()))
-        return nearest <= 0.5 * math.sqrt(2.0) * self.flat_size
+    def _overlaps_substrate(self) -> bool:
+        """Whether any beam position can lie on the substrate, for any rotation of it."""
+        nearest = math.hypot(*(max(0.0, float(a.min()), -float(a.max())) for a in self._positions_on_substrate()))
+        return nearest <= 0.5 * math.sqrt(2.0) * self.substrate_size
 
 
 def aperture_contains(aperture: Aperture, points: np.ndarray) -> np.ndarray:
-    """Return which points (x, y) on the plate lie inside an aperture [n]."""
+    """Test which points (x, y) on the plate lie inside an aperture [n]."""
     c, s = math.cos(aperture.rotation), math.sin(aperture.rotation)
     d = points - np.asarray(aperture.center)
     u, v = c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]
@@ -279,7 +279,7 @@ def aperture_contains(aperture: Aperture, points: np.ndarray) -> np.ndarray:
 
 
 def _catches(opening: Aperture | Cone, sights: np.ndarray, distance: float) -> np.ndarray:
-    """Return which directions [n, 3] from the nominal spot, `distance` um below the plate, a detector catches [n]."""
+    """Test which directions [n, 3] from the nominal spot, `distance` um below the plate, a detector covers [n]."""
     if isinstance(opening, Cone):
         return sights @ np.asarray(opening.axis) >= math.cos(opening.half_angle)
     up = sights[:, 2] > 0.0
@@ -289,20 +289,20 @@ def _catches(opening: Aperture | Cone, sights: np.ndarray, distance: float) -> n
 
 
 def _sights(opening: Aperture | Cone, distance: float) -> np.ndarray:
-    """Return unit directions from the nominal spot to a detector's rim and middle [n, 3]."""
+    """Compute unit directions from the nominal spot to a detector's rim and centre [n, 3]."""
     if isinstance(opening, Aperture):
         plane = np.concatenate([opening.rim(256)[0], np.array([opening.center])])
         sights = np.column_stack([plane, np.full(len(plane), distance)])
         return sights / np.linalg.norm(sights, axis=1, keepdims=True)
     first, second, axis = axis_frame(np.asarray(opening.axis))
-    turn = 2.0 * np.pi * np.arange(256)[:, None] / 256
-    side = np.cos(turn) * first + np.sin(turn) * second
+    angle = 2.0 * np.pi * np.arange(256)[:, None] / 256
+    side = np.cos(angle) * first + np.sin(angle) * second
     return np.concatenate([math.cos(opening.half_angle) * axis + math.sin(opening.half_angle) * side, axis[None]])
 
 
 def _too_high(top: float, distance: float) -> str:
-    """Return the message for a sample that would touch the plate."""
+    """Format the message for a sample that would touch the plate."""
     return (
-        f"the sample's top at {top:g} um must stay below the plate, which is {distance:g} um above the reference "
-        "plane: enlarge plate.sample_distance_um or lower the sample"
+        f"the sample's top at {top:g} um must be below the plate, which is {distance:g} um above the substrate: "
+        "increase plate.sample_distance_um or lower the sample"
     )

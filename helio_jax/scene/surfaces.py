@@ -1,9 +1,8 @@
-"""Build the surfaces of samples as triangles and exact spheres, and closed-form first hits of the beam. Pure NumPy.
+"""Build the surfaces of samples as triangles and exact spheres; closed-form first hits of the beam. Pure NumPy.
 
-Flow: `scene.sample` calls the builders, the tracer intersects the `Body` they return. Sample frame: z up, z = 0 on
-the reference plane, micrometres. Faces run counter-clockwise seen from the vacuum, so normals point out of the
-solid (up on a flat). A sample is an open sheet: neighbouring faces share their vertices, so no ray leaks
-between them, and only the outer border of the flat is open.
+Sample frame: z up, z = 0 on the substrate, um. Faces are counter-clockwise seen from the vacuum, so normals point out
+of the solid. A sample is an open sheet: neighbouring faces share their vertices, so no ray leaks between them, and only
+the outer border of the substrate is open.
 """
 
 import numpy as np
@@ -14,12 +13,12 @@ from helio_jax.scene.body import Body
 
 WALL_SEGMENTS = 1440
 """Segments of a moat's outer wall: the polygon lies at most 2.4e-6 of its radius inside the circle."""
-_STEEP = 0.5
-"""Vertical part of the unit normal below which a point is a wall's, not the ground at its foot."""
+_MIN_NORMAL_Z = 0.5
+"""Lower limit of the normal's z when the height at the foot of a wall is extrapolated: a wall counts as 60 degrees."""
 _LEE_PIXELS = 2.0
-"""The lee of a rim is where the heights, averaged with this Gaussian width [pixels], fall down the beam ..."""
+"""Gaussian width [pixels] of the smoothed heights whose downhill direction defines the lee side of an edge."""
 _LEE_COSINE = 0.25
-"""... at an angle to its azimuth whose cosine is at least this: a wall along the beam hides nothing."""
+"""Lee side: the cosine of the angle between downhill direction and beam azimuth is at least this."""
 
 
 def flat_body(size: float, height: float = 0.0) -> Body:
@@ -31,13 +30,13 @@ def flat_body(size: float, height: float = 0.0) -> Body:
 def step_body(size: float, height: float, position: float, facing: float, slope: float) -> Body:
     """Build an upper terrace at z = `height` above a lower one at z = 0, joined by a straight facet.
 
-    Valid for |position| and position + height / tan(slope) inside the flat.
+    Valid for |position| and position + height / tan(slope) inside the substrate.
 
     Args:
-        size: side of the square flat, which turns with `facing` [um].
+        size: side of the square substrate, which rotates with `facing` [um].
         height: of the upper terrace [um].
         position: of the upper edge along the facing direction, from the z axis [um].
-        facing: azimuth towards which the lower side lies, counter-clockwise from +x [rad].
+        facing: azimuth of the lower side, counter-clockwise from +x [rad].
         slope: angle of the facet to the horizontal; pi/2 is vertical [rad].
     """
     s = 0.5 * size
@@ -45,38 +44,38 @@ def step_body(size: float, height: float, position: float, facing: float, slope:
     profile = [(-s, height), (position, height), (foot, 0.0), (s, 0.0)]
     vertices = np.array([[u, v, z] for u, z in profile for v in (-s, s)])
     faces = _quads([[2 * k, 2 * k + 2, 2 * k + 3, 2 * k + 1] for k in range(3)])
-    return Body(_turn(vertices, facing), faces)
+    return Body(_rotate(vertices, facing), faces)
 
 
 def trench_body(
     size: float, width: float, length: float, depth: float, azimuth: float, center: tuple[float, float]
 ) -> Body:
-    """Cut a slot with vertical walls and closed ends into a flat: 18 triangles that share all their edges.
+    """Cut a trench with vertical walls and closed ends into a substrate: 18 triangles that share all their edges.
 
     Args:
-        size: side of the square flat, which turns with `azimuth` [um].
-        width, length, depth: of the slot [um].
-        azimuth: direction of the slot's length, counter-clockwise from +x [rad].
-        center: of the slot on the flat, sample frame [um].
+        size: side of the square substrate, which rotates with `azimuth` [um].
+        width, length, depth: of the trench [um].
+        azimuth: direction of the trench's length, counter-clockwise from +x [rad].
+        center: of the trench, sample frame [um].
     """
     top = _rectangle(length, width, 0.0) + _local(center, azimuth)
     vertices = np.concatenate([_rectangle(size, size, 0.0), top, top - [0.0, 0.0, depth]])
     ring = [[k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)]
     walls = [[8 + k, 4 + k, 4 + (k + 1) % 4, 8 + (k + 1) % 4] for k in range(4)]
-    return Body(_turn(vertices, azimuth), _quads([*ring, *walls, [8, 9, 10, 11]]))
+    return Body(_rotate(vertices, azimuth), _quads([*ring, *walls, [8, 9, 10, 11]]))
 
 
 def pyramid_body(
     size: float, base: float, height: float, top: float, azimuth: float, center: tuple[float, float]
 ) -> Body:
-    """Raise a square (truncated) pyramid out of a flat; no face lies under it.
+    """Build a square (truncated) pyramid on a substrate; no face lies under it.
 
     Args:
-        size: side of the square flat, which turns with `azimuth` [um].
+        size: side of the square substrate, which rotates with `azimuth` [um].
         base, top: sides of the base and of the top square; 0 <= top < base [um].
-        height: of the top above the flat [um].
-        azimuth: in which one of the four faces looks, counter-clockwise from +x [rad].
-        center: of the base on the flat, sample frame [um].
+        height: of the top above the substrate [um].
+        azimuth: of one of the four faces, counter-clockwise from +x [rad].
+        center: of the base, sample frame [um].
     """
     shift = _local(center, azimuth)
     parts = [_rectangle(size, size, 0.0), _rectangle(base, base, 0.0) + shift]
@@ -87,18 +86,17 @@ def pyramid_body(
     else:
         parts.append(np.array([[0.0, 0.0, height]]) + shift)
         sides = np.array([[4 + k, 4 + (k + 1) % 4, 8] for k in range(4)])
-    return Body(_turn(np.concatenate(parts), azimuth), np.concatenate([ring, sides]))
+    return Body(_rotate(np.concatenate(parts), azimuth), np.concatenate([ring, sides]))
 
 
 def moated_body(size: float, moats: np.ndarray, spheres: np.ndarray) -> Body:
-    """Build spheres on a flat into which round pits are cut: the gap between sphere and pit wall is the moat.
+    """Build spheres on a substrate with round pits; the gap between a sphere and its pit wall is the moat.
 
-    The pit has a vertical wall of `WALL_SEGMENTS` segments (vertices on the circle, so the wall stands at most
-    radius * 2.4e-6 inside of it: 0.003 um for 1 mm) and a flat floor; the sphere stands in it.
+    A pit has a vertical wall of `WALL_SEGMENTS` segments and a level floor; the sphere stands in it.
 
     Args:
-        size: side of the square flat [um].
-        moats: x, y, outer radius and depth of each pit [m, 4]; pits are disjoint and inside the flat, um.
+        size: side of the square substrate [um].
+        moats: x, y, outer radius and depth of each pit [m, 4]; pits are disjoint and inside the substrate, um.
         spheres: x, y, z and radius [s, 4], um.
     """
     flat = flat_body(size)
@@ -108,8 +106,8 @@ def moated_body(size: float, moats: np.ndarray, spheres: np.ndarray) -> Body:
 
     n, s = WALL_SEGMENTS, 2 * np.pi * np.arange(WALL_SEGMENTS) / WALL_SEGMENTS
     circles = moats[:, None, :2] + moats[:, None, 2:3] * np.stack([np.cos(s), np.sin(s)], -1)
-    # Each pit's centre is a vertex too: it makes the rim's edges strictly Delaunay, so the triangulation
-    # contains them all and the pit is exactly the fan of triangles about its centre.
+    # With each pit's centre as a vertex the rim's edges are strictly Delaunay: the triangulation contains all of them,
+    # and the pit is the fan of triangles about its centre.
     plane = np.concatenate([flat.vertices[:, :2], circles.reshape(-1, 2), moats[:, :2]])
     faces = Delaunay(plane).simplices.astype(np.int64)
     first_center = 4 + n * len(moats)
@@ -136,62 +134,64 @@ def surface_body(
     x: np.ndarray,
     y: np.ndarray,
     z: np.ndarray,
-    skirt_to_um: float | None = None,
+    reach: float | None = None,
     *,
     level: float | None = None,
     beam_shift: tuple[float, float] = (0.0, 0.0),
 ) -> Body:
-    """Triangulate points on a grid, with a flat skirt around them, for height maps and reconstructions.
+    """Triangulate points on a grid, with a substrate around them, for height maps and reconstructions.
 
     Each cell is split along the diagonal with the smaller height difference. Points of a beam-frame grid may run
-    backwards in x or y (curtains along the beam at depth jumps): orientation follows the grid, so normals stay
-    on the vacuum's side. The border is joined to the skirt by a curtain along the beam, which the beam does
-    not see; the inner edge of the skirt is then the raster itself. Pass the scan's `beam_shift` for that;
-    without it the curtain is vertical.
+    backwards in x or y (sheets along the beam at depth jumps): orientation follows the grid, so normals stay on the
+    vacuum's side. A sheet along the beam, shadowed by the surface, joins the border to the substrate, whose inner edge
+    is then the raster. Without `beam_shift` this sheet is vertical.
 
     Args:
-        x, y, z: sample-frame positions [y, x], um; finite; x grows with the column and y with the row.
-        skirt_to_um: half the side of the square skirt about the z axis, or None for no skirt [um].
-        level: height of the skirt; default: the median height of the border [um].
+        x, y, z: sample-frame positions [y, x], um; finite; x increases with the column and y with the row.
+        reach: half the side of the square substrate about the z axis; None: no substrate [um].
+        level: height of the substrate; default: the median height of the border [um].
         beam_shift: `Instrument.beam_shift` of a beam-frame grid.
 
     Returns:
-        A sheet whose only open edges are the skirt's outer border (without skirt: the grid's border).
+        A sheet whose only open edges are the outer border of the substrate, or of the grid.
 
     Raises:
-        SceneError: fewer than 2 x 2 points, or the skirt ends inside the grid.
+        SceneError: fewer than 2 x 2 points, or the substrate ends inside the grid.
     """
     if z.ndim != 2 or min(z.shape) < 2:
         raise SceneError(f"a surface needs at least 2 x 2 points, got {z.shape}: enlarge the raster")
     points = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float64)
     index = np.arange(z.size).reshape(z.shape)
     a, b, c, d = (v.ravel() for v in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
-    flat_z = points[:, 2]
-    along_ac = (np.abs(flat_z[a] - flat_z[c]) <= np.abs(flat_z[b] - flat_z[d]))[:, None]
+    heights = points[:, 2]
+    along_ac = (np.abs(heights[a] - heights[c]) <= np.abs(heights[b] - heights[d]))[:, None]
     first = np.where(along_ac, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     second = np.where(along_ac, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     faces = np.concatenate([first, second])
-    if skirt_to_um is None:
+    if reach is None:
         return Body(points, faces)
-    extra, extra_faces = _skirt(points, index, skirt_to_um, level, beam_shift)
+    extra, extra_faces = _surround(points, index, reach, level, beam_shift)
     return Body(np.concatenate([points, extra]), np.concatenate([faces, extra_faces]))
 
 
-def behind_rims(
+def occluded_vertices(
     x: np.ndarray, y: np.ndarray, z: np.ndarray, normals: np.ndarray, beam_shift: tuple[float, float], share: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points of a beam-frame grid with those in the lee of a rim moved towards its foot, for `hollowed`.
+    """Estimate the shadowed surface on the lee side of occlusion edges of a beam-frame grid, for `with_cavities`.
 
-    What the beam does not see lies behind a rim, anywhere between the sheet along the beam, which is as far out as it
-    can lie, and under the rim: the point at the sheet's foot moves back by a share of the way to below the rim, in its
-    tangent plane; that of a wall is taken for one of 60 degrees. A sheet along the beam faces the plate and would send
-    it atoms that a real hollow keeps. Measured on spheres A and B and in a slot: tests/physics/test_hidden_side.py.
+    The shadowed surface lies between the sheet along the beam, its outer limit, and the vertical below the edge. The
+    point at the sheet's foot is moved back by a fraction of the way to the vertical, in its tangent plane (a wall
+    counts as 60 degrees). The sheet itself faces the plate and would scatter atoms there that a real cavity keeps.
+    Measured on spheres A and B and in a trench: tests/physics/test_hidden_side.py.
 
     Args:
         x, y, z: sample-frame positions [y, x], um, as for `surface_body`.
         normals: unit normals there [y, x, 3].
         beam_shift: `Instrument.beam_shift` of the grid.
-        share: of the way back, 0 (the sheet along the beam) to 1 (a wall straight below the rim).
+        share: fraction of the way, 0 (the sheet along the beam) to 1 (a vertical wall below the edge).
+
+    Returns:
+        x, y, z with the moved points [y, x], um.
     """
     from scipy.ndimage import gaussian_filter, maximum_filter
 
@@ -206,17 +206,17 @@ def behind_rims(
     fall = maximum_filter(z, size=3) - z
     drop = np.where((fall > WALL_PITCHES * max(pitch_x, pitch_y)) & is_lee, fall, 0.0)
     back_x, back_y = (share * drop * shift for shift in beam_shift)
-    rise = (normals[..., 0] * back_x + normals[..., 1] * back_y) / np.maximum(normals[..., 2], _STEEP)
+    rise = (normals[..., 0] * back_x + normals[..., 1] * back_y) / np.maximum(normals[..., 2], _MIN_NORMAL_Z)
     return x - back_x, y - back_y, z + rise
 
 
-def hollowed(body: Body, grid: tuple[np.ndarray, ...], behind: tuple[np.ndarray, ...]) -> Body:
-    """Return a `surface_body` whose faces across a rim end at other points, joined to their feet by a strip of faces.
+def with_cavities(body: Body, grid: tuple[np.ndarray, ...], behind: tuple[np.ndarray, ...]) -> Body:
+    """Move the lower ends of a `surface_body`'s faces across occlusion edges; a strip of faces closes the gap.
 
     Args:
         body: its first vertices are the grid's.
         grid: x, y, z of the grid's points [y, x], um.
-        behind: where the faces that fall from a rim end, from `behind_rims`.
+        behind: new lower ends, from `occluded_vertices`.
     """
     from scipy.ndimage import maximum_filter
 
@@ -230,7 +230,7 @@ def hollowed(body: Body, grid: tuple[np.ndarray, ...], behind: tuple[np.ndarray,
     top = body.vertices[body.faces, 2].max(1)
     is_across = np.any(top[:, None] > rim[body.faces], axis=1)
     seen, across = body.faces[~is_across], body.faces[is_across]
-    # the edges that a face across a rim shares with another one, in the direction of the other's
+    # edges shared by a face across an occlusion edge and another face, in the other's direction
     edge, other = (f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2) for f in (across[:, ::-1], seen))
     shared = other[np.isin(other @ [n, 1], edge @ [n, 1])]
     u, v = shared.T
@@ -242,10 +242,10 @@ def hollowed(body: Body, grid: tuple[np.ndarray, ...], behind: tuple[np.ndarray,
 def first_hit_spheres(
     x: np.ndarray, y: np.ndarray, spheres: np.ndarray, beam_shift: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find where the beam axis first meets spheres on an infinite flat z = 0, exactly.
+    """Compute the first hit of the beam axis on spheres on an infinite substrate z = 0, in closed form.
 
-    A point of height h seen at beam position (X, Y) is (X - h tx, Y - h ty, h): inserted into the sphere's
-    equation this is a quadratic in h, whose larger root is met first by a beam from above.
+    The point of height h at beam position (X, Y) is (X - h tx, Y - h ty, h). The sphere's equation is then quadratic in
+    h, and a beam from above hits the larger root first.
 
     Args:
         x, y: beam positions of any common (broadcast) shape [um].
@@ -253,7 +253,7 @@ def first_hit_spheres(
         beam_shift: (tx, ty) = tan t (cos phi, sin phi), `Instrument.beam_shift`.
 
     Returns:
-        Height above the flat [...], um, and unit normals [..., 3].
+        Height above the substrate [...], um, and unit normals [..., 3].
 
     Source: own derivation, tests/unit/test_sample.py.
     """
@@ -276,10 +276,10 @@ def first_hit_spheres(
     return height, normals
 
 
-def _skirt(
+def _surround(
     points: np.ndarray, index: np.ndarray, reach: float, level: float | None, beam_shift: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return further vertices and faces: the curtain below the grid's border and the flat around it."""
+    """Build further vertices and faces: the sheet below the grid's border and the substrate around it."""
     sides = [index[0, :], index[:, -1], index[-1, ::-1], index[::-1, 0]]
     loop = np.concatenate([side[:-1] for side in sides])
     z_level = float(np.median(points[loop, 2])) if level is None else level
@@ -287,8 +287,8 @@ def _skirt(
     inner = _lift(points[loop, :2] + rise[:, None] * np.asarray(beam_shift), z_level)
     if np.abs(inner[:, :2]).max() >= reach:
         raise SceneError(
-            f"the flat around the surface must reach beyond it: half its side is {reach:g} um, the surface extends to "
-            f"{np.abs(inner[:, :2]).max():g} um: enlarge size_um"
+            f"the substrate around the surface must reach beyond it: half its side is {reach:g} um, the surface "
+            f"extends to {np.abs(inner[:, :2]).max():g} um: enlarge size_um"
         )
     at_level = np.abs(rise) <= 1e-6
     ring = np.where(at_level, loop, len(points) + np.arange(len(loop)))
@@ -311,27 +311,27 @@ def _skirt(
 
 
 def _strip(inner: np.ndarray, outer: np.ndarray, is_closed: bool = True) -> np.ndarray:
-    """Return the faces between two counter-clockwise polylines of equal length."""
+    """Triangulate between two counter-clockwise polylines of equal length."""
     i1, o1 = np.roll(inner, -1), np.roll(outer, -1)
     faces = np.stack([np.stack([i1, inner, outer], 1), np.stack([i1, outer, o1], 1)], 1)
     return _with_area((faces if is_closed else faces[:-1]).reshape(-1, 3))
 
 
 def _with_area(faces: np.ndarray) -> np.ndarray:
-    """Return the faces [m, 3] whose three vertices differ."""
+    """Select the faces [m, 3] whose three vertices differ."""
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return faces[has_area]
 
 
 def _check_cut(size: float, moats: np.ndarray, area: float) -> None:
-    """Check that the flat minus the pits has the area it must have."""
+    """Check that the area of the substrate minus the pits is right."""
     pits = 0.5 * WALL_SEGMENTS * np.sin(2 * np.pi / WALL_SEGMENTS) * np.sum(moats[:, 2] ** 2)
     if abs(area - (size**2 - pits)) > 1e-9 * size**2:
-        raise SceneError("the moats could not be cut out of the flat: they must be disjoint and lie inside it")
+        raise SceneError("the moats could not be cut out of the substrate: they must be disjoint and lie inside it")
 
 
 def _rectangle(length: float, width: float, z: float) -> np.ndarray:
-    """Return the corners of a rectangle about the z axis, counter-clockwise from (-, -) [4, 3]."""
+    """Construct the corners of a rectangle about the z axis, counter-clockwise from (-, -) [4, 3]."""
     a, b = 0.5 * length, 0.5 * width
     return np.array([[-a, -b, z], [a, -b, z], [a, b, z], [-a, b, z]])
 
@@ -347,7 +347,7 @@ def _lift(points: np.ndarray, z: float) -> np.ndarray:
     return np.column_stack([points, np.full(len(points), z)])
 
 
-def _turn(vertices: np.ndarray, azimuth: float) -> np.ndarray:
+def _rotate(vertices: np.ndarray, azimuth: float) -> np.ndarray:
     """Rotate vertices about the z axis, counter-clockwise seen from above; quarter turns are exact."""
     c, s = np.cos(azimuth), np.sin(azimuth)
     if abs(np.sin(2 * azimuth)) < 1e-12:
@@ -356,5 +356,5 @@ def _turn(vertices: np.ndarray, azimuth: float) -> np.ndarray:
 
 
 def _local(center: tuple[float, float], azimuth: float) -> np.ndarray:
-    """Return a position of the sample frame in the frame that `_turn` will turn [3]."""
-    return _turn(np.array([[center[0], center[1], 0.0]]), -azimuth)[0]
+    """Transform a position of the sample frame to the frame before `_rotate` [3]."""
+    return _rotate(np.array([[center[0], center[1], 0.0]]), -azimuth)[0]

@@ -1,8 +1,8 @@
-"""Views of a scan: the same beam positions at another distance, or with sample or detectors turned.
+"""Views of a scan: the same beam positions at another distance, or with rotated sample or detectors.
 
-Each view becomes one `MicrographStack`; several make a `MicrographSet`. Rotations are counter-clockwise seen from above
-(about the beam: seen from the source), so turning the sample by +a at normal incidence shows what turning the apertures
-by -a does, apart from where the sample then lies (DESIGN.md section 1).
+Each view gives one `MicrographStack`, several views a `MicrographSet`. Rotations are counter-clockwise seen from above
+(about the beam: seen from the source). Rotating the sample by +a at normal incidence equals rotating the apertures by
+-a, except for the orientation of the sample in the image (docs/conventions.md).
 """
 
 import math
@@ -21,40 +21,40 @@ class View:
     """One view of a scan.
 
     Attributes:
-        label: what tells it from the others; "" for the only one.
+        label: distance and rotation in words; "" for the only view.
         instrument: with the distance and the apertures of this view.
-        turn: rotation matrix of the sample [3, 3], or None.
-        axis: where the axis of that rotation meets the plane z = 0 [um].
-        sample_rotation: of the sample about the plate normal [rad]; about an oblique beam: about that.
-        about: the same for people, JSON-compatible.
+        rotation: rotation matrix of the sample [3, 3], or None.
+        axis: point (x, y) in the plane z = 0 on the axis of that rotation [um].
+        sample_rotation: angle of that rotation, about the plate normal or the beam [rad].
+        description: distance and rotation as in the scene file, JSON-compatible.
     """
 
     label: str
     instrument: Instrument
-    turn: np.ndarray | None
+    rotation: np.ndarray | None
     axis: tuple[float, float]
     sample_rotation: float
-    about: dict[str, float | str]
+    description: dict[str, float | str]
 
-    def turned(self, body: Body) -> Body:
-        """Return the sample as it stands in this view.
+    def rotated_body(self, body: Body) -> Body:
+        """Return the sample as it is placed in this view.
 
         Raises:
             SceneError: it touches the plate.
         """
-        if self.turn is not None:
+        if self.rotation is not None:
             there = (*self.axis, 0.0)
-            body = body.moved((-there[0], -there[1], 0.0)).transformed(self.turn, 1.0, there)
+            body = body.moved((-there[0], -there[1], 0.0)).transformed(self.rotation, 1.0, there)
         if body.max_height >= self.instrument.sample_distance:
             raise SceneError(
                 f"scan: in the view {self.label!r} the sample's top at {body.max_height:g} um touches the plate, which "
-                f"is {self.instrument.sample_distance:g} um above the reference plane: leave out this view"
+                f"is {self.instrument.sample_distance:g} um above the substrate: remove this view"
             )
         return body
 
 
 def views_of(scan: Scan, instrument: Instrument) -> tuple[View, ...]:
-    """Return all views of a scan, distances running fastest."""
+    """Construct all views of a scan, distances varying fastest."""
     distances = scan.sample_distances_um
     if isinstance(scan, Line) and scan.along == "beam":
         distances = tuple((instrument.sample_distance + scan.steps).tolist())
@@ -62,27 +62,28 @@ def views_of(scan: Scan, instrument: Instrument) -> tuple[View, ...]:
 
 
 def _view(scan: Scan, instrument: Instrument, angle_deg: float | None, distance: float | None) -> View:
-    """Return one view; None: as the instrument and the sample are."""
-    about: dict[str, float | str] = {}
-    words, turn, rotation = [], None, 0.0
+    """Construct one view; None: unchanged."""
+    description: dict[str, float | str] = {}
+    words, matrix, angle = [], None, 0.0
     if angle_deg is not None:
         words.append(f"{scan.rotate} at {angle_deg:g} deg")
-        about |= {"rotation_deg": angle_deg, "rotated": scan.rotate, "axis": scan.about}
+        description |= {"rotation_deg": angle_deg, "rotated": scan.rotate, "axis": scan.about}
     if angle_deg is not None and scan.rotate == "detectors":
-        turned = tuple(_turned(d, angle_deg) for d in instrument.detector)
-        instrument = instrument.model_copy(update={"detector": turned})
+        rotated = tuple(_rotate_detector(d, angle_deg) for d in instrument.detector)
+        instrument = instrument.model_copy(update={"detector": rotated})
     elif angle_deg is not None:
-        rotation = math.radians(angle_deg)
-        turn = _about(-instrument.beam_direction if scan.about == "beam" else np.array([0.0, 0.0, 1.0]), rotation)
+        angle = math.radians(angle_deg)
+        axis = -instrument.beam_direction if scan.about == "beam" else np.array([0.0, 0.0, 1.0])
+        matrix = _rotation_about(axis, angle)
     if distance is not None:
         words.append(f"{distance:g} um")
-        about["sample_distance_um"] = distance
+        description["sample_distance_um"] = distance
         instrument = instrument.at_distance(distance)
-    return View(", ".join(words), instrument, turn, scan.axis_um, rotation, about)
+    return View(", ".join(words), instrument, matrix, scan.axis_um, angle, description)
 
 
-def _turned(detector: Detector, angle_deg: float) -> Detector:
-    """Return a detector whose aperture is turned about the point of the plate above the nominal spot."""
+def _rotate_detector(detector: Detector, angle_deg: float) -> Detector:
+    """Rotate a detector's aperture about the point of the plate above the nominal spot."""
     if detector.center_um is None:
         return detector.model_copy(update={"azimuth_deg": _wrapped((detector.azimuth_deg or 0.0) + angle_deg)})
     (x, y), a = detector.center_um, math.radians(angle_deg)
@@ -92,12 +93,12 @@ def _turned(detector: Detector, angle_deg: float) -> Detector:
 
 
 def _wrapped(angle_deg: float) -> float:
-    """Return the same direction within -180 to 180 deg."""
+    """Return the equivalent angle within -180 to 180 deg."""
     return math.remainder(angle_deg, 360.0)
 
 
-def _about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the matrix of a right-handed rotation about a unit axis [3, 3] (Rodrigues' formula)."""
+def _rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Compute the matrix of a right-handed rotation about a unit axis [3, 3] (Rodrigues' formula)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross

@@ -108,7 +108,7 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
             "trace fewer rays"
         )
     analog = settings.model_copy(update={"estimator": "analog"})
-    body = views[view].turned(scene.build_body())
+    body = views[view].rotated_body(scene.build_body())
     experiment = make_experiment(body, views[view].instrument, analog, scene.read_laws(), scene.read_rays())
     return follow_atoms(experiment, inner + view * nx * ny, *scene.points(inner))
 

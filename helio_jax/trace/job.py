@@ -79,7 +79,7 @@ class Job:
                 **{name: _version(name) for name in _LIBRARIES},
             },
         }
-        return cls(scene.at(scene.base_dir.resolve()), settings, about)
+        return cls(scene.with_base_dir(scene.base_dir.resolve()), settings, about)
 
     @functools.cached_property
     def key(self) -> str:

@@ -289,7 +289,7 @@ class Canvas:
                 "n_negative": n_negative,
                 **missed,
                 "materials": {name: law.kind for name, law in scene.used_materials.items()},
-                **({"view": view.about} if view.about else {}),
+                **({"view": view.description} if view.description else {}),
             },
         )
 

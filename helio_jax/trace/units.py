@@ -90,7 +90,7 @@ def experiment_of(job: Job, body: Body, number: int = 0) -> Experiment:
     """Prepare what all units of one of a job's views share in one process."""
     view, scene = job.views[number], job.scene
     read = scene.read_laws(), scene.read_rays(), scene.read_plate()
-    return make_experiment(view.turned(body), view.instrument, job.settings, *read)
+    return make_experiment(view.rotated_body(body), view.instrument, job.settings, *read)
 
 
 def tasks(experiment: Experiment, job: Job, unit: Unit) -> list[Callable[[], Any]]:

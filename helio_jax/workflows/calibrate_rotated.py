@@ -24,7 +24,7 @@ from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.nearfield import limited
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
-from helio_jax.scene.runout import ground_level
+from helio_jax.scene.border import substrate_level
 from helio_jax.workflows.corrections import make_predictor
 
 _ROUNDS, _SETTLED = 8, (0.01, 0.5)
@@ -103,7 +103,7 @@ def _relief_of(stack: MicrographStack) -> Relief:
     rec = reconstruct_stack(stack, settings)
     height = limited(rec.height[nearest_known(rec.is_valid)], stack)
     normals = np.where(rec.is_valid[..., None], rec.normals, np.array([0.0, 0.0, 1.0]))
-    ground = ground_level(height)
+    ground = substrate_level(height)
     above = stack.replace(instrument=stack.instrument.at_distance(stack.instrument.sample_distance - ground))
     predict = make_predictor(above, settings.refine.paths(height.size))
     multiple = predict(np.maximum(height - ground, 0.0), normals).multiple

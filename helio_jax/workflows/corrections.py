@@ -23,8 +23,8 @@ from helio_jax.forward.radiosity import Radiosity
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.residuals import Prediction
 from helio_jax.micrograph import MicrographStack
-from helio_jax.scene.runout import ground_level, run_out
-from helio_jax.scene.surfaces import behind_rims, hollowed, surface_body
+from helio_jax.scene.border import extend_border, substrate_level
+from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
@@ -61,8 +61,8 @@ def make_predictor(
     neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
 
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
-    with a `flat` border by the flat z = 0, with a `free` one by what leads from the border to level ground (`run_out`;
-    in radiosity by the flat in either case).
+    with a `flat` border by the flat z = 0, with a `free` one by `extend_border`
+    (in radiosity by the flat in either case).
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
     what is traced, by the cosine law.
 
@@ -79,7 +79,7 @@ def make_predictor(
 
     @lru_cache(maxsize=1)
     def about_instrument(given: str) -> tuple[SpotGeometry, _Raster, Radiosity | None]:
-        instrument = Instrument.model_validate_json(given).with_cosine_plate()
+        instrument = Instrument.model_validate_json(given).idealised()
         reach = half + _surroundings(instrument) if substrate_um is None else max(0.5 * substrate_um, 1.001 * half)
         raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat")
         geometry = SpotGeometry(instrument)
@@ -186,19 +186,19 @@ class _Raster:
         """Return the surface with its unseen side at a share of the way back."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        behind = behind_rims(*at, normals, shift, share)
+        behind = occluded_vertices(*at, normals, shift, share)
         if self.is_flat_around:
             body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
-            body = hollowed(body, at, behind)
+            body = with_cavities(body, at, behind)
         else:
-            ground = ground_level(height)
-            around, behind = (run_out(*points, ground, self.reach) for points in (at, behind))
-            body = hollowed(surface_body(*around), around, behind)
+            ground = substrate_level(height)
+            around, behind = (extend_border(*points, ground, self.reach) for points in (at, behind))
+            body = with_cavities(surface_body(*around), around, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
         return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
         """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        is_seen = np.array_equal(behind_rims(*at, normals, self.instrument.beam_shift, 1.0), at)
+        is_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
         return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]

@@ -18,7 +18,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.files import read_bytes
-from helio_jax.scene.scan import named_kind
+from helio_jax.scene.scan import with_scan_kind
 from helio_jax.scene.scene import Scene
 from helio_jax.scores.settings import TruthSettings
 from helio_jax.trace.settings import TraceSettings
@@ -61,12 +61,12 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
             table, value, limit and remedy.
     """
     path = Path(path)
-    data = {"name": path.stem[:200], **named_kind(_merge(_read_extended(path), _nest(overrides or {})))}
+    data = {"name": path.stem[:200], **with_scan_kind(_merge(_read_extended(path), _nest(overrides or {})))}
     try:
         scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
         raise SceneError(explain_errors(str(path), e, SceneFile, data)) from None
-    return scene.at(path.parent).settled()
+    return scene.with_base_dir(path.parent).with_sample_distance()
 
 
 def files_read(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helio_jax.micrograph import MicrographStack
-from helio_jax.scene.runout import run_out
+from helio_jax.scene.border import extend_border
 from helio_jax.scene.surfaces import surface_body
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
@@ -69,7 +69,7 @@ def test_a_grid_runs_out_to_the_ground_and_a_terrace_goes_on():
     height = np.clip(245.0 - 0.5 * x, 50.0, 200.0)  # a terrace to x = 90 um, then a flank
     height[15:25, 20:] = 0.0
     height[20, 20:] = 5.0
-    around_x, around_y, around_z = run_out(x, y, height, 0.0, 5000.0)
+    around_x, around_y, around_z = extend_border(x, y, height, 0.0, 5000.0)
     assert around_x.shape == around_y.shape == around_z.shape == (44, 44)
     flank, ground, bump, terrace = 40, 20, 22, 5  # rows, and a column, of the wider grid
     assert np.allclose(around_x[flank, -2:], [390.0 + 100.0, 5000.0]) and np.allclose(around_z[flank, -2:], 0.0)

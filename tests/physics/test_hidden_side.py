@@ -8,7 +8,7 @@ import pytest
 from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.sample import check_body
-from helio_jax.scene.surfaces import behind_rims, first_hit_spheres, hollowed, surface_body
+from helio_jax.scene.surfaces import first_hit_spheres, occluded_vertices, surface_body, with_cavities
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.scene_file import load_scene
@@ -32,10 +32,12 @@ def test_foot_of_a_rim_moves_back(is_along_y):
     normals = np.broadcast_to(np.array([-tilt, 0.0, 1.0]) / np.hypot(tilt, 1.0), (*z.shape, 3))
     at = grid_x - z * TAN30, grid_y, z
     if is_along_y:
-        turned = behind_rims(at[1].T, at[0].T, z.T, normals[..., [1, 0, 2]].transpose(1, 0, 2), (0.0, TAN30), share)
+        turned = occluded_vertices(
+            at[1].T, at[0].T, z.T, normals[..., [1, 0, 2]].transpose(1, 0, 2), (0.0, TAN30), share
+        )
         moved = turned[1].T, turned[0].T, turned[2].T
     else:
-        moved = behind_rims(*at, normals, (TAN30, 0.0), share)
+        moved = occluded_vertices(*at, normals, (TAN30, 0.0), share)
     back = at[0] - moved[0]
     np.testing.assert_allclose(back[4:9, 11], share * (100.0 - z[4:9, 11]) * TAN30)
     np.testing.assert_allclose(moved[1], at[1])
@@ -81,7 +83,7 @@ def test_hollowed_surface_is_closed(share):
     normals = np.where(wall[..., None], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     at = grid_x - z * TAN30, grid_y, z
     plain = surface_body(*at, 500.0, level=0.0, beam_shift=(TAN30, 0.0))
-    body = hollowed(plain, at, behind_rims(*at, normals, (TAN30, 0.0), share))
+    body = with_cavities(plain, at, occluded_vertices(*at, normals, (TAN30, 0.0), share))
     assert len(body.vertices) > len(plain.vertices)
     report = check_body(body)
     assert report["is_winding_consistent"] and report["n_inner_open_edges"] == 0

@@ -86,10 +86,10 @@ def predictions(name: str, **changes):
         "helio_jax.workflows.corrections.UNSEEN_SHARES", (0.0, 0.0)
     ):  # the sheet along the beam, as radiosity has it
         traced, ours = (
-            make_predictor(stack, 2_000_000, scene.flat_size, multiple=model)(height, normals).multiple
+            make_predictor(stack, 2_000_000, scene.substrate_size, multiple=model)(height, normals).multiple
             for model in ("traced", "radiosity")
         )
-    return stack, height, normals, scene.flat_size, traced, ours
+    return stack, height, normals, scene.substrate_size, traced, ours
 
 
 def test_sphere_against_tracer():

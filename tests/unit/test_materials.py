@@ -68,7 +68,7 @@ def told(folder, text: str) -> str:
         ('[material.x]\nkind = "specular"\nalbedo = 0', "material.x.albedo = 0: must be > 0"),
         (DIFFRACTION + "lattice_nm = [[1, 0], [2, 0]]", "lattice_nm must be two vectors in different directions"),
         (DIFFRACTION + "lattice_nm = [[1, 0], [2, 0, 0]]", "must be two vectors, both of 2 or both of 3 numbers"),
-        (DIFFRACTION + "lattice_nm = [[1, 0], [0, 1]]\npeaks = [[0, 0, 0.0]]", "must have one intensity > 0"),
+        (DIFFRACTION + "lattice_nm = [[1, 0], [0, 1]]\npeaks = [[0, 0, 0.0]]", "must have at least one intensity > 0"),
         (
             DIFFRACTION + "lattice_nm = [[1, 0], [0, 1]]\nmax_order = [6, 60]",
             "max_order must be two numbers from 0 to 50",
@@ -204,7 +204,7 @@ def test_laws_of_an_mtl_file(tmp_path):
         ("newmtl gold\nhelio_albedo 0.5\n", "line 2: the material 'gold' has no helio_law: add one"),
         ("newmtl gold\nHelio_law specular\n", "line 2: Helio_law: keys are written helio_law and helio_KEY"),
         ("helio_law specular\n", "line 1: helio_law: stands before any newmtl NAME"),
-        ("newmtl cosine\nhelio_law specular\n", "line 2: helio_law: 'cosine' stands for the cosine law itself"),
+        ("newmtl cosine\nhelio_law specular\n", "line 2: helio_law: 'cosine' is reserved for the cosine law"),
         ("newmtl gold\nhelio_law specular\nhelio_law cosine\n", "line 3: helio_law: 'gold' has it already in line 2"),
     ],
 )
@@ -275,7 +275,7 @@ def test_upright_lattice_is_refused(tmp_path, bshem):
         ("1 2\n3 4\n", "needs 3 or 4 columns"),
         ("0 0 1\n0 180 1\n90 0 1\n", "do not fill a grid of 1 x 2 x 2"),
         ("0 0 1\n0 180 1\n95 0 1\n95 180 1\n", "must lie within 0 to 90 deg"),
-        ("0 0 1\n0 90 1\n90 0 1\n90 90 1\n", "phi must start at 0 and run to 180 deg"),
+        ("0 0 1\n0 90 1\n90 0 1\n90 90 1\n", "phi must run from 0 to 180 deg"),
         ("0 0 1\n0 180 1\n90 0 -1\n90 180 1\n", "intensities must be >= 0"),
         ("0 0 x\n", "is not a grid of numbers"),
     ],

@@ -151,7 +151,7 @@ def test_axis_of_rotation(tmp_path):
     scan = ONE + "rotations_deg = [90.0]\naxis_um = [100.0, -50.0]\n"
     scene = scene_of(tmp_path, CAP, scan)
     (view,) = scene.views()
-    np.testing.assert_allclose(view.turned(scene.build_body()).spheres, [[10.0, -50.0, -200.0, 500.0]], atol=1e-9)
+    np.testing.assert_allclose(view.rotated_body(scene.build_body()).spheres, [[10.0, -50.0, -200.0, 500.0]], atol=1e-9)
 
 
 def test_views_in_units_shards_and_files(tmp_path):

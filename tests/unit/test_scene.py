@@ -53,7 +53,7 @@ def test_shipped_scenes_validate(path):
     scene = load_scene(path)
     assert scene.name == path.stem and scene.warnings() == []
     assert scene.build_body().max_height < scene.sample_distance
-    assert SceneFile.model_validate(json.loads(json.dumps(resolved(scene)))).at(scene.base_dir) == scene
+    assert SceneFile.model_validate(json.loads(json.dumps(resolved(scene)))).with_base_dir(scene.base_dir) == scene
 
 
 @pytest.mark.parametrize("path", sorted((SCENES / "instruments").glob("*.toml")), ids=lambda p: p.stem)
@@ -131,7 +131,7 @@ SPHERES = {"kind": "spheres", "spheres": [{"radius_um": 100.0}]}
         ),
         (
             {"sample": SPHERES | {"spheres": [{"radius_um": 9, "moat": {"width_um": 5000, "depth_um": 1}}]}},
-            "sample: a moat reaches 5000 um from the middle, the flat only 4000 um: enlarge size_um",
+            "sample: a moat reaches 5000 um from the centre, the substrate only 4000 um: enlarge size_um",
         ),
         ({"sample": {"kind": "step", "height_um": 9, "position_um": 4e3}}, "sample: the facet from 4000"),
         (
@@ -141,7 +141,7 @@ SPHERES = {"kind": "spheres", "spheres": [{"radius_um": 100.0}]}
         ({"sample": {"kind": "pyramid", "base_um": 9, "height_um": 1, "top_um": 9}}, "top_um must be < base_um = 9 um"),
         (
             {"sample": {"kind": "step", "height_um": 4000}},
-            "sample: the sample's top at 4000 um must stay below the plate",
+            "sample: the sample's top at 4000 um must be below the plate",
         ),
         ({"scan.nx": 5000, "scan.ny": 5000}, "scan: nx * ny must be <= 16777216 pixels, got 5000 x 5000"),
         ({"scan.center_um": [9000, 0]}, "scan.center_um: the raster about [9000.0, 0.0] um lies wholly beside"),
@@ -246,7 +246,7 @@ def test_mesh_paths_start_at_the_scene_file(tmp_path):
     assert len(direct.build_body().faces) == len(extended.build_body().faces) == 1
     with pytest.raises(InputFileError, match="no such file"):
         load_scene(write(tmp_path, text, "wrong.toml")).build_body()
-    with pytest.raises(SceneError, match="must stay below the plate"):
+    with pytest.raises(SceneError, match="must be below the plate"):
         load_scene(tmp_path / "scene.toml", {"sample.translate_um": [0, 0, 3999]}).build_body()
 
 
@@ -260,11 +260,11 @@ def test_warnings_of_validate(tmp_path):
     scene = load_scene(write(tmp_path, MINIMAL), {"detector": detectors, "sample.size_um": 30})
     told = "\n".join(scene.warnings())
     assert "'all': its aperture contains the pinhole" in told and "'all' and 'small' overlap" in told
-    assert "its rim misses it" in told
+    assert "its border misses the sample" in told
     assert load_scene(SCENES / "sphere_a.toml").warnings() == []
     plate = {**PLATE, "size_um": [40, 9e3], "center_um": [-4000 / 3**0.5, 0]}
     told = "\n".join(load_scene(tmp_path / "scene.toml", {"plate": plate, "beam.incidence_deg": 30}).warnings())
-    assert "reaches beyond the plate's outline" in told and "the pinhole" not in told and "beside the flat" in told
+    assert "reaches beyond the plate's outline" in told and "the pinhole" not in told and "beside the substrate" in told
     four = load_instrument(SCENES / "instruments/bshem_4detector.toml").model_dump(mode="json", exclude_none=True)
     assert load_scene(tmp_path / "scene.toml", four).warnings() == []
 
