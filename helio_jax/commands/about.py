@@ -1,7 +1,4 @@
-"""Commands that tell: info, validate, schema, doctor, fetch-data, cite.
-
-Each parses, calls, prints; no logic of its own.
-"""
+"""Informational commands: info, validate, schema, doctor, fetch-data, cite."""
 
 import json
 import textwrap
@@ -39,7 +36,7 @@ def info(
 
 @app.command()
 def validate(scene: SceneArg) -> None:
-    """Check a scene file and its sample; list every error with place, value, limit and remedy."""
+    """Check a scene file and its sample; list all errors with key, value, limit and remedy."""
     from helio_jax.scene.plates import check_solid
     from helio_jax.scene.sample import check_body
     from helio_jax.workflows.scene_file import load_scene
@@ -53,7 +50,7 @@ def validate(scene: SceneArg) -> None:
     for key, value in body.items():
         print(f"  {key}: {value}")
     if body["n_open_edges"] and not body["n_inner_open_edges"]:
-        print("  open edges: all on the outer border; a flat with structure is an open surface by design")
+        print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
     if (plate := loaded.read_plate()) is not None:
         for key, value in check_solid(plate).items():
             print(f"  plate {key}: {value}")
@@ -74,7 +71,7 @@ def schema() -> None:
 
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
-    """Check this installation: versions, ray engine, JAX devices, and a small trace."""
+    """Check this installation: versions, ray engine, JAX devices, a small trace."""
     from helio_jax.workflows.doctor import diagnose
 
     found = diagnose()
@@ -93,7 +90,7 @@ def fetch_data(
         Path | None, typer.Option("--output", "-o", help="Folder (default: the user's cache)."), Writes(within=())
     ] = None,
 ) -> None:
-    """Download the paper's public micrographs (CC BY-SA), check their SHA-256 and say where they are."""
+    """Download the paper's public micrographs (CC BY-SA), check their SHA-256 and print their paths."""
     from helio_jax.formats.fetch import CITATION, fetch_pack
 
     for path in fetch_pack(output):
@@ -103,7 +100,7 @@ def fetch_data(
 
 @app.command()
 def cite() -> None:
-    """Print how to cite this program and the papers behind it."""
+    """Print the citations of this program and of the underlying papers."""
     from helio_jax.figures.report import CITATION
 
     print("\n".join(CITATION))

@@ -1,7 +1,7 @@
-"""What all commands share: the application, options that several take, messages, progress bars, tables.
+"""The application and shared parts of all commands: options, messages, progress bars, tables.
 
-Light at import (`helio --help` in under 0.3 s): every command imports what it needs. stdout carries results
-(one JSON object with --json), stderr progress and messages. Exit codes: errors.py.
+Every command imports its dependencies itself, so that `helio --help` takes less than 0.3 s. stdout carries results (one
+JSON object with --json), stderr progress and messages. Exit codes: errors.py.
 """
 
 import sys
@@ -94,7 +94,7 @@ def print_table(rows: list[tuple[str, str, str]]) -> None:
 
 
 def set_options(items: list[str] | None, **options: Any) -> dict[str, Any]:
-    """Return settings given as KEY=VALUE (`--set`), and those that have options of their own, where these were given.
+    """Merge settings given as KEY=VALUE (`--set`) with given options.
 
     Raises:
         SceneError: an item is no KEY=VALUE, or a key is given twice.

@@ -1,7 +1,4 @@
-"""Commands about heights: reconstruct, evaluate, measure, report.
-
-Each parses, calls, prints; no logic of its own.
-"""
+"""Commands about heights: reconstruct, evaluate, measure, report."""
 
 import json
 from pathlib import Path
@@ -39,7 +36,7 @@ def reconstruct(
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
 ) -> None:
-    """Turn three or more micrographs into a height map."""
+    """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows import pipeline
@@ -73,7 +70,7 @@ def evaluate(
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Score a height map against the true heights of the same rays."""
+    """Score a height map against the true heights of the same beam positions."""
     from helio_jax.formats.hdf5 import read_height
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -170,15 +167,16 @@ def measure(
 
 
 def _print_instrument(found: dict[str, Any]) -> None:
-    """Print what a fit found out about the geometry, and what the data leave open of the instrument."""
+    """Print the fitted geometry and its weakly determined combinations."""
     for name, (value, std, prior, unit) in found.get("values", {}).items():
         if unit in ("um", "deg"):
-            print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} beyond what the instrument says (prior {prior:g})")
+            print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} from the stated value (prior {prior:g})")
     if found.get("widening", 1.0) > 1.0:
         print(
-            f"  the instrument comes out farther off than stated: all error bars are {found['widening']:.1f} times as "
-            f"wide for it (and up to {found.get('bent_um', 0.0):.0f} um more, for what that did to the heights)"
+            "  the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars "
+            f"are inflated by {found['widening']:.1f} (plus up to {found.get('bent_um', 0.0):.0f} um for the resulting "
+            "height error)"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())
-        print(f"  weakly determined, {weak['left']:.0%} of the prior is left: {terms}")
+        print(f"  weakly determined, posterior / prior standard deviation {weak['left']:.0%}: {terms}")

@@ -1,4 +1,4 @@
-"""Tables of named columns as text (.csv) or as NumPy arrays (.npz): atoms, directions, positions."""
+"""Write tables of named columns as text (.csv) or NumPy arrays (.npz)."""
 
 import os
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from helio_jax.formats.safe import atomic_path, check_target
 
 
 def check_table_target(path: str | os.PathLike) -> str:
-    """Return the kind of table that will be written, by its suffix; ask before a long computation.
+    """Return the suffix of a table to be written; call this before a long computation.
 
     Raises:
         SceneError: the suffix is neither .csv nor .npz, or the file cannot be written there.

@@ -1,8 +1,8 @@
-"""Write micrographs for users of other programs; the kind of file follows from its suffix.
+"""Write micrographs for other programs; the suffix selects the format.
 
-`.mat`: the reference simulator's layout (`im.single`, `im.multiple`, `param`, `beam_param`), which `helio import` reads
-back: counts to the bit, positions to rounding. Its frame is told in matlab_reference.py. Not written: rotations of
-apertures (the layout has no place for them) and `detector_vector` (what its users took for constant directions).
+`.mat`: the reference simulator's layout (`im.single`, `im.multiple`, `param`, `beam_param`). `helio import` reads it
+back: counts bit for bit, positions to rounding. Frame: matlab_reference.py. Not written: rotations of apertures (the
+layout has no field) and `detector_vector` (constant directions, which the layout's users assume).
 """
 
 import math
@@ -24,26 +24,26 @@ def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> list[s
     """Write an object to a foreign file.
 
     Args:
-        obj: what `read` gave.
-        path: its suffix says which kind.
-        view: which stack of a set, from 0; needed where there are several.
+        obj: result of `read`.
+        path: target file.
+        view: index of the stack in a set, from 0; required for several stacks.
 
     Returns:
-        What the object holds and that kind of file has no place for, each with a reason.
+        Data of the object that the format cannot hold, each with a reason.
 
     Raises:
-        SceneError: nothing of this kind can be written, or not from this object; the message says what can.
+        SceneError: the format is unknown, or cannot hold this object.
     """
     n = len(obj.stacks) if isinstance(obj, MicrographSet) else 1
     if (view is None and n > 1) or not 0 <= (view or 0) < n:
         given = "" if view is None else f", got {view}"
-        raise SceneError(f"{path}: holds one scan, there is a choice of {n}: give --view 0 to {n - 1}{given}")
+        raise SceneError(f"{path}: holds one scan, the set has {n}: give --view 0 to {n - 1}{given}")
     if isinstance(obj, MicrographSet):
         obj = obj.stacks[view or 0]
     kind = Path(path).suffix.lower()
     if kind != ".mat" or not isinstance(obj, MicrographStack):
         raise SceneError(
-            f"{path}: a {type(obj).__name__} cannot be written as {kind or 'a file without suffix'!r}: there is .mat "
+            f"{path}: a {type(obj).__name__} cannot be written as {kind or 'a file without suffix'!r}: known is .mat "
             "for micrographs (the reference simulator's layout)"
         )
     tree = reference_tree(obj, str(path))
@@ -55,23 +55,23 @@ def export(obj: Any, path: str | os.PathLike, view: int | None = None) -> list[s
 
 
 def _left_out(stack: MicrographStack) -> list[str]:
-    """Return what of a stack the reference simulator's layout does not hold."""
+    """List data of a stack that the reference simulator's layout does not hold."""
     out = []
     if stack.effuse is not None:
-        share = float(stack.effuse.sum() / stack.counts.sum()) if stack.counts.sum() > 0 else 0.0
-        out.append(f"effuse, counts of the effusive beam ({share:.1%} of the others): no place in this layout")
+        ratio = float(stack.effuse.sum() / stack.counts.sum()) if stack.counts.sum() > 0 else 0.0
+        out.append(f"effuse, counts of the effusive beam ({ratio:.1%} of the others): no field in this layout")
     if stack.plate is not None:
-        out.append("plate, which counts met the plate: they are in single and multiple, no longer told apart")
+        out.append("plate, counts from plate bounces: included in single and multiple, not separately")
     if stack.by_order is not None and len(stack.by_order) > 2:
-        out.append(f"orders 2 to {len(stack.by_order)} one by one: multiple is their sum")
+        out.append(f"orders 2 to {len(stack.by_order)} separately: multiple is their sum")
     return out
 
 
 def reference_tree(stack: MicrographStack, path: str = "") -> dict[str, dict[str, Any]]:
-    """Return a stack as the variables of the reference simulator's file.
+    """Convert a stack to the variables of the reference simulator's file.
 
     Args:
-        stack: simulated, with scattering orders that add up to the counts, on a raster.
+        stack: simulated on a raster, with scattering orders whose sum is the counts.
         path: for messages.
 
     Raises:
@@ -107,7 +107,7 @@ def _check(stack: MicrographStack, path: str) -> None:
     n, ny, nx = stack.shape
     if stack.by_order is None or len(stack.by_order) < 2 or stack.n_rays is None:
         raise SceneError(
-            f"{path}: this layout holds single and multiple scattering apart, which {stack.name!r} does not"
+            f"{path}: this layout holds single and multiple scattering separately, which {stack.name!r} does not"
         )
     if stack.noise != "expected" and not np.array_equal(stack.by_order.sum(0), stack.counts):
         raise SceneError(
@@ -117,7 +117,7 @@ def _check(stack: MicrographStack, path: str) -> None:
     if stack.instrument.beam.azimuth_deg != 0.0:
         raise SceneError(
             f"{path}: in this layout the beam travels along x, here beam.azimuth_deg is "
-            f"{stack.instrument.beam.azimuth_deg:g}: turn the scene"
+            f"{stack.instrument.beam.azimuth_deg:g}: rotate the scene"
         )
     if stack.positions is not None:
         raise SceneError(f"{path}: this layout holds rasters, {stack.name!r} is a list of {nx} positions")
@@ -128,7 +128,7 @@ def _check(stack: MicrographStack, path: str) -> None:
 
 
 def _compact(images: np.ndarray) -> list[np.ndarray]:
-    """Return images [detector, y, x] one by one: as small whole numbers where they are whole."""
+    """Split images [detector, y, x]; integer counts are converted to the smallest unsigned type."""
     if np.array_equal(images, np.round(images)) and images.min() >= 0 and images.max() < 2**32:
         kind = next(k for k in (np.uint8, np.uint16, np.uint32) if images.max() <= np.iinfo(k).max)
         return list(images.astype(kind))
@@ -136,7 +136,7 @@ def _compact(images: np.ndarray) -> list[np.ndarray]:
 
 
 def _cells(items: list[np.ndarray]) -> np.ndarray:
-    """Return a MATLAB cell array (one row)."""
+    """Convert to a MATLAB cell array (one row)."""
     cells = np.empty((1, len(items)), dtype=object)
     for i, item in enumerate(items):
         cells[0, i] = item

@@ -1,8 +1,7 @@
-"""Write and read helio files: HDF5 laid out as NeXus (see `nexus`). The only door to h5py.
+"""Write and read helio files: HDF5 with a NeXus layout (see `nexus`). The only import of h5py.
 
-Reading: the HDF5 library can crash on a corrupt file, and a file that claims to be ours can be corrupt too. So every
-file, ours included, is opened in a limited child process only, which hands back plain arrays; this process never
-touches its bytes. That costs a Python start (0.7 s on a slow core). The nouns are imported late for that child's sake.
+The HDF5 library can crash on a corrupt file. Every file is therefore opened in a limited child process, which returns
+plain arrays; this costs a Python start (0.7 s on a slow core). `nexus` is imported late to keep that start short.
 Refused: external and soft links, external storage, virtual datasets, unknown filters, objects, oversized data.
 """
 
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 FORMAT = "1.0"
 HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
-"""What files of HDF5 may be called."""
+"""Suffixes of HDF5 files."""
 MAX_BYTES = 4 * safe.GIB
 _MAX_OBJECTS = 20_000
 _MAX_DEPTH = 8
@@ -38,11 +37,11 @@ _SCAN = re.compile(r"scan_[1-9][0-9]{0,5}")
 
 
 def write(obj: "Noun", path: str | os.PathLike) -> None:
-    """Write micrographs, a set of them or a reconstruction, replacing the file in one step.
+    """Write a `MicrographStack`, `MicrographSet` or `Reconstruction`, replacing the file in one step.
 
     Args:
-        obj: `MicrographStack`, `MicrographSet` or `Reconstruction`.
-        path: the target, usually `.h5`; it stays as it was when writing fails.
+        obj: data to write.
+        path: target, usually `.h5`; unchanged if writing fails.
 
     Raises:
         SceneError: the target cannot be written.
@@ -61,7 +60,7 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
         "filetype": nexus.KINDS[type(obj)],
         "file_time": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    # v110: the library then keeps checksums of its own structures, so that damage is noticed
+    # v110: the library then stores checksums of its own structures, which reveal damage
     with safe.atomic_path(path) as temporary, h5py.File(temporary, "w", libver=("v110", "v110")) as file:
         _put_attributes(file, root)
         for node in nodes:
@@ -69,7 +68,7 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
 
 
 def _put_node(file: h5py.File, node: "Node") -> None:
-    """Write one group, dataset or second name."""
+    """Write one group, dataset or alias."""
     if node.same_as is not None:
         file[node.path] = file[node.same_as]
         return
@@ -81,7 +80,7 @@ def _put_node(file: h5py.File, node: "Node") -> None:
         value = value.astype("<f8")
     packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if value.ndim and value.size else {}
     dataset = file.create_dataset(node.path, data=value, **packing)
-    # gzip and the library's own structures carry checksums, single values do not
+    # gzip and the library's own structures have checksums, single values do not
     checksum = {} if value.ndim else {"sha256": hashlib.sha256(value.tobytes()).hexdigest()}
     _put_attributes(dataset, {**node.attributes, **checksum})
 
@@ -93,7 +92,7 @@ def _put_attributes(target: Any, attributes: Mapping[str, str | list[str]]) -> N
 
 
 def _fixed_text(value: str | list[str]) -> np.ndarray:
-    """Return UTF-8 text of fixed length: other programs handle it better than variable length."""
+    """Encode UTF-8 text of fixed length, which other programs handle better than variable length."""
     texts = [v.encode() for v in ([value] if isinstance(value, str) else value)]
     length = max(1, *map(len, texts))
     array = np.array(texts, dtype=h5py.string_dtype("utf-8", length))
@@ -111,8 +110,7 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
         `MicrographStack`, `MicrographSet` or `Reconstruction`, equal bit for bit to what was written.
 
     Raises:
-        InputFileError: missing, not HDF5, not ours, damaged, too large, or with links to other files; the message
-            names the file and, where it applies, the place in it.
+        InputFileError: missing, not HDF5, not a helio file, damaged, too large, or with links to other files.
     """
     from helio_jax.formats import nexus
 
@@ -128,7 +126,7 @@ def read_micrographs(path: str | os.PathLike) -> Micrographs:
     """
     found = read(path)
     if isinstance(found, Reconstruction):
-        raise InputFileError(f"{path}: holds a height map, needed are micrographs: helio simulate or import makes them")
+        raise InputFileError(f"{path}: holds a height map, needed are micrographs: run helio simulate or helio import")
     return found
 
 
@@ -153,7 +151,7 @@ def read_height(path: str | os.PathLike) -> Reconstruction:
     """
     found = read(path)
     if not isinstance(found, Reconstruction):
-        raise InputFileError(f"{path}: holds micrographs, needed is a height map: helio reconstruct makes one")
+        raise InputFileError(f"{path}: holds micrographs, needed is a height map: run helio reconstruct")
     return found
 
 
@@ -162,7 +160,7 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
 
     Returns:
         file, bytes, kind, format, creator, created; and per entry ("" or "scan_1", ...): fields (shape, unit and
-        meaning by place), instrument and provenance.
+        long name by path), instrument and provenance.
 
     Raises:
         InputFileError: as `read`.
@@ -182,7 +180,7 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def _load_in_child(path: str | os.PathLike, places: tuple[str, ...], max_bytes: int) -> dict[str, Any]:
-    """Check the file's size, then have a child process read it."""
+    """Check the file's size and read it in a child process."""
     safe.check_size(path, max_bytes)
     with Path(path).open("rb") as file:
         head = file.read(8)
@@ -225,7 +223,7 @@ def load_fields(path: Path, places: list[str], max_bytes: int) -> dict[str, Any]
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
-    """Open a file for reading; what the library says on closing an invalid one is put into words."""
+    """Open a file for reading."""
     try:
         file = h5py.File(path, "r", locking=False)
     except OSError as e:
@@ -235,7 +233,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
 
 
 def _read_about(path: Path, file: h5py.File) -> dict[str, str]:
-    """Read the root attributes and refuse what is not ours."""
+    """Read the root attributes; refuse files of other programs or of another major format."""
     names = ("helio_format", "filetype", "creator", "creator_version", "file_time")
     about = {name: _text_attribute(path, "/", file, name) for name in names}
     if not about["helio_format"]:
@@ -250,7 +248,7 @@ def _read_about(path: Path, file: h5py.File) -> dict[str, str]:
 
 
 def _walk(path: Path, group: h5py.Group, depth: int = 1, count: list[int] | None = None) -> Iterator[tuple[str, Any]]:
-    """Yield every object below `group` with its place, following hard links only."""
+    """Yield every object below `group` with its path, following hard links only."""
     count = [0] if count is None else count
     for name in group:
         place = f"{str(group.name).rstrip('/')}/{name}"
@@ -269,7 +267,7 @@ def _walk(path: Path, group: h5py.Group, depth: int = 1, count: list[int] | None
 
 
 def _check_item(path: Path, place: str, item: Any) -> int:
-    """Refuse storage that reaches outside the file or needs plugins; return the bytes the item declares."""
+    """Refuse storage outside the file or with plugins; return the size that the item declares [bytes]."""
     if isinstance(item, h5py.Group):
         return 0
     if not isinstance(item, h5py.Dataset):
@@ -310,13 +308,13 @@ def _value(path: Path, place: str, item: h5py.Dataset) -> Any:
 
 
 def _summary(path: Path, place: str, item: h5py.Dataset) -> dict[str, Any]:
-    """Return shape, unit and meaning of a dataset."""
+    """Return shape, unit and long name of a dataset."""
     unit, long_name = (_text_attribute(path, place, item, name) for name in ("units", "long_name"))
     return {"shape": list(item.shape), "unit": unit, "long_name": long_name}
 
 
 def _text_attribute(path: Path, place: str, item: Any, name: str) -> str:
-    """Read a text attribute, "" where it is missing."""
+    """Read a text attribute; "" if it is missing."""
     try:
         value = item.attrs.get(name, "")
     except (OSError, RuntimeError, TypeError, ValueError) as e:

@@ -1,9 +1,9 @@
-"""Import micrographs from MATLAB files: the reference simulator, B-SHeM and A-SHeM. The only door to pymatreader.
+"""Import micrographs from MATLAB files of the reference simulator, B-SHeM and A-SHeM. The only import of pymatreader.
 
-The file is parsed in a limited child process, for SciPy's reader crashes on corrupt files. Three layouts are told
-apart by their variables and brought to our frame (arrays.py): `im.single` and `im.multiple` (reference simulator),
-`meas_list.image` as a list of channels (B-SHeM) or as one array (A-SHeM). What the file does not say, such as the
-apertures, comes from the instrument. All scalar metadata go to `provenance["metadata"]`. Does no calibration.
+The file is parsed in a limited child process, because SciPy's reader crashes on corrupt files. Its variables identify
+the layout: `im.single` and `im.multiple` (reference simulator), `meas_list.image` as a list of channels (B-SHeM) or as
+one array (A-SHeM). Images are converted to the frame of arrays.py. Data that the file lacks, such as the apertures,
+come from the instrument. All scalar metadata go to `provenance["metadata"]`. No calibration.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ MAX_FILE_BYTES = 256 * safe.MIB
 _IMAGES = ("image", "single", "multiple")
 _SUMMARISED = ("labtemp", "beam_pressure", "return_state")
 _SMALL = 64
-_WANTED_INSTRUMENT = {
+_EXAMPLE_INSTRUMENT = {
     "reference simulator": "scenes/instruments/bshem_wd4.toml",
     "B-SHeM": "scenes/instruments/bshem_wd3.toml",
     "A-SHeM": "scenes/instruments/ashem_normal.toml",
@@ -39,15 +39,15 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
 
     Args:
         path: file of the reference simulator, a B-SHeM or an A-SHeM scan.
-        instrument: beam, plate and apertures. For the reference simulator the file's own values are used and only
-            what it lacks (aperture rotations) is taken from here; a contradiction is an error.
+        instrument: beam, plate and apertures. For the reference simulator only the aperture rotations, which its
+            file lacks, are taken from here; contradictions are errors.
 
     Returns:
-        The stack, detectors in the instrument's order; `provenance` tells the file, its SHA-256, the kind, how the
-        raw array was turned, where the variance comes from, and the file's metadata.
+        The stack, detectors in the instrument's order; `provenance` holds the file, its SHA-256, the kind, the
+        orientation of the raw array, the source of the variance, and the file's metadata.
 
     Raises:
-        InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument does not fit.
+        InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument contradicts the file.
     """
     safe.check_size(path, MAX_FILE_BYTES)
     _check_header(Path(path))
@@ -56,8 +56,8 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
     kind = _find_kind(str(path), tree)
     if instrument is None:
         raise InputFileError(
-            f"{path}: a {kind} file does not say how its apertures are shaped and turned: name the instrument, "
-            f"for example --instrument {_WANTED_INSTRUMENT[kind]}"
+            f"{path}: a {kind} file does not state the shape and rotation of its apertures: give the instrument, "
+            f"for example --instrument {_EXAMPLE_INSTRUMENT[kind]}"
         )
     build = {"reference simulator": _reference_stack, "B-SHeM": _bshem_stack, "A-SHeM": _ashem_stack}[kind]
     fields, notes = build(str(path), tree, instrument)
@@ -70,7 +70,7 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
 
 
 def _check_header(path: Path) -> None:
-    """Check that a file says it is a level 5 MATLAB file."""
+    """Check that a file has the header of a level 5 MATLAB file."""
     with path.open("rb") as file:
         head = file.read(19)
     if head.startswith(b"MATLAB 7.3"):
@@ -80,8 +80,8 @@ def _check_header(path: Path) -> None:
 
 
 def load_tree(path: Path) -> dict[str, Any]:
-    """Parse a level 5 MATLAB file and drop what is large and no image; runs in a child process."""
-    from pymatreader import read_mat  # here, so that this process alone loads it
+    """Parse a level 5 MATLAB file and drop large arrays other than images; runs in a child process."""
+    from pymatreader import read_mat  # loaded in the child process only
 
     tree = read_mat(str(path))
     return {k: _reduce(k, v) for k, v in tree.items() if not k.startswith("__")}
@@ -108,7 +108,7 @@ def _reduce(name: str, value: Any) -> Any:
 
 
 def _to_json(value: Any) -> Any:
-    """Return metadata as JSON values: images left out, non-finite numbers None."""
+    """Convert metadata to JSON values: images omitted, non-finite numbers None."""
     if isinstance(value, dict):
         return {k: _to_json(v) for k, v in value.items() if k not in _IMAGES}
     if isinstance(value, np.ndarray) and value.size > _SMALL:
@@ -119,7 +119,7 @@ def _to_json(value: Any) -> Any:
 
 
 def _find_kind(path: str, tree: dict[str, Any]) -> str:
-    """Tell the three layouts apart."""
+    """Identify the layout."""
     im, scan = tree.get("im"), tree.get("meas_list")
     if isinstance(im, dict) and "single" in im and "multiple" in im:
         return "reference simulator"
@@ -129,7 +129,7 @@ def _find_kind(path: str, tree: dict[str, Any]) -> str:
         return "A-SHeM"
     found = ", ".join(list(tree)[:10]) or "none"
     raise InputFileError(
-        f"{path} holds no micrographs that are known: neither im.single and im.multiple (reference simulator) nor "
+        f"{path} holds no known micrographs: neither im.single and im.multiple (reference simulator) nor "
         f"meas_list.image (B-SHeM, A-SHeM); its variables: {found}"
     )
 
@@ -205,7 +205,7 @@ def _ashem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tup
     if len(instrument.detector) != 1:
         raise InputFileError(
             f"{path}: an A-SHeM scan has 1 detector, the instrument has {len(instrument.detector)}: "
-            f"give the instrument of this microscope, for example {_WANTED_INSTRUMENT['A-SHeM']}"
+            f"give the instrument of this microscope, for example {_EXAMPLE_INSTRUMENT['A-SHeM']}"
         )
     image = get_array(path, scan["image"], "meas_list.image", 2)
     n_rows, n_columns = image.shape
@@ -231,7 +231,7 @@ def _ashem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tup
 
 
 def _measured_notes(orientation: str, fast: str, variance: list[float]) -> dict[str, Any]:
-    """Return what provenance says about a measured scan."""
+    """Construct the provenance of a measured scan."""
     how = (
         "one value per detector: median of squared second differences along the fast axis, drift between lines excluded"
     )
@@ -239,7 +239,7 @@ def _measured_notes(orientation: str, fast: str, variance: list[float]) -> dict[
 
 
 def _fast_direction(path: str, scan: dict[str, Any]) -> str:
-    """Return the raw array's fast axis, horizontal unless the scan's inputs say otherwise."""
+    """Return the raw array's fast axis, horizontal unless the scan's inputs state another one."""
     inputs = scan.get("inputs", [])
     for key, value in zip(inputs[::2], inputs[1::2], strict=False) if isinstance(inputs, list) else ():
         if isinstance(key, str) and key == "fast_axis":
@@ -252,7 +252,7 @@ def _fast_direction(path: str, scan: dict[str, Any]) -> str:
 
 
 def _raw_pitch(path: str, scan: dict[str, Any], direction: str, n: int) -> float:
-    """Return the scan step in the file's unit, after checking that it spans the range in n - 1 steps."""
+    """Return the scan step in the file's unit; check that n - 1 steps span the range."""
     step = get_number(path, scan, f"{direction}_res", low=0.0)
     span = float(np.ptp(get_array(path, scan.get(f"{direction}_range"), f"meas_list.{direction}_range", 1)))
     if abs(span - (n - 1) * step) > 0.5 * step:
@@ -264,7 +264,7 @@ def _raw_pitch(path: str, scan: dict[str, Any], direction: str, n: int) -> float
 
 
 def _centred(n: int, step: float) -> np.ndarray:
-    """Return n beam positions about zero [um]."""
+    """Compute n beam positions centred on zero [um]."""
     return (np.arange(n) - (n - 1) / 2) * step
 
 
@@ -274,10 +274,10 @@ def _per_detector(values: list[float], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
-    """Return the mean of the 8 neighbours of every pixel [detector, y, x]: its expected count, free of its own noise.
+    """Average the 8 neighbours of every pixel [detector, y, x]: its expected count, independent of its own noise.
 
-    With weights 1 / count, low counts weigh more and every mean comes out one count too low (at 400 counts that is as
-    much as an offset of -0.25 %). Source: Mighell, ApJ 518 (1999) 380, sec. 2.
+    Weights 1 / count would favour low counts and bias every mean by one count (-0.25 % at 400 counts).
+    Source: Mighell, ApJ 518 (1999) 380, sec. 2.
     """
     padded = np.pad(np.asarray(counts, float), ((0, 0), (1, 1), (1, 1)), mode="reflect")
     return (9.0 * np.asarray(uniform_filter(padded, 3, axes=(1, 2)))[:, 1:-1, 1:-1] - counts) / 8.0
@@ -286,8 +286,8 @@ def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
 def _noise_variance(image: np.ndarray, fast: str) -> float:
     """Estimate the noise variance of a pixel from second differences along the raw fast axis.
 
-    Valid for white noise on an image that is smooth over 3 pixels in more than half of its area; slow drift and
-    the offset of lines are not in it.
+    Valid for white noise on an image that is smooth over 3 pixels in more than half of its area. Slow drift and
+    offsets of lines are excluded.
 
     Source: own derivation: the second difference of white noise has 6 times its variance, and the median of its
         absolute value is 0.6745 standard deviations; tests/formats/test_matlab.py.

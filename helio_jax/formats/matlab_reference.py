@@ -1,7 +1,7 @@
-"""The reference simulator's file in our terms: its apertures, beam and counts.
+"""Read apertures, beam and counts of the reference simulator's file.
 
-Its frame: plate in the plane y = 0, apertures given as (x, z) in mm, full axes; ours: x = x, y = -z, um. Its scan
-moves the sample, so the columns run against our x. It does not store how the apertures are turned.
+Its frame: plate in the plane y = 0, apertures given as (x, z) in mm, full axes. Conversion to the lab frame: x = x,
+y = -z, um. Its scan moves the sample, so its columns run against x. It does not store the rotation of the apertures.
 """
 
 import math
@@ -21,12 +21,12 @@ _RELATIVE_TOLERANCE = 1e-3
 
 
 def read_counts(path: str, tree: dict[str, Any], order: list[int]) -> np.ndarray:
-    """Return counts of single and multiple scattering [2, detector, y, x], columns reversed.
+    """Read counts of single and multiple scattering [2, detector, y, x], columns reversed.
 
     Args:
         path: for messages.
-        tree: the file.
-        order: for each of our detectors, its index in the file.
+        tree: contents of the file.
+        order: index in the file of each detector of the instrument.
 
     Raises:
         InputFileError: images missing or of different sizes.
@@ -43,13 +43,13 @@ def read_counts(path: str, tree: dict[str, Any], order: list[int]) -> np.ndarray
 
 
 def complete_instrument(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[Instrument, list[int]]:
-    """Combine the file's instrument with what only the given one knows: names and aperture rotations.
+    """Combine the file's instrument with the names and aperture rotations of the given one.
 
     Returns:
-        The instrument in the given detector order, and for each detector its index in the file.
+        The instrument in the given detector order, and the index in the file of each detector.
 
     Raises:
-        InputFileError: file and instrument contradict each other; the message names both values.
+        InputFileError: file and instrument contradict each other.
     """
     beam, plate = _file_beam(path, tree), _file_plate(path, tree, instrument)
     _compare(path, "beam", beam, {k: getattr(instrument.beam, k) for k in instrument.beam.model_fields_set})
@@ -59,9 +59,9 @@ def complete_instrument(path: str, tree: dict[str, Any], instrument: Instrument)
     detectors = []
     for ours, aperture, k in zip(instrument.detector, instrument.apertures(), order, strict=True):
         center, axes = ellipses[k]
-        turn = ours.rotation_deg if ours.center_um is not None else math.degrees(aperture.rotation)
+        rotation = ours.rotation_deg if ours.center_um is not None else math.degrees(aperture.rotation)
         detectors.append(
-            {"name": ours.name, "center_um": center, "axes_um": axes, "rotation_deg": turn or 0.0}
+            {"name": ours.name, "center_um": center, "axes_um": axes, "rotation_deg": rotation or 0.0}
             | ({} if ours.channel is None else {"channel": ours.channel})
         )
     parts = {
@@ -76,7 +76,7 @@ def complete_instrument(path: str, tree: dict[str, Any], instrument: Instrument)
 
 
 def _file_beam(path: str, tree: dict[str, Any]) -> dict[str, Any]:
-    """Return the beam as our settings."""
+    """Read the beam as settings."""
     beam = get_table(path, tree, "beam_param")
     model = beam.get("source_model")
     if not isinstance(model, str) or model not in _SOURCES:
@@ -91,7 +91,7 @@ def _file_beam(path: str, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _file_plate(path: str, tree: dict[str, Any], instrument: Instrument) -> dict[str, float]:
-    """Return the distances; the design working distance follows from where the pinhole is."""
+    """Read the distances; the design working distance follows from the position of the pinhole."""
     beam = get_table(path, tree, "beam_param")
     incidence = get_number(path, beam, "init_angle")
     pinhole = get_array(path, beam.get("pinhole_c"), "beam_param.pinhole_c", 1)
@@ -100,13 +100,13 @@ def _file_plate(path: str, tree: dict[str, Any], instrument: Instrument) -> dict
     distance = _um(get_number(path, get_table(path, tree, "param"), "z_sample_to_detector", low=0.0))
     if abs(incidence) < 0.1 or abs(incidence) > 80.0:
         return {"working_distance_um": instrument.working_distance, "sample_distance_um": distance}
-    # the pinhole stands W tan t upstream, given in mm to 8 decimals
+    # the pinhole is W tan t upstream, given in mm to 8 decimals
     working = round(float(-pinhole[0]) * 1000 / math.tan(math.radians(incidence)), 3)
     return {"working_distance_um": working, "sample_distance_um": distance}
 
 
 def _file_ellipses(path: str, tree: dict[str, Any]) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Return centre and full axes of every aperture in our frame [um]."""
+    """Read centre and full axes of every aperture, lab frame [um]."""
     param = get_table(path, tree, "param")
     centers = get_list(path, param, "detector_position")
     axes = get_list(path, param, "detector_axes", len(centers))
@@ -121,7 +121,7 @@ def _file_ellipses(path: str, tree: dict[str, Any]) -> list[tuple[tuple[float, f
 
 
 def _match_apertures(path: str, ellipses: list, instrument: Instrument) -> list[int]:
-    """Find each of our apertures in the file by its centre, and check its axes."""
+    """Find each aperture of the instrument in the file by its centre, and check its axes."""
     if len(ellipses) != len(instrument.detector):
         raise InputFileError(
             f"{path} has {len(ellipses)} detectors, the instrument {len(instrument.detector)}: "
@@ -138,19 +138,19 @@ def _match_apertures(path: str, ellipses: list, instrument: Instrument) -> list[
 
 
 def _check_aperture(path: str, name: str, ellipse: tuple, aperture: Aperture) -> None:
-    """Compare one aperture of the file with ours."""
+    """Compare one aperture of the file with that of the instrument."""
     center, axes = ellipse
     ours = tuple(2 * s for s in aperture.semi_axes)
     for what, theirs, given in (("centre", center, aperture.center), ("full axes", axes, ours)):
         if math.dist(theirs, given) > _LENGTH_TOLERANCE_UM:
             raise InputFileError(
-                f"{path}: detector {name!r}: its {what} in the file is {theirs} um (our frame), in the instrument "
+                f"{path}: detector {name!r}: its {what} in the file is {theirs} um (lab frame), in the instrument "
                 f"{tuple(round(g, 3) for g in given)} um: give the instrument that the file was made with"
             )
 
 
 def _compare(path: str, table: str, found: dict[str, Any], given: dict[str, Any]) -> None:
-    """Refuse settings that were given explicitly and differ from the file's."""
+    """Refuse explicitly given settings that differ from the file's."""
     for name, value in given.items():
         theirs = found.get(name)
         if theirs is None or value is None or value == theirs:
@@ -158,10 +158,10 @@ def _compare(path: str, table: str, found: dict[str, Any], given: dict[str, Any]
         if isinstance(value, str) or abs(value - theirs) > _RELATIVE_TOLERANCE * max(abs(value), abs(theirs)):
             raise InputFileError(
                 f"{path}: {table}.{name} is {theirs} in the file but {value} in the instrument: "
-                "give the instrument that the file was made with, or leave this setting out"
+                "give the instrument that the file was made with, or remove this setting"
             )
 
 
 def _um(millimetres: float) -> float:
-    """Convert mm to um (or rad to mrad), rounded to 1e-6 so that decimals stay what they were in the file."""
+    """Convert mm to um (or rad to mrad), rounded to 1e-6 to keep the file's decimals."""
     return round(float(millimetres) * 1000, 6)

@@ -1,8 +1,8 @@
-"""How the nouns are laid out in a NeXus file: which array goes where, with which unit and meaning.
+"""NeXus layout of micrographs and reconstructions: path, unit and long name of every array.
 
-Pure bookkeeping between the nouns and a flat list of nodes; `hdf5` writes and reads the nodes. Every array is stored
-in float64 (masks in uint8), so that a file read back is equal bit for bit; what is None is left out. Values that are
-derived from others (`counts_errors`, `/entry/x`, `/entry/y`) are written for other programs and not read back.
+Converts between these objects and a flat list of nodes; `hdf5` writes and reads the nodes. Arrays are stored in float64
+(masks in uint8), so that a file is read back bit for bit; None is omitted. Derived values (`counts_errors`, `/entry/x`,
+`/entry/y`) are written for other programs and not read back.
 """
 
 import json
@@ -24,7 +24,7 @@ Noun = MicrographStack | MicrographSet | Reconstruction
 
 @dataclass(frozen=True)
 class Node:
-    """A group (`value` None), a dataset, or a second name of one (`same_as`); attributes are texts."""
+    """A group (`value` None), a dataset, or an alias of a dataset (`same_as`); attributes are texts."""
 
     path: str
     value: Any = None
@@ -34,7 +34,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Field:
-    """One attribute of a noun: its place below the entry, unit ("counts": that of the stack) and meaning."""
+    """One attribute of an object: its path below the entry, unit ("counts": that of the stack) and long name."""
 
     name: str
     place: str
@@ -81,7 +81,7 @@ RECONSTRUCTION_FIELDS = (
 )
 COMMON_PLACES = ("instrument/settings", "provenance/data")
 READ_PLACES = (*COMMON_PLACES, *(f.place for f in (*STACK_FIELDS, *RECONSTRUCTION_FIELDS)))
-"""Places below an entry that the reader needs; everything else in a file is ignored."""
+"""Paths below an entry that the reader needs; everything else in a file is ignored."""
 
 KINDS: dict[type, str] = {
     MicrographStack: "micrographs",
@@ -91,10 +91,10 @@ KINDS: dict[type, str] = {
 
 
 def lay_out(obj: Noun) -> list[Node]:
-    """Return the nodes of a file that holds `obj`, groups before what is in them, root excluded.
+    """Lay out the nodes of a file that holds `obj`, groups before their members, root excluded.
 
     Raises:
-        HelioError: the provenance is not JSON-compatible, or `obj` is not one of the three nouns.
+        HelioError: the provenance is not JSON-compatible, or `obj` is of another type.
     """
     if isinstance(obj, MicrographStack):
         return _stack_nodes("/entry", "NXentry", obj)
@@ -148,7 +148,7 @@ def _reconstruction_nodes(entry: str, rec: Reconstruction) -> list[Node]:
 
 
 def _field_nodes(entry: str, obj: Any, fields: tuple[Field, ...], count_unit: str) -> list[Node]:
-    """Lay out the attributes of a noun that are not None."""
+    """Lay out the attributes of an object that are not None."""
     nodes = []
     for f in fields:
         value = getattr(obj, f.name)
@@ -186,7 +186,7 @@ def _text_node(path: str, text: str, long_name: str) -> Node:
 
 
 def _plain(value: Any) -> Any:
-    """Replace mappings, numpy numbers and arrays by what JSON knows; other types are refused by `json`."""
+    """Convert mappings, numpy numbers and arrays to JSON types; `json` refuses other types."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -195,15 +195,15 @@ def _plain(value: Any) -> Any:
 
 
 def rebuild(kind: str, entries: dict[str, dict[str, Any]], path: str) -> Noun:
-    """Make the noun from what was read.
+    """Construct the object from the values of a file.
 
     Args:
         kind: the file's `filetype`.
-        entries: values by place below the entry, for the entry itself ("") and its scans ("scan_1", ...).
+        entries: values by path below the entry, for the entry itself ("") and its scans ("scan_1", ...).
         path: the file, for messages.
 
     Raises:
-        InputFileError: the kind is unknown, something is missing, or the noun's own checks fail; names the place.
+        InputFileError: the kind is unknown, data are missing, or the object's own checks fail.
     """
     top = entries.get("", {})
     if kind == "micrographs":
@@ -220,11 +220,11 @@ def rebuild(kind: str, entries: dict[str, dict[str, Any]], path: str) -> Noun:
 
 
 def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: str) -> Any:
-    """Make one stack or reconstruction from its values."""
+    """Construct one stack or reconstruction from its values."""
     given = {f.name: values[f.place] for f in fields if f.place in values}
     try:
         for name, value in given.items():
-            # stored as arrays without axes; the nouns hold plain numbers
+            # stored as arrays without axes
             given[name] = float(value) if isinstance(value, np.ndarray) and value.ndim == 0 else value
         _check_record(noun, given)
         return noun(**given, instrument=_instrument(values, place), provenance=_provenance(values, place))
@@ -235,7 +235,7 @@ def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: 
 
 
 def _check_record(noun: type, given: dict[str, Any]) -> None:
-    """Check the texts and numbers that the noun itself takes on trust."""
+    """Check the texts and numbers that the object does not check itself."""
     choices = {"fast_axis": ("x", "y"), "noise": ("expected", "poisson", "measured")}
     for name in ("fast_axis", "noise", "unit", "name", "method", "status"):
         if name in given and not isinstance(given[name], str):
@@ -255,7 +255,7 @@ def _check_record(noun: type, given: dict[str, Any]) -> None:
 
 
 def _instrument(values: dict[str, Any], place: str) -> Instrument:
-    """Read the instrument back from its JSON text."""
+    """Parse the instrument."""
     text = values.get("instrument/settings")
     if not isinstance(text, str):
         raise InputFileError(f"{place}/instrument/settings is missing: the file is incomplete")
@@ -266,7 +266,7 @@ def _instrument(values: dict[str, Any], place: str) -> Instrument:
 
 
 def _provenance(values: dict[str, Any], place: str) -> dict[str, Any]:
-    """Read the provenance back from its JSON text."""
+    """Parse the provenance."""
     try:
         found = json.loads(values.get("provenance/data", "{}"))
     except (TypeError, ValueError) as e:

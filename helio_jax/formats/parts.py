@@ -1,8 +1,7 @@
-"""Parts of a file to be: finished pieces of a long run, kept in the folder OUT.parts beside OUT until all are there.
+"""Partial results of a long run, kept in the folder OUT.parts beside OUT until the run is complete.
 
-A manifest (JSON) says what run they belong to; every part is an uncompressed .npz, renamed into place in one step,
-whose members carry checksums. Knows nothing of what the parts mean. Parts are read like any other file: bounded, no
-pickle, every failure names the file.
+A manifest (JSON) identifies the run. Every part is an uncompressed .npz (with checksums), renamed into place in one
+step. Parts are untrusted like any other file: bounded, no pickle, every failure names the file.
 """
 
 import contextlib
@@ -27,11 +26,7 @@ _OWN = re.compile(r"\d{6}\.npz|whole\.\w+|\.(\d{6}|manifest|whole)\.[0-9a-f]{8}\
 
 
 class Parts:
-    """The parts of one file.
-
-    Args:
-        output: the file that they will make.
-    """
+    """The parts of one output file."""
 
     def __init__(self, output: Path) -> None:
         self.output = output
@@ -39,14 +34,14 @@ class Parts:
 
     @property
     def exist(self) -> bool:
-        """Whether a run was begun and not finished."""
+        """Whether an unfinished run exists."""
         return (self.folder / "manifest.json").is_file()
 
     def begin(self, manifest: dict[str, Any]) -> None:
-        """Make the folder and its manifest.
+        """Create the folder and its manifest.
 
         Raises:
-            SceneError: the folder, or the file itself when its time comes, cannot be written.
+            SceneError: the folder or the output file cannot be written.
         """
         safe.check_target(self.output)
         try:
@@ -57,7 +52,7 @@ class Parts:
             path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
     def manifest(self) -> dict[str, Any]:
-        """Return the manifest.
+        """Read the manifest.
 
         Raises:
             InputFileError: missing or damaged.
@@ -73,11 +68,11 @@ class Parts:
         return found
 
     def path(self, number: int) -> Path:
-        """Return where a part is kept."""
+        """Return the path of a part."""
         return self.folder / f"{number:06d}.npz"
 
     def has(self, number: int) -> bool:
-        """Whether a part is there (sound or not)."""
+        """Whether a part exists (intact or not)."""
         return self.path(number).is_file()
 
     def save(self, number: int, arrays: dict[str, np.ndarray]) -> None:
@@ -93,7 +88,7 @@ class Parts:
         """Read one part.
 
         Raises:
-            InputFileError: missing, too large or damaged; the message names it.
+            InputFileError: missing, too large or damaged.
         """
         path = self.path(number)
         safe.check_size(path, MAX_PART_BYTES)
@@ -108,22 +103,20 @@ class Parts:
             raise InputFileError(f"{path} is damaged ({type(e).__name__}: {e})") from None
 
     def claim(self) -> bool:
-        """Return True to one caller only, of all that find the parts complete."""
+        """Claim the merge of the complete parts; True for one of all concurrent callers."""
         try:
             (self.folder / "claimed").mkdir()
-        except FileNotFoundError:  # already put together and removed
-            return False
-        except FileExistsError:
+        except (FileNotFoundError, FileExistsError):  # merged and removed already, or claimed
             return False
         return True
 
     def finish(self, write: Callable[[Path], None]) -> None:
-        """Write the whole file, and remove the parts.
+        """Write the complete file, and remove the parts.
 
-        It is written within the folder and then moved, so that a killed process leaves nothing beside it.
+        The file is written in the folder and then moved, so that a killed process leaves nothing outside the folder.
 
         Args:
-            write: writes it to the path it is given.
+            write: writes the file to a given path.
 
         Raises:
             SceneError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Control points as CSV: the header `view,point,x_um,y_um`, then one pick per line (beam positions, um)."""
+"""Control points as CSV: the header `view,point,x_um,y_um`, then one point per line (beam positions, um)."""
 
 import csv
 import io
@@ -15,11 +15,10 @@ MAX_FILE_BYTES = 4 * MIB
 
 
 def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, float]]]:
-    """Read control points: {view: {point: (x, y) [um]}}. Lines that begin with # are left out.
+    """Read control points: {view: {point: (x, y) [um]}}. Lines that begin with # are ignored.
 
     Raises:
-        InputFileError: missing, too large, not UTF-8, another header, a bad number, or a point given twice; the message
-            names file and line.
+        InputFileError: missing, too large, not UTF-8, another header, a bad number, or a repeated point.
     """
     check_size(path, MAX_FILE_BYTES)
     try:
@@ -50,7 +49,7 @@ def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, flo
 
 
 def write_points(path: str | os.PathLike, picks: Mapping[str, Mapping[str, tuple[float, float]]]) -> None:
-    """Write control points; replaces the file at once or not at all."""
+    """Write control points, replacing the file in one step."""
     with atomic_path(Path(path)) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(HEADER)

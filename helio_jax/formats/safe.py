@@ -1,9 +1,9 @@
-"""Guards for files that may be corrupt or hostile, and for files that must never be half written.
+"""Safe reading of files that may be corrupt, and atomic writing.
 
-A parser written in C can crash on a bad file and take the user's session along (SciPy's .mat reader and the HDF5
-library both do). So foreign bytes are parsed in a fresh Python process with capped memory and time, and only
-arrays and JSON come back: no pickle. This is protection against accidents, not a sandbox against an attacker.
-Imports no format library itself, so that the child starts quickly.
+Parsers written in C crash on corrupt files (SciPy's .mat reader and the HDF5 library do). Foreign bytes are therefore
+parsed in a fresh Python process with limited memory and time, which returns arrays and JSON only (no pickle). This
+protects against accidents; it is no sandbox against an attacker. No format library is imported here, so that the child
+starts quickly.
 """
 
 import contextlib
@@ -35,10 +35,10 @@ _BOOT = (
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for output, and those above it, where it is not there yet.
+    """Create a folder for output, and those above it.
 
     Raises:
-        SceneError: it cannot be made.
+        SceneError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -76,20 +76,20 @@ def check_size(path: str | os.PathLike, limit_bytes: int) -> int:
 def call_in_child(
     function_qualname: str, path: str | os.PathLike, *args: Any, memory_bytes: int = 2 * GIB, seconds: float = 120
 ) -> Any:
-    """Call a module-level function of helio_jax on a file in a fresh process with capped memory and time.
+    """Call a module-level function of helio_jax on a file in a fresh process with limited memory and time.
 
     Works from a REPL, pytest or an unguarded script: the child never imports the caller's main module. Memory and
-    CPU caps need POSIX (macOS ignores the memory cap; Windows has neither); the wall-clock limit holds everywhere.
+    CPU limits need POSIX (macOS ignores the memory limit; Windows has neither); the wall-clock limit always holds.
 
     Args:
         function_qualname: "helio_jax.package.module:function"; it is called as function(path, *args).
         path: the file to parse.
         args: JSON-compatible further arguments.
-        memory_bytes: cap on the child's address space and on what it writes.
-        seconds: cap on its CPU time, and on its wall time once doubled (+ 10 s for a busy machine).
+        memory_bytes: limit of the child's address space and of the files it writes.
+        seconds: limit of its CPU time; the wall-clock limit is 2 * seconds + 10 s.
 
     Returns:
-        What the function returned: nested dicts and lists of numpy arrays and JSON values (tuples become lists).
+        The function's result: nested dicts and lists of numpy arrays and JSON values (tuples become lists).
 
     Raises:
         InputFileError: the function failed, crashed, took too long or needed too much memory.
@@ -124,7 +124,7 @@ def call_in_child(
 
 
 def _run_child(request: dict[str, Any], wall_seconds: float) -> int:
-    """Run the request in a new interpreter, return its exit status."""
+    """Run the request in a new interpreter and return its exit status."""
     folder = Path(request["folder"])
     root = str(Path(__file__).resolve().parents[2])
     # -P: no module is imported from the working folder, where the foreign file may lie
@@ -169,7 +169,7 @@ def serve_request(text: str) -> None:
 
 
 def _limit_self(memory_bytes: int, seconds: float) -> None:
-    """Cap this process's memory, CPU time and file sizes, where the system can."""
+    """Limit this process's memory, CPU time and file sizes, if the system supports it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -195,7 +195,7 @@ def _tail(path: Path) -> str:
 
 
 def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Turn a tree into JSON, moving its arrays to `arrays`; the tag keeps dicts and arrays apart."""
+    """Convert a tree to JSON and move its arrays to `arrays`; tags distinguish dicts from arrays."""
     if isinstance(value, dict):
         return {"dict": {str(k): _pack(v, arrays) for k, v in value.items()}}
     if isinstance(value, (list, tuple)):
@@ -225,7 +225,7 @@ def _unpack(value: Any, arrays: Any) -> Any:
 
 
 def check_target(target: Path) -> Path:
-    """Return the file that writing to `target` will replace: a link is followed, what it points to is replaced.
+    """Return the file that writing to `target` will replace; links are followed.
 
     Raises:
         SceneError: it is a folder, a device or write-protected, or its folder does not exist.
@@ -322,8 +322,8 @@ def _is_same(path: Path, other: Path) -> bool:
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path in the same folder that becomes `path` when the block succeeds.
 
-    The temporary keeps the suffix. It is flushed to disk before it replaces the target in one step. When the block
-    fails the temporary is removed and an existing target stays as it was.
+    The temporary file keeps the suffix. It is flushed to disk before it replaces the target in one step. If the block
+    fails, it is removed and an existing target is unchanged.
 
     Raises:
         SceneError: the target cannot be written (no such folder, no permission, disk full, is a folder).
@@ -350,7 +350,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Force a file or folder to the disk; folders only where the system can."""
+    """Flush a file to disk, or a folder on POSIX systems."""
     if path.is_dir() and os.name != "posix":
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)

@@ -1,7 +1,4 @@
-"""Checked access to what a foreign file holds: nested tables of arrays and plain values.
-
-Every failure names the file, the entry, the value and what was expected.
-"""
+"""Checked access to the contents of a foreign file: nested tables of arrays and plain values."""
 
 import math
 from typing import Any
@@ -51,7 +48,7 @@ def get_number(path: str, tree: dict[str, Any], name: str, *, low: float = -math
 
 
 def get_array(path: str, value: Any, name: str, ndim: int) -> np.ndarray:
-    """Return a non-empty array of numbers in float64, so that small integer types cannot wrap.
+    """Return a non-empty array of numbers in float64, so that small integer types cannot overflow.
 
     Raises:
         InputFileError: missing, not numeric, empty, or of another number of axes.
@@ -64,7 +61,7 @@ def get_array(path: str, value: Any, name: str, ndim: int) -> np.ndarray:
 
 
 def describe_value(value: Any) -> str:
-    """Say what a value is, in a few words."""
+    """Describe a value in a few words, for messages."""
     if value is None:
         return "nothing"
     if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""Write TOML: scenes that a study varies, instrument files that a fit calibrated."""
+"""Write TOML: scenes of a study, instrument files with a fitted geometry."""
 
 import json
 import os
@@ -10,17 +10,17 @@ from helio_jax.formats.safe import atomic_path
 from helio_jax.instrument import Instrument
 from helio_jax.reconstruction import Reconstruction
 
-_MOST = 30.0
+_MAX_ANGLE_STD = 30.0
 """Largest uncertainty of an angle that an instrument file may state [deg]."""
 _COMMENT = """# Instrument file: the geometry that helio reconstruct fitted to {name}, for other scans of this
-# instrument. [uncertainty] is what that fit left open, the largest of all detectors. How far the sample stands below
-# the plate is a matter of the scene (plate.sample_distance_um); there it was {distance:.1f} um.
+# instrument. [uncertainty] holds the posterior standard deviations, the largest of all detectors. The sample distance
+# belongs to the scene (plate.sample_distance_um); in the fit it was {distance:.1f} um.
 
 """
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
-    """Return a tree of JSON-compatible values as TOML: one line per value below each top table; None is left out."""
+    """Format a tree of JSON-compatible values as TOML, one line per value below each top table; None is omitted."""
     values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None}
     lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items()]
     for name, table in tables.items():
@@ -45,29 +45,29 @@ def _key(key: str) -> str:
 
 def _not_fitted(path: str | os.PathLike) -> SceneError:
     return SceneError(
-        f"{path}: no directions of detectors are fitted: use refine, on a stack whose instrument file says how "
-        "uncertain they are (polar_deg, azimuth_deg in the table [uncertainty])"
+        f"{path}: no directions of detectors are fitted: use refine, on a stack whose instrument file states their "
+        "uncertainty (polar_deg, azimuth_deg in the table [uncertainty])"
     )
 
 
 def check_uncertain(instrument: Instrument, path: str | os.PathLike) -> None:
-    """Refuse, before the work, a file of a fitted instrument of which nothing would be fitted.
+    """Check, before a fit, that the fit will determine the geometry to be written.
 
     Raises:
-        SceneError: the directions of the detectors are known.
+        SceneError: the instrument states no uncertainty of the detectors' directions.
     """
     if not instrument.uncertainty.polar_deg and not instrument.uncertainty.azimuth_deg:
         raise _not_fitted(path)
 
 
 def write_instrument(rec: Reconstruction, path: str | os.PathLike) -> None:
-    """Write the instrument that a fit found as an instrument file, which scenes may extend and `helio import` takes.
+    """Write the fitted instrument as an instrument file, for scenes (`extends`) and `helio import`.
 
-    The distance of the sample is left to the scene. The uncertainties are the posterior deviations of polar angles and
-    azimuths, the largest of all detectors (those of the file that the fit started from where it did not fit them).
+    The sample distance is omitted, it belongs to the scene. The uncertainties of polar angles and azimuths are their
+    posterior standard deviations, the largest of all detectors; angles that were not fitted keep their prior.
 
     Raises:
-        SceneError: nothing of the geometry was fitted.
+        SceneError: no direction of a detector was fitted.
     """
     found = rec.provenance.get("instrument", {}).get("values", {})
     if not any(name.startswith(("polar ", "azimuth ")) for name in found):
@@ -77,7 +77,7 @@ def write_instrument(rec: Reconstruction, path: str | os.PathLike) -> None:
     for kind in ("polar", "azimuth"):
         of_kind = [std for name, (_, std, *_) in found.items() if name.startswith(f"{kind} ")]
         if of_kind:
-            tables["uncertainty"][f"{kind}_deg"] = min(max(of_kind), _MOST)
+            tables["uncertainty"][f"{kind}_deg"] = min(max(of_kind), _MAX_ANGLE_STD)
     distance = rec.instrument.sample_distance
     name = str(rec.provenance.get("stack", {}).get("source", {}).get("file", "a scan"))
     with atomic_path(path) as part:

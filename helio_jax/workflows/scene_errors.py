@@ -1,7 +1,4 @@
-"""Turn pydantic's validation errors into sentences: where, which value, which limit, what to do.
-
-Used by config.py for scene and instrument files. Knows the settings models only through their fields.
-"""
+"""Format pydantic's validation errors of scene and instrument files: key, value, limit, remedy."""
 
 import difflib
 import re
@@ -17,23 +14,23 @@ _SIGNS["less_than_equal"] = ("<=", "le")
 _KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "string": "a text in quotes"}
 _KINDS |= {"tuple": "a list in brackets", "model": "a table", "finite": "a finite number", "dict": "a table"}
 MAX_SHOWN = 50
-"""Errors listed at most."""
+"""Largest number of errors listed."""
 
 
 def explain_errors(source: str, error: ValidationError, model: type[BaseModel], data: Mapping[str, Any]) -> str:
-    """Return one message that lists every error.
+    """Format one message that lists all errors.
 
     Args:
         source: name of the file.
-        error: what validating `data` raised.
-        model: the model that was validated.
-        data: what was validated.
+        error: raised by validating `data`.
+        model: the validated model.
+        data: the validated tables.
     """
     lines = []
     for item in error.errors(include_url=False):
         loc = _without_tags(item["loc"], data)
         if item["type"] in ("too_short", "too_long") and not _has_wrong_length(item):
-            continue  # pydantic repeats a list whose items are wrong as too short
+            continue  # pydantic reports a list with invalid items as too short, too
         lines += _explain(item, loc, model, data)
     n = len(lines)
     shown = lines[:MAX_SHOWN] + ([f"... and {n - MAX_SHOWN} more"] if n > MAX_SHOWN else [])
@@ -41,7 +38,7 @@ def explain_errors(source: str, error: ValidationError, model: type[BaseModel], 
 
 
 def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the sentences for one error of pydantic's list."""
+    """Yield the messages for one error of pydantic's list."""
     where, kind, context, value = _path(loc), item["type"], item.get("ctx", {}), item["input"]
     parent, field = _find(model, loc, data)
     key = next((part for part in reversed(loc) if isinstance(part, str)), "")
@@ -100,7 +97,7 @@ def _without_tags(loc: tuple, data: Mapping[str, Any]) -> tuple:
 
 
 def _child(node: Any, part: str | int) -> Any:
-    """Return what lies at `part` of a table or list, or None."""
+    """Return the value at `part` of a table or list, or None."""
     if isinstance(node, Mapping):
         return node.get(part)
     if isinstance(node, (list, tuple)) and isinstance(part, int) and part < len(node):
@@ -111,11 +108,11 @@ def _child(node: Any, part: str | int) -> Any:
 def _find(
     model: type[BaseModel], loc: tuple, data: Mapping[str, Any]
 ) -> tuple[type[BaseModel] | None, FieldInfo | None]:
-    """Return the model that holds the key at `loc`, and the key's field (None: unknown)."""
+    """Find the model that holds the key at `loc`, and the key's field (None: unknown)."""
     parent: type[BaseModel] | None = model
     field: FieldInfo | None = None
     node: Any = data
-    is_name = False  # whether the last part was a name of the user's own, as in material.NAME
+    is_name = False  # whether the last part was a user-defined name, as in material.NAME
     for i, part in enumerate(loc):
         node = _child(node, part)
         if isinstance(part, int):
@@ -133,14 +130,14 @@ def _find(
 
 
 def _at(data: Any, loc: tuple) -> Any:
-    """Return what lies at a path."""
+    """Return the value at a path."""
     for part in loc:
         data = _child(data, part)
     return data
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models inside an annotation (tuples, unions, Annotated)."""
+    """Find the models inside an annotation (tuples, unions, Annotated)."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for arg in get_args(annotation) for m in _models(arg)]
@@ -155,12 +152,12 @@ def _choose(models: list[type[BaseModel]], kind: Any) -> type[BaseModel] | None:
 
 
 def _tags(field: FieldInfo | None) -> list[str]:
-    """Return the kinds that a union knows."""
+    """List the kinds of a union."""
     return [] if field is None else [repr(m.model_fields["kind"].default) for m in _models(field.annotation)]
 
 
 def _has_wrong_length(item: Any) -> bool:
-    """Whether the input itself, not its valid part, has too few or too many entries."""
+    """Whether the complete input, not only its valid part, has too few or too many entries."""
     context, value = item.get("ctx", {}), item["input"]
     if not hasattr(value, "__len__"):
         return True
@@ -168,7 +165,7 @@ def _has_wrong_length(item: Any) -> bool:
 
 
 def _remedy(field: FieldInfo | None, unit: str) -> str:
-    """Say which values a field allows."""
+    """Format the range that a field allows."""
     limits: dict[str, Any] = {}
     for part in () if field is None else (*field.metadata, *_nested_metadata(field.annotation)):
         for node in (part, *getattr(part, "metadata", ())):
@@ -186,13 +183,13 @@ def _nested_metadata(annotation: Any) -> Iterator[Any]:
 
 
 def _path(loc: tuple) -> str:
-    """Write a path as `detector[1].axes_um`."""
+    """Format a path as `detector[1].axes_um`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
     return text.removeprefix(".")
 
 
 def _show(value: Any) -> str:
-    """Show a value, shortened."""
+    """Format a value, shortened."""
     text = repr(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -202,5 +199,5 @@ def _number(value: Any) -> str:
 
 
 def _first_sentence(text: str) -> str:
-    """Return the start of a field's description, up to the first full stop or colon that ends a clause."""
+    """Return the first sentence or clause of a field's description."""
     return re.split(r"(?<=[.;])\s", " ".join(text.split()), maxsplit=1)[0].rstrip(".;")

@@ -1,7 +1,6 @@
-"""Scene files: TOML in, a checked `SceneFile` out, with every error reported at once.
+"""Read scene and instrument files (TOML) and validate them, with all errors reported at once.
 
-Only composes the models that live beside the code that uses them; declares no setting itself. Light: loading a
-scene imports neither JAX nor the tracer. Units: see helio_jax.settings.
+`SceneFile` composes the settings models of all stages. Loading a scene imports neither JAX nor the tracer.
 """
 
 import os
@@ -26,12 +25,12 @@ from helio_jax.workflows.scene_errors import explain_errors
 
 MAX_SCENE_MB = 1.0
 """Largest scene file."""
-ONE_MODEL = ("plate",)
+SHARED_KEYS = ("plate",)
 """Tables whose kinds share their keys."""
 
 
 class SceneFile(Scene):
-    """Everything a scene file may say."""
+    """All tables of a scene file."""
 
     trace: TraceSettings = TraceSettings()
     noise: NoiseSettings = NoiseSettings()
@@ -42,7 +41,7 @@ class SceneFile(Scene):
         problems = super()._problems()
         if self.plate.is_mesh and self.trace.estimator != "analog":
             problems.append(
-                f"trace.estimator = {self.trace.estimator!r}: under a plate of kind 'mesh' only whole atoms are "
+                f"trace.estimator = {self.trace.estimator!r}: with a plate of kind 'mesh' only whole atoms are "
                 "counted: set trace.estimator = 'analog'"
             )
         return problems + [f"noise.{key}: {text}" for key, text in self.noise.problems(len(self.detector))]
@@ -52,13 +51,12 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
     """Read a scene file.
 
     Args:
-        path: of the TOML file. `extends = "FILE"` (relative to it) names one file whose tables lie beneath.
-        overrides: values that win over the file: nested tables, or dotted keys as in {"trace.rays": 1000}
+        path: of the TOML file. `extends = "FILE"` (relative to it) names one file whose tables it overrides.
+        overrides: values that override the file: nested tables, or dotted keys as in {"trace.rays": 1000}
             and {"sample.spheres.0.radius_um": 500.0}.
 
     Raises:
-        SceneError: missing, too large, not UTF-8, not TOML, or wrong; the message lists all errors, each with file,
-            table, value, limit and remedy.
+        SceneError: missing, too large, not UTF-8, not TOML, or invalid; the message lists all errors.
     """
     path = Path(path)
     data = {"name": path.stem[:200], **with_scan_kind(_merge(_read_extended(path), _nest(overrides or {})))}
@@ -90,10 +88,10 @@ def files_read(
 
 
 def read_reconstruction(path: Path) -> Reconstruction:
-    """Read a reconstruction, for samples that are one.
+    """Read a reconstruction for samples of kind "reconstruction".
 
     Raises:
-        InputFileError: missing, damaged, or something else.
+        InputFileError: missing, damaged, or no reconstruction.
     """
     from helio_jax.formats.hdf5 import read_height
 
@@ -116,20 +114,20 @@ def load_instrument(path: str | os.PathLike) -> Instrument:
 
 
 def resolved(scene: Scene) -> dict[str, Any]:
-    """Return all settings of a scene, defaults included, JSON-compatible; `SceneFile.model_validate` reads it back."""
+    """Return all settings of a scene, defaults included, JSON-compatible, for `SceneFile.model_validate`."""
     return scene.model_dump(mode="json")
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of a scene file, for editors and `helio schema`."""
+    """Generate the JSON schema of a scene file, for editors and `helio schema`."""
     schema = SceneFile.model_json_schema()
-    text = "Scene or instrument file, relative to this one, whose tables lie beneath this file's"
+    text = "Scene or instrument file, relative to this one, whose tables this file overrides"
     schema["properties"] = {"extends": {"type": "string", "description": text}, **schema["properties"]}
     return schema
 
 
 def _read_extended(path: Path) -> dict[str, Any]:
-    """Read a file, and beneath it the one that it extends."""
+    """Read a file and merge it over the file that it extends."""
     data = _read_toml(path)
     if "extends" not in data:
         return data
@@ -144,19 +142,19 @@ def _read_extended(path: Path) -> dict[str, Any]:
     if "extends" in base:
         raise SceneError(
             f"{path}: extends = {name!r}: that file extends {base['extends']!r} itself; only one level is allowed: "
-            "put everything needed into one of the two"
+            "merge the two files"
         )
 
-    def moved(name: str) -> str:
-        return (
-            name if Path(name).is_absolute() else Path(os.path.relpath(base_path.parent / name, path.parent)).as_posix()
-        )
+    def relative_to_scene(name: str) -> str:
+        if Path(name).is_absolute():
+            return name
+        return Path(os.path.relpath(base_path.parent / name, path.parent)).as_posix()
 
-    return _merge(with_files(base, moved), data)
+    return _merge(with_files(base, relative_to_scene), data)
 
 
 def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
-    """Return a scene's tables with the name of every file, relative to the scene, changed."""
+    """Apply `change` to all file names in a scene's tables."""
 
     def changed(node: Any) -> Any:
         if isinstance(node, list):
@@ -187,16 +185,16 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: is nested too deeply: a scene has tables of plain values") from None
 
 
-def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge tables deeply; everything else is replaced whole, and so is a table of another `kind` (but `ONE_MODEL`).
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge tables recursively; other values, and tables of another `kind` (except `SHARED_KEYS`), are replaced.
 
-    Of an array single elements are replaced where they are named by number, from 0 ({"spheres": {"0": ...}}).
+    An index from 0 selects an element of an array ({"spheres": {"0": ...}}).
     """
-    out = dict(under)
+    out = dict(base)
     for key, value in over.items():
         old = out.get(key)
         both = isinstance(old, Mapping) and isinstance(value, Mapping)
-        if both and (key in ONE_MODEL or value.get("kind", old.get("kind")) == old.get("kind")):  # type: ignore[union-attr]
+        if both and (key in SHARED_KEYS or value.get("kind", old.get("kind")) == old.get("kind")):  # type: ignore[union-attr]
             out[key] = _merge(old, value)  # type: ignore[arg-type]
         elif isinstance(old, list) and isinstance(value, Mapping) and all(_is_index(k, old) for k in value):
             out[key] = list(_merge(dict(zip(map(str, range(len(old))), old, strict=True)), value).values())
@@ -206,12 +204,12 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_index(key: str, array: list) -> bool:
-    """Whether a key is the number of an element."""
+    """Whether a key is the index of an element."""
     return key in map(str, range(len(array)))
 
 
 def _nest(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn dotted keys into nested tables."""
+    """Convert dotted keys to nested tables."""
     out: dict[str, Any] = {}
     for key, value in overrides.items():
         first, _, rest = key.partition(".")

@@ -1,4 +1,4 @@
-"""The true surface that a reconstruction is scored against: of a scene, or of another height map. Never in a fit."""
+"""The true surface for scores: of a scene, or another height map. Never used by a fit."""
 
 from pathlib import Path
 
@@ -16,31 +16,31 @@ from helio_jax.trace.run import first_hits
 from helio_jax.workflows.scene_file import SceneFile, load_scene
 
 SUBSTRATE_RATIO = 1.35
-"""Where a scene does not say: the substrate begins at this many radii of the scored region."""
+"""Default inner radius of the scored substrate, over the radius of the scored region."""
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
-    """Return the true first hit of the beam axis for every pixel of a reconstruction's raster.
-
-    Raises:
-        SceneError: the beam misses the sample in some pixel.
-    """
+    """Compute the true first hit of the beam axis for every pixel of a reconstruction's raster (see `true_surface`)."""
     return true_surface(scene, rec.raster_x, rec.raster_y)
 
 
 def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray) -> Truth:
-    """Return the same for the beam positions x [x] and y [y], um."""
+    """Compute the true first hit of the beam axis for the beam positions x [x] and y [y], um.
+
+    Raises:
+        SceneError: the beam misses the sample in some pixel.
+    """
     grid_x, grid_y = np.meshgrid(x, y)
     hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     n_missed = int(np.sum(hits.surface == MISS))
     if n_missed:
-        raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or shrink the scan")
+        raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or reduce the scan")
     height = hits.point[:, 2].reshape(grid_x.shape)
     return Truth(height, hits.normal.reshape(*grid_x.shape, 3), _region(scene, float(height.max())))
 
 
 def _region(scene: SceneFile, top: float) -> Region | None:
-    """Return the scored region of a scene's table [truth], or None where it names none."""
+    """Return the scored region of a scene's table [truth], if it defines one."""
     t = scene.truth
     if t.region_radius_um is None:
         return None
@@ -53,12 +53,12 @@ def _region(scene: SceneFile, top: float) -> Region | None:
 
 
 def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = False) -> Truth:
-    """Return the truth of a scene file, or of another reconstruction on the same raster.
+    """Load the truth from a scene file, or from another reconstruction on the same raster.
 
     Args:
         path: scene (.toml) or height map (.h5).
-        rec: what will be scored.
-        fit_center: for a scene of one sphere: fit its position first, as for measured data (DATA.md).
+        rec: reconstruction to be scored.
+        fit_center: fit the position of the scene's only sphere first, as for measured data.
 
     Raises:
         InputFileError: the file is missing, damaged or of another kind, or on another raster.
@@ -72,12 +72,12 @@ def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = Fals
 
 
 def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:
-    """Return the truth of a scene's sphere, moved to where it fits the reconstruction best."""
+    """Return the truth of a scene's sphere at its best-fitting position."""
     sample, region = scene.sample, _region(scene, 0.0)
     if not isinstance(sample, SpheresSample) or len(sample.spheres) != 1 or sample.is_placed or region is None:
         raise SceneError(
-            f"{path}: fitting a centre needs a scene with one sphere, which sample.scale, rotate_deg and translate_um "
-            "leave where it is, and truth.region_radius_um"
+            f"{path}: fitting a centre needs a scene with one sphere, without sample.scale, rotate_deg and "
+            "translate_um, and with truth.region_radius_um"
         )
     grid_x, grid_y = np.meshgrid(rec.raster_x, rec.raster_y)
     (_, _, z, radius), shift = sample.sphere_array[0], rec.instrument.beam_shift

@@ -88,11 +88,11 @@ def test_command_and_refusals(tmp_path, stacks):
     result = CliRunner().invoke(app, ["export", str(tmp_path / "a.h5"), "-o", str(tmp_path / "a.mat")])
     assert result.exit_code == 0 and (tmp_path / "a.mat").stat().st_size > 500, result.output
     stack, scene = stacks["expected"], load_scene(SCENE, SMALL)
-    with pytest.raises(SceneError, match=r"cannot be written as '.x3p': there is .mat for micrographs"):
+    with pytest.raises(SceneError, match=r"cannot be written as '.x3p': known is .mat for micrographs"):
         export(stack, tmp_path / "a.x3p")
     with pytest.raises(SceneError, match="are expectations, its counts have noise"):
         export(record(scene, stack), tmp_path / "a.mat")
-    with pytest.raises(SceneError, match="single and multiple scattering apart"):
+    with pytest.raises(SceneError, match="single and multiple scattering separately"):
         export(stack.replace(by_order=None), tmp_path / "a.mat")
     both = MicrographSet((stack, stacks["analog"]))
     with pytest.raises(SceneError, match=r"give --view 0 to 1$"):

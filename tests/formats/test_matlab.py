@@ -398,5 +398,5 @@ def test_ashem_needs_one_detector(import_tree):
 def test_named_instrument_files_exist():
     """Catches an error message that recommends a file which is not shipped."""
     root = Path(__file__).resolve().parents[2]
-    for name in matlab._WANTED_INSTRUMENT.values():
+    for name in matlab._EXAMPLE_INSTRUMENT.values():
         assert (root / name).is_file(), name
