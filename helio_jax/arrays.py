@@ -43,6 +43,14 @@ def as_float_array(name: str, value: Any, shape: tuple[int | None, ...], error: 
     return array
 
 
+def set_float_arrays(record: Any, shapes: Mapping[str, tuple[int | None, ...]], error: type[HelioError]) -> None:
+    """Convert fields of a frozen record by `as_float_array`, each to its shape; None stays None."""
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is not None:
+            object.__setattr__(record, name, as_float_array(name, value, shape, error))
+
+
 def check_axis(name: str, values: np.ndarray, error: type[HelioError]) -> None:
     """Check that a raster axis is finite, increasing and equally spaced (to 1e-6 of its pitch)."""
     if not np.all(np.isfinite(values)):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array, check_axis
+from helio_jax.arrays import check_axis, set_float_arrays
 from helio_jax.errors import InputFileError
 
 
@@ -22,9 +22,7 @@ class HeightMap:
     y: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("x", "y"):
-            axis = as_float_array(name, getattr(self, name), (None,), InputFileError)
-            check_axis(name, axis, InputFileError)
-            object.__setattr__(self, name, axis)
-        shape = (self.y.size, self.x.size)
-        object.__setattr__(self, "height", as_float_array("height", self.height, shape, InputFileError))
+        set_float_arrays(self, {"x": (None,), "y": (None,)}, InputFileError)
+        check_axis("x", self.x, InputFileError)
+        check_axis("y", self.y, InputFileError)
+        set_float_arrays(self, {"height": (self.y.size, self.x.size)}, InputFileError)

@@ -123,7 +123,7 @@ class Plate(Settings):
 
     @property
     def outline(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Middle (x, y) and half extents of a flat scattering plate, lab frame [um]."""
+        """Centre (x, y) and half extents of a flat scattering plate, lab frame [um]."""
         a, b = self.size_um if self.size_um is not None else (2.0 * (self.radius_um or 0.0),) * 2
         return self.center_um or (0.0, 0.0), (0.5 * a, 0.5 * b)
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array, check_axis
+from helio_jax.arrays import check_axis, set_float_arrays
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 
@@ -63,33 +63,23 @@ class MicrographStack:
 
     def __post_init__(self) -> None:
         error = InputFileError
-        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
-        put("x", as_float_array("x", self.x, (None,), error))
-        put("y", as_float_array("y", self.y, (None,), error))
+        set_float_arrays(self, {"x": (None,), "y": (None,)}, error)
         check_axis("x", self.x, error)
         check_axis("y", self.y, error)
         shape = (len(self.instrument.detector), self.y.size, self.x.size)
-        put("counts", as_float_array("counts", self.counts, shape, error))
-        for name in ("variance", "effuse", "plate", "masked"):
-            if getattr(self, name) is not None:
-                put(name, as_float_array(name, getattr(self, name), shape, error))
-        if self.shadowed is not None:
-            put("shadowed", as_float_array("shadowed", self.shadowed, shape[1:], error))
-        if self.positions is not None:
-            put("positions", as_float_array("positions", self.positions, (self.x.size, 2), error))
-            if self.y.size != 1 or not np.all(np.isfinite(self.positions)):
-                raise error(f"positions must be finite and belong to images of one row, got {self.y.size} rows")
-        if self.by_order is not None:
-            put("by_order", as_float_array("by_order", self.by_order, (None, *shape), error))
-        if self.background is not None:
-            ndim = np.ndim(self.background)
-            put("background", as_float_array("background", self.background, shape if ndim == 3 else shape[:1], error))
+        others = {"shadowed": shape[1:], "positions": (self.x.size, 2), "by_order": (None, *shape)}
+        is_background_image = self.background is not None and np.ndim(self.background) == 3
+        others["background"] = shape if is_background_image else shape[:1]
+        images = dict.fromkeys(("counts", "variance", "effuse", "plate", "masked"), shape)
+        set_float_arrays(self, images | others, error)
+        if self.positions is not None and (self.y.size != 1 or not np.all(np.isfinite(self.positions))):
+            raise error(f"positions must be finite and belong to images of one row, got {self.y.size} rows")
         observed = np.isfinite(self.counts)
         if self.is_observed is not None:
             if np.shape(self.is_observed) != shape:
                 raise error(f"is_observed must have the shape of counts {shape}, got {np.shape(self.is_observed)}")
             observed &= np.asarray(self.is_observed, bool)
-        put("is_observed", observed)
+        object.__setattr__(self, "is_observed", observed)
         if self.variance is not None and not np.all(self.variance[observed] >= 0):
             raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array, check_axis, pitch
+from helio_jax.arrays import check_axis, pitch, set_float_arrays
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 
@@ -65,11 +65,9 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         error = InputFileError
-        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
-        for name in ("raster_x", "raster_y"):
-            axis = as_float_array(name, getattr(self, name), (None,), error)
-            check_axis(name, axis, error)
-            put(name, axis)
+        set_float_arrays(self, {"raster_x": (None,), "raster_y": (None,)}, error)
+        check_axis("raster_x", self.raster_x, error)
+        check_axis("raster_y", self.raster_y, error)
         shape = (self.raster_y.size, self.raster_x.size)
         n_detectors = len(self.instrument.detector)
         shapes: dict[str, tuple[int | None, ...]] = {
@@ -82,14 +80,12 @@ class Reconstruction:
             "gain": (n_detectors,),
             "offset": (n_detectors,),
         }
-        for name, expected in shapes.items():
-            if getattr(self, name) is not None:
-                put(name, as_float_array(name, getattr(self, name), expected, error))
+        set_float_arrays(self, shapes, error)
         for name, kind in (("is_valid", bool), ("reason", np.uint8)):
             value = np.asarray(getattr(self, name))
             if value.shape != shape:
                 raise error(f"{name} must have the shape {shape} of the raster, got {value.shape}")
-            put(name, value.astype(kind))
+            object.__setattr__(self, name, value.astype(kind))
         if self.reason.max(initial=0) >= len(REASONS):
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
 

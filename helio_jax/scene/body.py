@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from helio_jax.arrays import as_float_array
+from helio_jax.arrays import set_float_arrays
 from helio_jax.errors import SceneError
 
 COSINE = "cosine"
@@ -36,15 +36,13 @@ class Body:
     sphere_material: np.ndarray = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 (frozen record, once)
-        put("vertices", as_float_array("vertices", self.vertices, (None, 3), SceneError))
-        put("spheres", as_float_array("spheres", self.spheres, (None, 4), SceneError))
+        set_float_arrays(self, {"vertices": (None, 3), "spheres": (None, 4)}, SceneError)
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
             raise SceneError(f"faces must be integers of the shape any x 3, got {faces.dtype} {faces.shape}")
         if faces.size and (faces.min() < 0 or faces.max() >= len(self.vertices)):
             raise SceneError(f"faces must index the {len(self.vertices)} vertices, got {faces.min()} to {faces.max()}")
-        put("faces", faces.astype(np.int64))
+        object.__setattr__(self, "faces", faces.astype(np.int64))
         for name in ("vertices", "spheres"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise SceneError(f"{name} must be finite, got NaN or infinity: check the sample's file and settings")
@@ -55,7 +53,7 @@ class Body:
             index = np.zeros(n, np.int64) if given is None else np.asarray(given, np.int64)
             if index.shape != (n,) or (n and not 0 <= index.min() <= index.max() < len(self.materials)):
                 raise SceneError(f"{name} must be {n} indices of the {len(self.materials)} materials, got {index!r}")
-            put(name, index)
+            object.__setattr__(self, name, index)
 
     def with_material(self, face: str, sphere: Sequence[str] = ()) -> "Body":
         """Return the body with one material on all faces, and one per sphere (default: that of the faces)."""

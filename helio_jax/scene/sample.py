@@ -57,11 +57,7 @@ class MeshSample(MaterialSample):
         return (self.material, *self.materials.values())
 
     def build_shape(self, base_dir: Path = Path()) -> Body:
-        """Read and check the mesh, in the file's unit.
-
-        Raises:
-            InputFileError: the file is missing, too large, unreadable, empty or non-finite.
-        """
+        """Read and check the mesh, in the file's unit (errors as `load_mesh`)."""
         laws = self.file_laws(base_dir)
         own = tuple(law.name for law in laws.values())
         vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials), own)
@@ -93,11 +89,7 @@ class MeshSample(MaterialSample):
         ]
 
     def build(self, base_dir: Path = Path()) -> Body:
-        """Read, check and place the mesh, and add the substrate.
-
-        Raises:
-            InputFileError: as `build_shape`; the mesh has an implausible size.
-        """
+        """Read, check and place the mesh, and add the substrate (errors as `load_mesh`, or an implausible size)."""
         mesh = self.place_body(self.build_shape(base_dir), UNITS_UM[self.unit])
         extent, (low, high) = float(np.ptp(mesh.triangles.reshape(-1, 3), axis=0).max()), MESH_EXTENT_UM
         if not low <= extent <= high:

@@ -113,9 +113,9 @@ class Raster(Scan):
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
         stretch = 1.0 / math.cos(math.radians(beam.incidence_deg)) if self.pitch == "beam" else 1.0
-        is_along_x = beam.azimuth_deg % 180 == 0
-        step_x = self.pixel_size_um * (stretch if is_along_x else 1.0)
-        step_y = self.pixel_size_um * (1.0 if is_along_x else stretch)
+        step_x, step_y = self.pixel_size_um * stretch, self.pixel_size_um
+        if beam.azimuth_deg % 180 != 0:
+            step_x, step_y = step_y, step_x
         x = self.center_um[0] + (np.arange(self.nx) - 0.5 * (self.nx - 1)) * step_x
         y = self.center_um[1] + (np.arange(self.ny) - 0.5 * (self.ny - 1)) * step_y
         return x, y

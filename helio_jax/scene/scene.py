@@ -159,11 +159,7 @@ class Scene(Instrument):
 
     @property
     def used_materials(self) -> dict[str, Law]:
-        """Scattering laws of the materials that sample and plate use, by name, except the default one.
-
-        Raises:
-            InputFileError: a file of the sample that defines laws (.mtl) is missing or wrong.
-        """
+        """Scattering laws of the materials that sample and plate use, by name, except the default one."""
         return {name: law for name, (law, _) in self._used_laws().items()}
 
     def read_laws(self) -> dict[str, tuple[Term, ...]]:
@@ -184,19 +180,11 @@ class Scene(Instrument):
         return out
 
     def read_rays(self) -> np.ndarray | None:
-        """Read position [um], unit direction and weight of the beam's rays [n, 7]; None: no file of rays.
-
-        Raises:
-            InputFileError: the file of the rays is missing or wrong.
-        """
+        """Read the beam's rays (see `scene.rays`); None: no file of rays."""
         return None if self.beam.file is None else read_rays(self.base_dir / self.beam.file)
 
     def read_plate(self) -> Body | None:
-        """Read the plate's mesh (see `scene.plates`); None: a flat plate.
-
-        Raises:
-            InputFileError: the file is missing or wrong, or lacks a part that a detector names.
-        """
+        """Read the plate's mesh (see `scene.plates`); None: a flat plate."""
         return read_plate(self.plate, self.detector, self.base_dir) if self.plate.is_mesh else None
 
     def warnings(self) -> list[str]:

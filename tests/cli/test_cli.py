@@ -99,7 +99,7 @@ def test_exit_codes(args, code, words, finished, tmp_path):
 
 
 def test_wrong_scene_lists_all_errors(tmp_path, small_scene):
-    """Two errors in one file are both told, with place and limit."""
+    """Two errors in one file are both reported, with key and limit."""
     bad = tmp_path / "bad.toml"
     bad.write_text(
         small_scene.read_text().replace("nx = 31", "nx = -4").replace("radius_um = 1000.0", "radius_um = 0.0")
@@ -199,7 +199,7 @@ def test_help_is_fast():
 
 
 def test_calibrate_says_what_it_found(finished, tmp_path):
-    """A scan told as measured is calibrated into a file with a picture and priors; a simulated one is refused.
+    """A measured scan is calibrated into a file with a picture and priors; a simulated one is refused.
 
     Catches priors that do not reach the file, and a second calibration of the same counts.
     """

@@ -138,7 +138,7 @@ def test_scene_without_a_name_and_lists(tmp_path):
 
 
 def test_validate_knows_the_border_of_a_tilted_flat(tmp_path):
-    """The outer border of a turned flat is open by design, no leak. Catches the bounding box of the turned flat."""
+    """The outer border of a tilted substrate is open by design. Catches the bounding box of the tilted substrate."""
     scene = tmp_path / "tilted.toml"
     scene.write_text(SCENE.format(scan="nx = 3\nny = 3\npixel_size_um = 10.0", rotate="rotate_deg = [3.0, 5.0, 20.0]"))
     found = CliRunner().invoke(app, ["validate", str(scene)])

@@ -26,9 +26,9 @@ def stacks():
 
 
 def test_says_what_is_left_out(tmp_path, stacks):
-    """Plate bounces, effusive counts and single orders have no place in that layout, which is told, not dropped.
+    """Plate bounces, effusive counts and single orders have no field in that layout, which is reported.
 
-    Catches an export that is silent about it, and one that tells it of stacks which have none.
+    Catches an export without that report, and a report on stacks without such data.
     """
     stack = stacks["expected"]
     more = stack.replace(effuse=0.1 * stack.counts, plate=0.2 * stack.counts)
@@ -83,7 +83,7 @@ def test_file_of_the_reference_is_written_as_it_was(tmp_path, shared, bshem):
 
 
 def test_command_and_refusals(tmp_path, stacks):
-    """`helio export` by suffix; what cannot be written says why and what can. Catches noise exported as if single."""
+    """`helio export` by suffix; errors name reason and known formats. Catches noise exported as single scattering."""
     write(stacks["analog"], tmp_path / "a.h5")
     result = CliRunner().invoke(app, ["export", str(tmp_path / "a.h5"), "-o", str(tmp_path / "a.mat")])
     assert result.exit_code == 0 and (tmp_path / "a.mat").stat().st_size > 500, result.output

@@ -1,4 +1,4 @@
-"""Import of MATLAB files: what is where, in which unit and which way round (DATA.md).
+"""Import of MATLAB files: contents, units and orientation.
 
 Orientation is tested on the physics in the pictures (apex, form factors, overlay of rotated scans), so that a
 flip in the reader cannot be matched by the same flip in the test.
@@ -126,7 +126,7 @@ def make_reference_tree(**param) -> dict:
 
 
 def form_factors(instrument: Instrument, height: float) -> np.ndarray:
-    """Phi of every aperture from the spot at `height` [detector, 3], by the contour integral (DESIGN.md section 2)."""
+    """Phi of every aperture from the spot at `height` [detector, 3], by the contour integral."""
     x, y, z = instrument.spot_position(height)
     out = []
     for aperture in instrument.apertures():
@@ -300,10 +300,10 @@ def test_bshem_faults_are_named(changes, channels, match, import_tree):
 
 
 def test_bshem_shows_the_same_side_as_the_reference(bshem_scan, reference):
-    """Catches each of the other 7 ways to turn the pictures, and swapped detectors.
+    """Catches each of the other 7 orientations of the pictures, and swapped detectors.
 
     Sphere A measured and simulated, correlation over 3 x 3 mm with the shift left free, mean of the detectors: 0.84 as
-    imported; the best other one has 0.67. (A mirror image with detectors 2 and 3 swapped cannot be told apart.)
+    imported; the best other one has 0.67. (A mirror image with detectors 2 and 3 swapped is indistinguishable.)
     """
     grid = np.arange(-1500.0, 1501.0, 30.0)
     mask = np.ones((grid.size, grid.size), bool)
@@ -329,7 +329,7 @@ def test_bshem_real_scan(bshem_scan):
     np.testing.assert_allclose(bshem_scan.x, (np.arange(121) - 60) * 30.0)
     np.testing.assert_allclose(bshem_scan.y, (np.arange(121) - 60) * 30.0)
     assert (bshem_scan.dwell, bshem_scan.fast_axis) == (1.0, "y")
-    # DATA.md: noise per pixel of channels 4, 3, 2 is 111, 88, 107
+    # noise per pixel of channels 4, 3, 2 is 111, 88, 107
     np.testing.assert_allclose(bshem_scan.std_error[:, 0, 0], [111, 88, 107], rtol=0.06)
 
 

@@ -39,12 +39,12 @@ def make_instrument(azimuth=0.0) -> Instrument:
 
 
 def turned(vector: tuple[float, float]) -> tuple[float, float]:
-    """Turn by +90 degrees about z, counter-clockwise seen from above."""
+    """Rotate by +90 degrees about z, counter-clockwise seen from above."""
     return -vector[1], vector[0]
 
 
 def bump_scene(is_turned: bool = False, **changes) -> Scene:
-    """A spherical cap at +x, +y on an oblong raster; sample, beam, detectors and raster turned together on request."""
+    """A spherical cap at +x, +y on an oblong raster; sample, beam, detectors and raster rotate together on request."""
     ellipses = [((2309.0, 0.0), 0.0), ((-1155.0, -2000.0), 60.0), ((-1155.0, 2000.0), -40.0)]
     turn = turned if is_turned else lambda vector: vector
     angle = 90.0 if is_turned else 0.0
@@ -101,7 +101,7 @@ def _parts(annotation) -> list[type[BaseModel]]:
     return [kind for part in getattr(annotation, "__args__", ()) for kind in _parts(part)]
 
 
-# Lengths are micrometres, angles radians, numbers float64. User units appear only in names that say so.
+# Lengths are micrometres, angles radians, numbers float64. Names with a suffix (`_deg`, `_nm`) hold other units.
 
 
 def test_micrometres_radians_float64(bump):
@@ -133,7 +133,7 @@ def test_settings_names_carry_their_unit():
     assert n_checked > 25
 
 
-# Images are [detector, y, x]; x grows with the column, y with the row; pictures are drawn origin lower.
+# Images are [detector, y, x]; x increases with the column, y with the row; pictures have their origin lower left.
 
 
 def test_bump_at_plus_x_plus_y_appears_there(bump, bump_height):
@@ -182,7 +182,7 @@ def test_a_slope_that_faces_a_detector_is_bright(bump, detector):
 
 
 def test_masks_lie_behind_the_sphere():
-    """A hemisphere hides an aperture from the flat on the side away from that aperture.
+    """A hemisphere masks an aperture from the substrate on the side away from that aperture.
 
     Catches: a mask drawn towards the detector, mirrored, or in another order of the detectors.
     """
@@ -200,12 +200,12 @@ def test_masks_lie_behind_the_sphere():
 
 
 # Pixel (i, j) has beam position (x[j], y[i]), where the beam axis meets z = 0; its surface point lies at
-# (x - h tan t, y, h): height goes up, towards the plate.
+# (x - h tan t, y, h): height increases upwards, towards the plate.
 
 
 @pytest.mark.parametrize("distance", [4000.0, 4720.0])
 def test_beam_position_is_on_the_reference_plane(distance):
-    """On a flat sample the first hit of the axis is (x[j], y[i], 0), at any sample distance.
+    """On the bare substrate the first hit of the axis is (x[j], y[i], 0), at any sample distance.
 
     Catches: positions taken on the plane at the design working distance, or on the plate.
     """
@@ -302,7 +302,7 @@ def test_reconstructed_normals_lean_downhill(bump, bump_height):
         assert np.polyfit(offset, lean, 1)[0] == pytest.approx(1 / 400.0, rel=0.3)
 
 
-# Masks say what True means: is_observed, is_valid.
+# The name of a mask states the meaning of True: is_observed, is_valid.
 
 
 def test_masks_say_what_true_means(bump):
@@ -336,11 +336,11 @@ def test_two_images_do_where_the_albedo_is_known(bump):
     assert np.abs(rec.height - full.height)[4:7, 15].max() < 3.0 * rec.height_std[4:7, 15].max()
 
 
-# Scattering orders: index 0 is single scattering (order 1); the last index holds that order and above.
+# Scattering orders: index 0 is single scattering (order 1); the last index holds its order and all above.
 
 
 def test_orders_start_at_single_and_end_with_the_rest(bump):
-    """A flat has single scattering only, which is index 0; with fewer orders the last index is the sum of the rest.
+    """A substrate has single scattering only, index 0; with fewer orders the last index is the sum of the rest.
 
     Catches: index = order, a last order that drops what lies above, multiple scattering counted into index 0.
     """
@@ -383,7 +383,7 @@ def test_detectors_permute_with_their_images(bump, bump_height):
 
 
 def test_turning_everything_turns_the_image(bump, bump_height):
-    """Sample, beam, detectors and raster turned by +90 degrees together give the turned images and heights.
+    """Sample, beam, detectors and raster rotated by +90 degrees together give the rotated images and heights.
 
     (x, y) -> (-y, x), so image'[i, j] = image[ny - 1 - j, i] = rot90(image, -1) (drawn origin lower, it turns
     counter-clockwise). Catches: x and y treated differently, a rotation or azimuth of the wrong sign.
@@ -393,7 +393,7 @@ def test_turning_everything_turns_the_image(bump, bump_height):
     assert other.by_order[0].shape == (3, 31, 21)
     differs = lambda image: np.quantile(np.abs(other.by_order[0] / image - 1.0), 0.98)  # noqa: E731
     assert differs(wanted) < 1e-4
-    # wrong models: turned the other way, mirrored
+    # wrong models: rotated the other way, mirrored
     assert differs(np.rot90(bump.by_order[0], 1, axes=(1, 2))) > 0.05 and differs(wanted[:, :, ::-1]) > 0.05
     height = hx.reconstruct(other, method="nearfield").height
     assert height == pytest.approx(np.rot90(bump_height.height, -1), abs=3.0)
@@ -419,7 +419,7 @@ def test_beam_pitch_is_stretched_along_the_beam():
 
 
 def test_ellipse_turns_counter_clockwise():
-    """The long axis of an ellipse turned by +30 deg points to +x, +y seen from above; catches the opposite sense."""
+    """The long axis of an ellipse rotated by +30 deg points to +x, +y seen from above; catches the opposite sense."""
     plate = Plate(working_distance_um=4000.0)
     detector = Detector(name="d", center_um=(0.0, 0.0), axes_um=(2000.0, 500.0), rotation_deg=30.0)
     rim = Instrument(plate=plate, detector=(detector,)).apertures()[0].rim(64)[0]

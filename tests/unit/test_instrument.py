@@ -115,7 +115,7 @@ def test_detector_refuses_mixtures(keys):
 
 @pytest.mark.parametrize("sample_distance", [4000.0, 4720.0])
 def test_directions_are_those_of_the_form_factor(sample_distance):
-    """From the spot on the reference plane to a small aperture: the form factor's direction, to its size squared.
+    """From the spot on the substrate to a small aperture: the form factor's direction, to its size squared.
 
     Catches directions from the origin, which the beam meets at the working distance only.
     """

@@ -22,7 +22,7 @@ FOUND = {
 
 
 def fitted(bshem, values) -> Reconstruction:
-    """A flat whose fit moved the apertures by `AIM` and the sample by 55 um."""
+    """A substrate whose fit moved the apertures by `AIM` and the sample by 55 um."""
     instrument = bshem.model_copy(update={"uncertainty": SURE}).moved(AIM, 55.0)
     provenance = {"instrument": {"values": values}, "stack": {"source": {"file": "scan\n[plate].mat"}}}
     flat, x = np.zeros((2, 3)), np.arange(3.0)

@@ -85,7 +85,7 @@ def told(folder, text: str) -> str:
     ],
 )
 def test_bad_materials(tmp_path, text, expected):
-    """Each mistake is told with its path, value, limit and remedy; catches tracebacks and union tags in paths."""
+    """Each error names path, value, limit and remedy; catches tracebacks and union tags in paths."""
     assert expected in told(tmp_path, text)
 
 
@@ -104,7 +104,7 @@ def test_groups_of_a_mesh(tmp_path):
 
 
 def test_geometries_of_a_glb(tmp_path):
-    """Geometries of a GLB are told apart by name and stay where their scene puts them; catches lost transforms."""
+    """Geometries of a GLB are identified by name and keep their places in the scene; catches lost transforms."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -209,7 +209,7 @@ def test_laws_of_an_mtl_file(tmp_path):
     ],
 )
 def test_bad_mtl(tmp_path, text, expected):
-    """Each mistake is told with file, line and remedy; catches keys that are skipped as if they were optical ones."""
+    """Each error names file, line and remedy; catches keys that are ignored as if they were optical ones."""
     (tmp_path / "cad").mkdir()
     (tmp_path / "cad" / "parts.mtl").write_text(text)
     with pytest.raises(InputFileError) as error:
@@ -256,7 +256,7 @@ def test_material_without_law_is_refused(bshem):
 
 
 def test_upright_lattice_is_refused(tmp_path, bshem):
-    """A lattice in space that stands upright on a face has no reciprocal there; one that turns with the face does."""
+    """A lattice perpendicular to a face has no reciprocal there; one that rotates with the face does."""
     from helio_jax.scene.scattering import DiffractionLaw
     from helio_jax.scene.shapes import StepSample
 

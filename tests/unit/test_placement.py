@@ -1,4 +1,4 @@
-"""Where samples stand: one mechanism for all kinds, a distance by the top of the sample, a reconstruction as sample."""
+"""Placement of samples: one mechanism for all kinds, a distance by the sample's top, a reconstruction as sample."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def z_scores(a, b):
 
 @pytest.mark.parametrize("sample", [CAP, STEP])
 def test_any_sample_is_scaled_turned_and_moved(tmp_path, sample):
-    """Triangles and exact spheres alike: scaled about the origin, then turned about x, y, z, then moved.
+    """Triangles and exact spheres alike: scaled about the origin, then rotated about x, y, z, then shifted.
 
     Catches a radius that is not scaled, spheres left behind, and another order (translation first).
     """
@@ -93,7 +93,7 @@ def test_place_does_not_matter(tmp_path):
 def test_top_at_working_distance(tmp_path):
     """The plate's distance is the working distance plus the sample's top, and so said in the scene; same bits.
 
-    Catches the top put at the substrate's place, a scale or turn that is not heeded, and a contradiction let through.
+    Catches the top placed at the substrate's height, an ignored scale or rotation, and an accepted contradiction.
     """
     place = 'place = "top-at-working-distance"\n'
     by_top = scene_of(tmp_path, CAP + place)
@@ -111,7 +111,7 @@ def test_top_at_working_distance(tmp_path):
 
 
 def test_scan_beside_a_moved_flat_is_refused(tmp_path):
-    """The flat moves with its sample. Catches a scan checked against where the flat was."""
+    """The substrate moves with its sample. Catches a scan checked against the unshifted substrate."""
     with pytest.raises(SceneError, match="wholly beside the sample"):
         scene_of(tmp_path, CAP + "translate_um = [20000.0, 0.0, 0.0]\n")
 

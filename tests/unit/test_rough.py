@@ -77,7 +77,7 @@ def test_surfaces_have_their_spectrum():
 
 
 def test_seeds_and_geometry():
-    """One seed, one surface; the sheet has no hole, its heights are those drawn, a patch stands in a flat at z = 0.
+    """One seed, one surface; the sheet has no hole, its heights are those drawn, a patch lies in the substrate z = 0.
 
     Catches a seed that is ignored, a patch of another size or resolution, and a leak at its border.
     """
@@ -106,7 +106,7 @@ def test_seeds_and_geometry():
     ],
 )
 def test_impossible_surfaces_are_refused(change, message):
-    """What cannot be built says so with limit and remedy. Catches a surface that is silently coarser than asked for."""
+    """Errors name limit and remedy. Catches a surface that is silently coarser than requested."""
     with pytest.raises(ValidationError, match=message):
         RoughSample.model_validate(PLAIN | change)
 

@@ -131,7 +131,7 @@ def test_directions_of_step_trench_pyramid():
 
 
 def test_moat_dimensions():
-    """The moat's wall is a vertical cylinder at rim radius + width, its floor flat at -depth, its wall faces inwards.
+    """The moat's wall is a vertical cylinder at rim radius + width, its floor level at -depth, its wall faces inwards.
 
     Catches: width measured from the sphere's equator, wall facing the solid, a polygon that is too coarse.
     """
@@ -148,12 +148,12 @@ def test_moat_dimensions():
     assert np.all(np.sum(body.normals[wall, :2] * middle[wall, :2], axis=1) < -0.99 * outer)
     assert outer - np.hypot(middle[wall, 0], middle[wall, 1]).min() < 3e-6 * outer  # the sagitta it promises
     pits = 0.5 * WALL_SEGMENTS * math.sin(2 * math.pi / WALL_SEGMENTS) * np.array([outer**2, 90.0**2])
-    # the second sphere rests on the flat: its rim radius is 0
+    # the second sphere rests on the substrate: its rim radius is 0
     assert volume_above(body, 0.0) == pytest.approx(-pits @ [100.0, 20.0], rel=1e-9)
 
 
 def cast_at_spheres(x, y, spheres, shift):
-    """March one beam ray downwards: distance along the unit ray to spheres and flat, by the textbook quadratic."""
+    """Trace one beam ray: distance along the unit ray to spheres and substrate, by the textbook quadratic."""
     u = np.array([shift[0], shift[1], -1.0])
     u /= np.linalg.norm(u)
     start = np.array([x, y, 0.0]) - 1e5 * u
@@ -169,7 +169,7 @@ def cast_at_spheres(x, y, spheres, shift):
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (TAN30, 0.0), (-0.3, 0.8)])
 def test_first_hits_match_brute_force(shift):
-    """First hits of beam rays on two spheres and the flat agree with a ray caster that knows no beam frame.
+    """First hits of beam rays on two spheres and the substrate agree with a ray caster without a beam frame.
 
     Catches: the far root, a shift of the wrong sign, spheres not ordered along the beam, normals not at the hit.
     """
@@ -203,7 +203,7 @@ def test_apex_of_sphere_a():
 def test_surface_body_has_no_leak(level):
     """A beam-frame grid with jumps (points running backwards in x) and a skirt is one sheet, open only outside.
 
-    Catches: gaps at the seam or the corners, flipped skirt, area counted twice, curtain seen by the beam.
+    Catches: gaps at the seam or the corners, flipped substrate, area counted twice, a sheet that the beam hits.
     """
     X, Y = np.meshgrid(np.arange(-60.0, 61.0, 10.0), np.arange(-40.0, 41.0, 10.0))
     z = np.where((np.abs(X) < 25) & (np.abs(Y) < 20), 60.0, 0.0)
@@ -284,7 +284,7 @@ def test_bad_height_maps(tmp_path, name, content, message):
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
 def test_mesh_is_scaled_turned_moved(tmp_path, suffix):
-    """A box of 1 x 2 x 3 mm, turned by 90 deg about x, then z, then moved, has the bounds worked out by hand.
+    """A box of 1 x 2 x 3 mm, rotated by 90 deg about x, then z, then shifted, has the bounds computed by hand.
 
     Catches: rotations in another order or sense, translation before rotation, a unit applied twice.
     """
@@ -302,9 +302,9 @@ def test_mesh_is_scaled_turned_moved(tmp_path, suffix):
     [((90, 0, 0), (0, 0, 10)), ((0, 0, 90), (-10, 0, 0)), ((90, 90, 0), (10, 0, 0)), ((0, 90, 90), (-10, 0, 0))],
 )
 def test_mesh_rotation_sense_and_order(tmp_path, angles, where):
-    """The corner at +y goes where right-handed turns about the fixed x, then y, then z axis take it.
+    """The corner at +y is moved by right-handed rotations about the fixed x, then y, then z axis.
 
-    Catches: clockwise rotation, the order z, y, x, axes that turn along.
+    Catches: clockwise rotation, the order z, y, x, axes that rotate with the sample.
     """
     trimesh.Trimesh([[0, 0, 0], [3, 0, 0], [0, 10, 0]], [[0, 1, 2]]).export(tmp_path / "t.stl")
     body = MeshSample(file="t.stl", unit="um", rotate_deg=angles).build(tmp_path)
@@ -313,7 +313,7 @@ def test_mesh_rotation_sense_and_order(tmp_path, angles, where):
 
 
 def test_mesh_on_flat_has_no_coincident_face(tmp_path):
-    """A box that rests on an added flat loses its bottom. Catches: two coincident faces at z = 0."""
+    """A box on an added substrate loses its bottom. Catches: two coincident faces at z = 0."""
     trimesh.creation.box((100.0, 100.0, 100.0)).export(tmp_path / "box.stl")
     body = MeshSample(file="box.stl", unit="um", translate_um=(0, 0, 50), flat_size_um=400.0).build(tmp_path)
     assert len(body.faces) == 10 + 2

@@ -70,7 +70,7 @@ def test_instrument_of_a_scene_keeps_its_uncertainty(tmp_path):
 
 
 def test_sphere_a_is_the_reference():
-    """Raster, pose and apertures of the reference simulation (DATA.md). Catches: any of its numbers mistyped."""
+    """Raster, pose and apertures of the reference simulation. Catches: any of its numbers mistyped."""
     scene = load_scene(SCENES / "sphere_a_full.toml")
     x, y = scene.positions()
     np.testing.assert_allclose(x, (np.arange(304) - 151.5) * 10 / np.cos(np.pi / 6), rtol=1e-12)
@@ -163,7 +163,7 @@ SPHERES = {"kind": "spheres", "spheres": [{"radius_um": 100.0}]}
     ],
 )
 def test_error_messages(tmp_path, overrides, expected):
-    """Each mistake is told with its path, value, limit and remedy. Catches: pydantic's wording, union tags in paths."""
+    """Each error names path, value, limit and remedy. Catches: pydantic's wording, union tags in paths."""
     told = message(write(tmp_path, MINIMAL), overrides)
     assert expected in told
     assert "pydantic" not in told and "Input should" not in told and "1 error:" in told
@@ -251,7 +251,7 @@ def test_mesh_paths_start_at_the_scene_file(tmp_path):
 
 
 def test_warnings_of_validate(tmp_path):
-    """Apertures over the pinhole or over each other and a raster beyond the flat are allowed but told.
+    """Apertures over the pinhole or over each other and a raster beyond the substrate give warnings.
 
     Catches: silence, and a check that mistakes an enclosed aperture for a separate one.
     """
