@@ -266,7 +266,7 @@ def test_what_is_refused(tmp_path):
         ({"plate.unit": None}, 'a plate of kind "mesh" needs unit'),
         ({"plate.kind": "transparent"}, 'a transparent plate has no file: set kind = "mesh"'),
         ({"detector.0.height_um": 3.0}, "not by a mixture"),
-        ({"scan.rotations_deg": [0.0, 9.0], "scan.rotate": "detectors"}, "turn the sample the other way"),
+        ({"scan.rotations_deg": [0.0, 9.0], "scan.rotate": "detectors"}, "rotate the sample the other way"),
         ({"detector": [{"name": "a", "part": "a"}], "plate": {"kind": "x"}}, "must be one of"),
     ):
         with pytest.raises(SceneError) as error:
