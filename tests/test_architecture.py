@@ -41,14 +41,14 @@ DOORS = {
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
     "manifold3d": {"scene/drill.py"},
+    "matplotlib": {"figures/canvas.py"},
+    "plotly": {"figures/interactive.py"},
     "platformdirs": {"workflows/compilation_cache.py"},
     "numba": {"kernel.py", "trace/random.py"},
 }
 FOLDERS = {
     "jax": {"forward", "inverse", "workflows/doctor.py"},
     "equinox": {"forward", "inverse"},
-    "matplotlib": {"figures"},
-    "plotly": {"figures"},
     "llvmlite": {"trace"},
     "typer": {"commands"},
 }
@@ -166,6 +166,8 @@ def test_imports_and_size(path):
         ("scores/metrics.py", "import h5py"),
         ("measure/facets.py", "import plotly.graph_objects as go"),
         ("inverse/linear.py", "def f():\n    from matplotlib import pyplot"),
+        ("figures/panel.py", "def f():\n    from matplotlib.figure import Figure"),
+        ("figures/report.py", "import plotly.graph_objects as go"),
         ("inverse/linear.py", "import optimistix"),
         ("inverse/linear.py", "from numba import njit"),
         ("trace/run.py", "import embreex"),

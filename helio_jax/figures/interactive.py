@@ -1,7 +1,7 @@
-"""Interactive figures of the report: maps, surface, profiles, as plotly JSON. The door to plotly.
+"""Interactive figures of the report: maps, surface, profiles, as plotly JSON. The only module that imports plotly.
 
-Maps are in the beam frame; surface and profiles at the points' own positions with jumps left open, as in figures.py.
-Colours of text, grid and background are left to the page (report.py). Reads no files and computes no scores.
+Maps are in the beam frame; surface and profiles at the points' own positions with gaps at jumps, as in `panel`. The
+page (`report`) sets the colours of text, grid and background. Reads no files and computes no scores.
 """
 
 import html
@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.figures.panel import (
+from helio_jax.figures.plot_data import (
     REASON_COLORS,
     apex_pixel,
     multiple_fraction,
     observed_counts,
     profile_band,
     profile_line,
+    profile_place,
     residual_rms,
     robust_range,
     surface_cells,
@@ -29,14 +30,14 @@ from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.scores.metrics import Truth, height_error
 
 MAX_MAP_VALUES = 1_300_000
-"""All maps together; above it they are thinned (keeps the page under 15 MB with plotly.js)."""
+"""Values of all maps together; larger maps are thinned (keeps the page under 15 MB with plotly.js)."""
 MAX_SURFACE_POINTS = 24_000
-"""Points of the 3-D surface; above it the raster is thinned."""
+"""Points of the 3-D surface; a larger raster is thinned."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """One section of the report: a title, a sentence, and figures (plotly's `data` and `layout`)."""
+    """One section of the report: title, note, and figures (plotly's `data` and `layout`)."""
 
     title: str
     note: str
@@ -66,12 +67,12 @@ def _stack_groups(stack: MicrographStack, step: int) -> list[Group]:
     if multiple is not None:
         pairs = zip(names, multiple, strict=True)
         maps = [_map(stack.x, stack.y, m, step, name, "of counts", "Magma") for name, m in pairs]
-        groups.append(Group("Multiple scattering", "Fraction of counts from more than one scattering.", maps))
+        groups.append(Group("Multiple scattering", "Fraction of counts scattered more than once.", maps))
     return groups
 
 
 def report_groups(stack: MicrographStack | None, rec: Reconstruction, truth: Truth | None) -> list[Group]:
-    """Return all interactive figures of a report, in reading order.
+    """Make all interactive figures of a report, in reading order.
 
     Raises:
         InputFileError, GuardError: the truth does not fit the reconstruction (see `height_error`).
@@ -88,7 +89,7 @@ def report_groups(stack: MicrographStack | None, rec: Reconstruction, truth: Tru
         maps.append(_map(x, y, rec.height_std, step, "standard deviation", "um", "Magma"))
     groups.append(Group("Height", "In the beam frame: one pixel per beam position.", maps))
     surface = _surface(rec.replace(height=height))
-    groups.append(Group("Surface", "True to scale, turn it with the mouse; gaps are not seen by the beam.", [surface]))
+    groups.append(Group("Surface", "True to scale; drag to rotate; gaps are not seen by the beam.", [surface]))
     profiles = [_profile(rec, truth, level, along) for along in ("x", "y")]
     groups.append(Group("Profiles", "Through the apex, at the surface points' own positions.", profiles))
     maps = [_validity(rec, step)]
@@ -107,14 +108,14 @@ def report_groups(stack: MicrographStack | None, rec: Reconstruction, truth: Tru
 
 
 def _compact(image: np.ndarray) -> np.ndarray:
-    """Return an image in the smallest type that keeps it: whole numbers below 65536 as uint16, others float32."""
+    """Convert an image to the smallest exact type: whole numbers below 65536 to uint16, others to float32."""
     if np.all(np.isfinite(image)) and np.all(image == np.round(image)) and image.min() >= 0 and image.max() < 65536:
         return image.astype(np.uint16)
     return image.astype(np.float32)
 
 
 def _layout(title: str, **more: Any) -> dict[str, Any]:
-    """Return what all figures share; colours of text and lines are set on the page."""
+    """Return the layout that all figures share; the page sets the colours of text and lines."""
     return {
         "template": "none",
         "title": {"text": html.escape(title), "font": {"size": 14}, "x": 0.02},
@@ -133,7 +134,7 @@ def _map(
     colors: str = "Viridis",
     limits: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
-    """Return one image over its beam positions; missing pixels stay empty."""
+    """Draw one image over its beam positions; missing pixels stay empty."""
     low, high = limits or robust_range(image)
     scale = {"Greys_r": [[0, "#000000"], [1, "#ffffff"]]}.get(colors, colors)
     unit = unit.replace("um", "µm")
@@ -150,15 +151,15 @@ def _map(
         "colorbar": {"title": {"text": unit, "side": "right"}, "thickness": 12, "outlinewidth": 0},
     }
     axes = {
-        "xaxis": {"title": {"text": "beam position X (µm)"}, "constrain": "domain", "showgrid": False},
-        "yaxis": {"title": {"text": "beam position Y (µm)", "standoff": 6}, "scaleanchor": "x", "constrain": "domain"},
+        "xaxis": {"title": {"text": "beam position X (µm)"}},
+        "yaxis": {"title": {"text": "beam position Y (µm)", "standoff": 6}, "scaleanchor": "x"},
     }
-    axes["yaxis"]["showgrid"] = False
+    axes = {name: {**axis, "constrain": "domain", "showgrid": False} for name, axis in axes.items()}
     return {"data": [trace], "layout": _layout(title, **axes)}
 
 
 def _validity(rec: Reconstruction, step: int) -> dict[str, Any]:
-    """Return the map of reasons, one colour each, named in the colour bar."""
+    """Draw the map of reasons, one colour each, named in the colour bar."""
     n = len(REASONS)
     figure = _map(rec.raster_x, rec.raster_y, rec.reason.astype(float), step, "validity", "")
     trace = figure["data"][0]
@@ -174,7 +175,7 @@ def _validity(rec: Reconstruction, step: int) -> dict[str, Any]:
 
 
 def _surface(rec: Reconstruction) -> dict[str, Any]:
-    """Return the surface as triangles at the points' own positions; a thinned cell with a cut in it is left out."""
+    """Draw the surface as triangles at the points' own positions; a thinned cell with a gap in it is skipped."""
     step = max(1, int(np.ceil(np.sqrt(rec.height.size / MAX_SURFACE_POINTS))))
     rows, columns = (np.arange(0, n, step) for n in rec.height.shape)
     corner = (rows[:, None], columns[None, :])
@@ -215,8 +216,8 @@ def _surface(rec: Reconstruction) -> dict[str, Any]:
 
 
 def _profile(rec: Reconstruction, truth: Truth | None, level: float, along: str) -> dict[str, Any]:
-    """Return the heights along one raster line through the apex: truth, reconstruction and its error band."""
-    row, column = pixel = apex_pixel(rec.height if truth is None else truth.height)
+    """Draw the heights along one raster line through the apex: truth, reconstruction and its error band."""
+    pixel = apex_pixel(rec.height if truth is None else truth.height)
     height = rec.height - level
 
     def line(height: np.ndarray, name: str, color: str, width: float) -> dict[str, Any]:
@@ -232,7 +233,9 @@ def _profile(rec: Reconstruction, truth: Truth | None, level: float, along: str)
         style = {"type": "scatter", "mode": "lines", "fill": "toself", "fillcolor": "rgba(68,119,170,0.35)"}
         traces.append({**style, **band, "line": {"width": 0}, "name": "± 1 std", "hoverinfo": "skip"})
     traces.append(line(height, "reconstruction", "#4b8fd0", 1.8))
-    at = f"Y = {rec.raster_y[row]:.0f}" if along == "x" else f"X = {rec.raster_x[column]:.0f}"
     axes = {"xaxis": {"title": {"text": f"{along} (µm)"}}, "yaxis": {"title": {"text": "height (µm)"}}}
     legend = {"x": 0.01, "y": 0.99, "bgcolor": "rgba(0,0,0,0)"}
-    return {"data": traces, "layout": _layout(f"along {along}, {at} µm", **axes, legend=legend)}
+    return {
+        "data": traces,
+        "layout": _layout(f"along {along}, {profile_place(rec, along, pixel)}", **axes, legend=legend),
+    }

@@ -1,48 +1,47 @@
-"""A window to pick control points: the scans side by side, one click per point and scan. The door to pyplot.
+"""Window to pick control points: the scans side by side, one click per point and scan.
 
-Left click: the present point in that scan (again: moves it). n, p: next, previous point. d: delete the present point
-in the scan under the mouse. Wheel: zoom about the mouse. Closing the window ends the picking.
+Left click: place or move the current point in that scan. n, p: next, previous point. d: delete the current point in
+the scan under the mouse. Wheel: zoom about the mouse. Closing the window ends the picking.
 """
 
 from collections.abc import Callable
 from typing import Any
 
-from helio_jax.errors import MissingDependencyError
-from helio_jax.figures.panel import raster_style
+from helio_jax.figures.canvas import COUNT_MAP, draw_image, open_window, show_window
 from helio_jax.micrograph import MicrographSet
 
 Picks = dict[str, dict[str, tuple[float, float]]]
 _ZOOM = 1.25
-_COLOR, _PRESENT = "#33bbee", "#ee3377"
+_COLOR, _CURRENT = "#33bbee", "#ee3377"
 
 
 class Picker:
-    """The picks, and what clicks and keys do to them; knows no window."""
+    """The picks, and the actions of clicks and keys on them; independent of the window."""
 
     def __init__(self, views: list[str], picks: Picks) -> None:
-        """Go on with the picks given."""
+        """Start from given picks."""
         self.picks: Picks = {view: dict(picks.get(view, {})) for view in views}
         names = {point for named in self.picks.values() for point in named}
         self.points = sorted(names) or ["P1"]
-        self.present = self.points[0]
+        self.current = self.points[0]
 
     def put(self, view: str, x: float, y: float) -> None:
-        """Pick the present point in a view [um]."""
-        self.picks[view][self.present] = (x, y)
+        """Place the current point in a view [um]."""
+        self.picks[view][self.current] = (x, y)
 
     def delete(self, view: str) -> None:
-        """Remove the present point from a view."""
-        self.picks[view].pop(self.present, None)
+        """Remove the current point from a view."""
+        self.picks[view].pop(self.current, None)
 
     def step(self, by: int) -> None:
         """Go to the next or previous point; beyond the last one a new point begins."""
-        at = self.points.index(self.present) + by
+        at = self.points.index(self.current) + by
         if at >= len(self.points):
             number = len(self.points) + 1
             while f"P{number}" in self.points:
                 number += 1
             self.points.append(f"P{number}")
-        self.present = self.points[max(at, 0)]
+        self.current = self.points[max(at, 0)]
 
 
 def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None]) -> Picks:
@@ -51,20 +50,11 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
     Raises:
         MissingDependencyError: no window can be opened here.
     """
-    import matplotlib
-    from matplotlib import pyplot
-
-    if matplotlib.get_backend().lower() in ("agg", "pdf", "svg", "ps", "cairo", "template"):
-        raise MissingDependencyError(
-            f"picking points needs a window, but matplotlib has only the backend {matplotlib.get_backend()!r} here: "
-            "run it on a machine with a display and a GUI toolkit (pip install PyQt6), or write the CSV by hand: "
-            "view,point,x_um,y_um"
-        )
+    figure, axes = open_window(len(scans.stacks), 4.5 * len(scans.stacks), 5)
     picker = Picker([s.name for s in scans.stacks], picks)
-    figure, axes = pyplot.subplots(1, len(scans.stacks), squeeze=False, figsize=(4.5 * len(scans.stacks), 5))
     view_of = {}
-    for ax, stack in zip(axes[0], scans.stacks, strict=True):
-        ax.imshow(stack.counts[0], cmap="gray", **raster_style(stack.x, stack.y))
+    for ax, stack in zip(axes, scans.stacks, strict=True):
+        draw_image(ax, stack.x, stack.y, stack.counts[0], COUNT_MAP)
         view_of[ax] = stack.name
     marks: list[Any] = []
 
@@ -75,10 +65,10 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
         for ax, view in view_of.items():
             ax.set_title(view, fontsize=8)
             for point, (x, y) in picker.picks[view].items():
-                color = _PRESENT if point == picker.present else _COLOR
+                color = _CURRENT if point == picker.current else _COLOR
                 marks.extend(ax.plot(x, y, "+", color=color, ms=12, mew=1.5))
                 marks.append(ax.annotate(point, (x, y), (4, 4), textcoords="offset points", color=color, fontsize=8))
-        figure.suptitle(f"point {picker.present}: click it in each scan; n/p next/previous, d delete, wheel zoom")
+        figure.suptitle(f"point {picker.current}: click it in each scan; n/p next/previous, d delete, wheel zoom")
         figure.canvas.draw_idle()
 
     def changed() -> None:
@@ -109,5 +99,5 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
     for name, handler in (("button_press", on_click), ("key_press", on_key), ("scroll", on_wheel)):
         figure.canvas.mpl_connect(f"{name}_event", handler)  # type: ignore[call-overload,arg-type]
     draw()
-    pyplot.show()
+    show_window()
     return picker.picks

@@ -1,14 +1,13 @@
 """One self-contained HTML report of a reconstruction: numbers, interactive maps, 3-D surface, provenance.
 
-The page holds plotly.js once and every figure (interactive.py) as JSON, so it opens offline and loads nothing; figures
-are drawn when scrolled to, in the colours of the reader's light or dark scheme. All text that comes from files is
-escaped. Computes no scores.
+The page holds plotly.js once and every figure (`interactive`) as JSON, so it opens offline and loads nothing. Figures
+are drawn when scrolled to, in the colours of the reader's light or dark scheme. All text from files is escaped.
+Computes no scores.
 """
 
 import base64
 import html
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.figures.interactive import figure_json, plotly_script, report_groups
+from helio_jax.formats.safe import atomic_path
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import SCORE_ROWS, Scores, Truth, format_score
@@ -31,12 +31,12 @@ CITATION = (
 
 @dataclass(frozen=True)
 class Reference:
-    """A published number to print beside ours.
+    """A published number to print beside a score.
 
     Attributes:
-        score: name of the field of `Scores` it stands beside.
-        value: in that field's own unit (a fraction, um or rad).
-        label: where it is from, e.g. "paper".
+        score: field of `Scores`.
+        value: in that field's unit (a fraction, um or rad).
+        label: its source, e.g. "paper".
     """
 
     score: str
@@ -62,21 +62,21 @@ def write_report(
     """Write the report as one HTML file, atomically.
 
     Args:
-        path: the file to write.
-        stack: the micrographs, any number of detectors, or None.
+        path: of the file to write.
+        stack: micrographs, or None.
         rec: the reconstruction.
         truth: true heights on the same raster, for the error map and the profiles.
         scores: from `evaluate_height`.
-        panel_png: the printed panel, as bytes or as a file to embed.
+        panel_png: the printed panel to embed, as bytes or as a file.
         title: heading of the page.
-        references: published numbers to print beside ours.
+        references: published numbers to print beside the scores.
 
     Returns:
         The path.
 
     Raises:
-        InputFileError: the truth has another raster, or the panel cannot be read or is no PNG.
-        SceneError: the file's suffix is not that of HTML.
+        InputFileError: the truth has another raster, or the panel cannot be read or is not a PNG.
+        SceneError: the suffix is not .html, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
@@ -97,12 +97,8 @@ def write_report(
         data=data.replace("<", "\\u003c"),
         script=_SCRIPT,
     )
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with atomic_path(path) as part:
         part.write_text(page, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
     return path
 
 
@@ -118,13 +114,12 @@ def _read_png(panel: bytes | str | Path) -> str:
 
 
 def _headline(stack: MicrographStack | None, rec: Reconstruction) -> str:
-    """Return one paragraph: what was measured and how the reconstruction ended."""
+    """Return one paragraph: scan, instrument, method, and the status of the reconstruction."""
     rows, columns = rec.height.shape
-    beam = rec.instrument.beam
     facts = [
         f"{columns} x {rows} pixels",
         f"{len(rec.instrument.detector)} detectors",
-        f"incidence {beam.incidence_deg:g}°",
+        f"incidence {rec.instrument.beam.incidence_deg:g}°",
         f"method {rec.method}",
     ]
     if stack is not None:
@@ -134,7 +129,7 @@ def _headline(stack: MicrographStack | None, rec: Reconstruction) -> str:
 
 
 def _score_table(rec: Reconstruction, scores: Scores | None, references: Sequence[Reference]) -> str:
-    """Return the numbers as a table, published marks beside; without scores, the share of valid pixels."""
+    """Return the scores as a table beside published numbers; without scores, the fraction of valid pixels."""
     labels = list(dict.fromkeys(r.label for r in references))
     marks = {(r.score, r.label): format_score(r.score, r.value) for r in references}
     head = "".join(f"<th>{html.escape(text)}</th>" for text in ("", "this work", *labels, ""))
@@ -153,7 +148,7 @@ def _score_table(rec: Reconstruction, scores: Scores | None, references: Sequenc
 
 
 def _provenance(stack: MicrographStack | None, rec: Reconstruction, scores: Scores | None) -> str:
-    """Return where everything came from, folded."""
+    """Return the provenance of all inputs, folded."""
     parts: dict[str, Any] = {"reconstruction": dict(rec.provenance)}
     for name in ("gain", "offset"):
         value = getattr(rec, name)
@@ -174,7 +169,7 @@ def _provenance(stack: MicrographStack | None, rec: Reconstruction, scores: Scor
 def _sections(
     stack: MicrographStack | None, rec: Reconstruction, truth: Truth | None
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the HTML of all figure sections, and the figures' JSON by the id of their place."""
+    """Return the HTML of all figure sections, and the figures' JSON by the id of their element."""
     out: list[str] = []
     figures: dict[str, str] = {}
     for group in report_groups(stack, rec, truth):

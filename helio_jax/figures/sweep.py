@@ -1,28 +1,26 @@
-"""The plot of a study: a score against every value that was varied."""
+"""Figure of a study: a score against every varied setting."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from helio_jax.figures.panel import save_figure
+from helio_jax.figures.canvas import new_figure, save_figure
 
 
 def save_sweep(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], score: str, title: str, path: Path) -> None:
-    """Save one panel per varied value as a PNG; values that are no numbers are numbered in their order.
+    """Save one plot per varied setting as a PNG; values that are not numbers are numbered in their order.
 
     Args:
-        rows: one per point; those without the score are left out.
-        keys: columns that were varied.
-        score: column that is drawn upwards.
+        rows: one per point; rows without the score are skipped.
+        keys: varied columns.
+        score: column on the vertical axis.
         title: of the figure.
         path: of the PNG.
     """
-    from matplotlib.figure import Figure
-
     known = [row for row in rows if isinstance(row.get(score), (int, float))]
     if not known:
         return
-    fig = Figure(figsize=(4.0 * len(keys), 3.5), layout="constrained")
+    fig = new_figure(4.0 * len(keys), 3.5)
     axes = fig.subplots(1, len(keys), squeeze=False)[0]
     for ax, key in zip(axes, keys, strict=True):
         values = [row[key] for row in known]

@@ -8,9 +8,9 @@ import numpy as np
 
 from helio_jax.arrays import as_json
 from helio_jax.errors import SceneError
+from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.cracks import crack_panel
 from helio_jax.figures.overlay import facet_map
-from helio_jax.figures.panel import save_figure
 from helio_jax.figures.ripple import ripple_panel
 from helio_jax.measure.crack_text import crack_lines, wall_lines
 from helio_jax.measure.cracks import CrackSettings, find_cracks
@@ -140,7 +140,7 @@ def measure_height_map(
             found["vertical_edges"] = walls.as_dict()
             lines += wall_lines(walls)
         if figure:
-            save_figure(crack_panel(rec, where, stack, cracks, walls), figure)
+            save_figure(crack_panel(rec, np.any(where, axis=0), stack, cracks, walls), figure)
     return as_json(found), lines
 
 

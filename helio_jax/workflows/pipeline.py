@@ -14,7 +14,8 @@ from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.calibration.noise import add_noise
 from helio_jax.errors import InputFileError, ResumeError, SceneError
 from helio_jax.figures.before_after import save_before_after
-from helio_jax.figures.panel import panel, save_figure
+from helio_jax.figures.canvas import save_figure
+from helio_jax.figures.panel import panel
 from helio_jax.figures.report import write_report
 from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts

@@ -270,7 +270,7 @@ def test_picker_keeps_points():
     picker = Picker(["a", "b"], {"a": {"P1": (1.0, 2.0)}})
     picker.step(1)
     picker.put("b", 3.0, 4.0)
-    assert picker.present == "P2" and picker.picks == {"a": {"P1": (1.0, 2.0)}, "b": {"P2": (3.0, 4.0)}}
+    assert picker.current == "P2" and picker.picks == {"a": {"P1": (1.0, 2.0)}, "b": {"P2": (3.0, 4.0)}}
     picker.step(-1)
     picker.delete("a")
     assert picker.picks == {"a": {}, "b": {"P2": (3.0, 4.0)}}

@@ -1,4 +1,4 @@
-"""Figures: drawn without a display, in the right place, for one to six detectors and for missing data."""
+"""Figures: drawn without a display, with the right orientation, for one to six detectors and for missing data."""
 
 import sys
 
@@ -7,7 +7,9 @@ import pytest
 from sphere_case import CAP, TAN, make_case
 
 from helio_jax.errors import SceneError
-from helio_jax.figures import panel as figures
+from helio_jax.figures import plot_data
+from helio_jax.figures.canvas import figure_png, save_figure
+from helio_jax.figures.panel import micrograph_panel, panel
 from helio_jax.reconstruction import REASONS
 from helio_jax.scores.metrics import evaluate_height
 
@@ -33,7 +35,7 @@ def test_panel_shows_all_and_the_numbers(case):
     stack, rec, truth = case
     rec = rec.replace(height=0.9 * truth.height, height_std=np.full_like(rec.height, 4.0))
     scores = evaluate_height(rec, truth)
-    fig = figures.panel(stack, rec, truth, scores)
+    fig = panel(stack, rec, truth, scores)
     for start in (
         "Micrograph D3",
         "Height",
@@ -46,7 +48,7 @@ def test_panel_shows_all_and_the_numbers(case):
         assert any(t.startswith(start) for t in titles(fig)), start
     text = {t.get_text() for ax in fig.axes for t in ax.texts}
     assert {f"{100 * scores.recovered_height:.1f}", f"{100 * scores.rms_region:.2f}", "refine"} <= text
-    assert figures.figure_png(fig, dpi=40).startswith(PNG)
+    assert figure_png(fig, dpi=40).startswith(PNG)
     pyplot = sys.modules.get("matplotlib.pyplot")
     assert pyplot is None or not pyplot.get_fignums()
 
@@ -55,7 +57,7 @@ def test_boxes_do_not_overlap(case):
     """Catches: labels, colour bars or legends of neighbouring maps drawn over each other or outside the page."""
     stack, rec, truth = case
     rec = rec.replace(height_std=np.full_like(rec.height, 4.0))
-    fig = figures.panel(stack, rec, truth, evaluate_height(rec, truth))
+    fig = panel(stack, rec, truth, evaluate_height(rec, truth))
     fig.canvas.draw()
     boxes = [ax.get_tightbbox() for ax in fig.axes]
     page = fig.bbox
@@ -71,7 +73,7 @@ def test_maps_have_orientation_and_scale(case):
     stack, _, _ = case
     counts = np.ones(stack.shape)
     counts[0, -3, -7] = 9.0
-    image = image_of(figures.micrograph_panel(stack.replace(counts=counts)), "Micrograph D1")
+    image = image_of(micrograph_panel(stack.replace(counts=counts)), "Micrograph D1")
     assert image.origin == "lower" and image.axes.get_aspect() == 1.0
     x0, x1, y0, y1 = image.get_extent()
     row, column = np.unravel_index(np.argmax(image.get_array()), counts.shape[1:])
@@ -88,19 +90,19 @@ def test_any_number_of_detectors(n_detectors):
     is_observed = np.ones(stack.shape, bool)
     is_observed[0, :2] = False
     stack = stack.replace(is_observed=is_observed, masked=None, shadowed=None)
-    fig = figures.panel(stack, rec.replace(height=height, residuals=None))
+    fig = panel(stack, rec.replace(height=height, residuals=None))
     assert sum(t.startswith("Micrograph") for t in titles(fig)) == n_detectors
     assert image_of(fig, "Micrograph D1").get_array().mask[:2].all()
-    assert figures.figure_png(fig, dpi=30).startswith(PNG)
-    fig = figures.micrograph_panel(stack)
+    assert figure_png(fig, dpi=30).startswith(PNG)
+    fig = micrograph_panel(stack)
     assert sum(t.startswith("Multiple") for t in titles(fig)) == n_detectors
-    assert figures.figure_png(fig, dpi=30).startswith(PNG)
+    assert figure_png(fig, dpi=30).startswith(PNG)
 
 
 def test_error_colours_are_symmetric(case):
     """Catches: a diverging map whose white is not zero."""
     stack, rec, truth = case
-    image = image_of(figures.panel(stack, rec.replace(height=0.9 * truth.height), truth), "Height error")
+    image = image_of(panel(stack, rec.replace(height=0.9 * truth.height), truth), "Height error")
     low, high = image.get_clim()
     assert low == -high < 0
 
@@ -109,7 +111,7 @@ def test_surface_is_cut_at_the_shadow_only(case):
     """The sphere's shadow gap, from x = R sin(60 deg) = 866 um at h = 220 um down the ray to x = 993 um, is cut; the
     flat and the top are whole. Catches: a curtain over the gap, holes elsewhere, cells off by one."""
     _, rec, _ = make_case(161, 91, pitch=20.0)
-    cut = ~figures.surface_cells(rec)
+    cut = ~plot_data.surface_cells(rec)
     assert cut.shape == (90, 160)
     x = 0.25 * (rec.x[1:, 1:] + rec.x[1:, :-1] + rec.x[:-1, 1:] + rec.x[:-1, :-1])
     r = np.hypot(x, 0.5 * (rec.raster_y[1:, None] + rec.raster_y[:-1, None]))
@@ -117,19 +119,19 @@ def test_surface_is_cut_at_the_shadow_only(case):
     assert not cut[(r < 780) | (r > 1060)].any()
     height = rec.height.copy()
     height[10, 20] = np.nan
-    hole = ~figures.surface_cells(rec.replace(height=height)) & ~cut
+    hole = ~plot_data.surface_cells(rec.replace(height=height)) & ~cut
     assert hole.sum() == 4 and hole[9:11, 19:21].all()
 
 
 def test_profile_is_at_the_points_own_positions(case):
     """The apex is drawn at x = 0, not at X = H tan t; the shadow gap is reported. Catches: raster positions."""
     _, rec, truth = make_case(161, 91, pitch=20.0)
-    pixel = figures.apex_pixel(truth.height)
-    at, height, gaps = figures.profile_line(rec, truth.height, "x", pixel)
+    pixel = plot_data.apex_pixel(truth.height)
+    at, height, gaps = plot_data.profile_line(rec, truth.height, "x", pixel)
     assert rec.raster_x[pixel[1]] == pytest.approx(CAP * TAN, abs=10.0)
     assert at[np.argmax(height)] == pytest.approx(0.0, abs=20.0)
     assert len(gaps) == 1 and 740 < at[gaps[0] - 1] < at[gaps[0]] < 1010
-    band = figures.profile_band(
+    band = plot_data.profile_band(
         rec.replace(height_std=np.full_like(height, 5.0) + 0 * truth.height), truth.height, "y", pixel
     )
     assert band[1].size == 2 * rec.raster_y.size and band[1].max() == pytest.approx(truth.height.max() + 5.0)
@@ -140,25 +142,25 @@ def test_fractions_and_residuals(case):
     stack, _, _ = case
     orders = np.stack([np.full(stack.shape, 3.0), np.full(stack.shape, 1.0)])
     orders[:, 0, 0, 0] = 0.0
-    fraction = figures.multiple_fraction(stack.replace(by_order=orders))
+    fraction = plot_data.multiple_fraction(stack.replace(by_order=orders))
     assert np.isnan(fraction[0, 0, 0]) and np.nanmax(np.abs(fraction - 0.25)) == 0.0
-    assert figures.multiple_fraction(stack.replace(by_order=None)) is None
+    assert plot_data.multiple_fraction(stack.replace(by_order=None)) is None
     residuals = np.array([3.0, np.nan, 4.0]).reshape(3, 1, 1)
-    assert figures.residual_rms(residuals) == pytest.approx(np.sqrt(12.5))
-    assert np.isnan(figures.residual_rms(np.full((3, 1, 1), np.nan))).all()
+    assert plot_data.residual_rms(residuals) == pytest.approx(np.sqrt(12.5))
+    assert np.isnan(plot_data.residual_rms(np.full((3, 1, 1), np.nan))).all()
 
 
 def test_figures_are_written_by_suffix(case, tmp_path):
     """Catches: half-written files left behind, unknown suffixes passed to matplotlib."""
     stack, _, _ = case
-    fig = figures.micrograph_panel(stack)
-    figures.save_figure(fig, tmp_path / "m.png", dpi=30)
+    fig = micrograph_panel(stack)
+    save_figure(fig, tmp_path / "m.png")
     assert (tmp_path / "m.png").read_bytes().startswith(PNG)
     with pytest.raises(SceneError, match="suffix must be one of png, pdf, svg"):
-        figures.save_figure(fig, tmp_path / "m.exe")
+        save_figure(fig, tmp_path / "m.exe")
     assert [p.name for p in tmp_path.iterdir()] == ["m.png"]
 
 
 def test_every_reason_has_a_colour_of_its_own():
     """Catches a reason added without a colour: the map then shows others in its neighbours' colours."""
-    assert len(set(figures.REASON_COLORS)) == len(REASONS)
+    assert len(set(plot_data.REASON_COLORS)) == len(REASONS)

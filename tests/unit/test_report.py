@@ -144,7 +144,7 @@ def test_refusals_and_atomic_write(tmp_path, monkeypatch):
         write_report(tmp_path / "r.html", stack, rec, panel_png=tmp_path / "none.png")
     with pytest.raises(SceneError, match="must name one of"):
         Reference("beauty", 1.0)
-    monkeypatch.setattr("helio_jax.figures.report.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr("helio_jax.formats.safe.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(SceneError, match="r.html: disk full"):
         write_report(tmp_path / "r.html", stack, rec)
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,148 @@
+"""Canvas of every figure: the only module that imports matplotlib, and only when the first figure is drawn.
+
+Uses `matplotlib.figure.Figure`: no pyplot, no display, no global state. Only the window of `pick` needs pyplot. Images
+are drawn in the beam frame: one pixel per beam position, origin lower, axes in um.
+"""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.errors import MissingDependencyError, SceneError
+from helio_jax.formats.safe import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+else:
+    Axes = Figure = Any
+
+HEIGHT_MAP, COUNT_MAP, FRACTION_MAP, ERROR_MAP = "viridis", "gray", "magma", "RdBu_r"
+_FORMATS = ("png", "pdf", "svg")
+_NO_DISPLAY = ("agg", "pdf", "svg", "ps", "cairo", "template")
+"""Backends of matplotlib that open no window."""
+
+
+def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
+    """Create an empty white figure [inch]; `layout=None` leaves the placing of axes to the caller."""
+    from matplotlib import figure
+
+    return figure.Figure(figsize=(width, height), facecolor="white", layout=layout)
+
+
+def open_window(n_columns: int, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """Create a figure with one row of axes for a window; `show_window` opens it.
+
+    Raises:
+        MissingDependencyError: no window can be opened on this machine.
+    """
+    import matplotlib
+    from matplotlib import pyplot
+
+    if matplotlib.get_backend().lower() in _NO_DISPLAY:
+        raise MissingDependencyError(
+            f"picking points needs a window, but matplotlib has only the backend {matplotlib.get_backend()!r} here: "
+            "run it on a machine with a display and a GUI toolkit (pip install PyQt6), or write the CSV by hand: "
+            "view,point,x_um,y_um"
+        )
+    figure, axes = pyplot.subplots(1, n_columns, squeeze=False, figsize=(width, height))
+    return figure, axes[0]
+
+
+def show_window() -> None:
+    """Open the window and return when it is closed."""
+    from matplotlib import pyplot
+
+    pyplot.show()
+
+
+def color_map(name: str, missing: str | None = None) -> Any:
+    """Return a colour map by name; masked pixels in the colour `missing`, or transparent."""
+    from matplotlib import colormaps
+
+    return colormaps[name] if missing is None else colormaps[name].with_extremes(bad=missing)
+
+
+def listed_colors(colors: Sequence[str]) -> Any:
+    """Return a colour map of the integers from 0."""
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(list(colors))
+
+
+def colored(values: np.ndarray, limits: tuple[float, float], name: str = HEIGHT_MAP) -> np.ndarray:
+    """Return the colours of values by a colour map [..., 3], from 0 to 1."""
+    from matplotlib.colors import Normalize
+
+    return color_map(name)(Normalize(*limits)(values))[..., :3]
+
+
+def patch(color: str, label: str, **style: Any) -> Any:
+    """Return a coloured rectangle for a legend."""
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=color, label=label, **style)
+
+
+def line(color: str, label: str) -> Any:
+    """Return a coloured line for a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=color, label=label)
+
+
+def draw_circle(ax: Axes, center: tuple[float, float], radius: float) -> None:
+    """Draw a thin white circle."""
+    from matplotlib.patches import Circle
+
+    ax.add_patch(Circle(center, radius, fill=False, color="white", lw=1.0))
+
+
+def label_axes(
+    ax: Axes, title: str, xlabel: str = "", ylabel: str = "", sizes: tuple[float, float, float] = (9, 8, 7)
+) -> None:
+    """Write title and labels of axes; `sizes` of title, labels and ticks [pt]."""
+    ax.set_title(title, fontsize=sizes[0], loc="left")
+    ax.set_xlabel(xlabel, fontsize=sizes[1])
+    ax.set_ylabel(ylabel, fontsize=sizes[1])
+    ax.tick_params(labelsize=sizes[2])
+
+
+def draw_image(
+    ax: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    image: np.ndarray,
+    cmap: Any,
+    limits: tuple[float, float] | tuple[None, None] = (None, None),
+    **style: Any,
+) -> Any:
+    """Draw an image [y, x] about its beam positions x, y [um]: unsmoothed, y upwards; return matplotlib's image."""
+    half_x, half_y = 0.5 * pitch(x), 0.5 * pitch(y)
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    style = {"origin": "lower", "interpolation": "nearest", "extent": extent, **style}
+    return ax.imshow(image, cmap=cmap, vmin=limits[0], vmax=limits[1], **style)
+
+
+def figure_png(figure: Figure, *, dpi: float = 150.0) -> bytes:
+    """Return a figure as PNG, e.g. for a notebook."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, PDF or SVG by the file's suffix, atomically.
+
+    Raises:
+        SceneError: another suffix, or the file cannot be written.
+    """
+    kind = Path(path).suffix.lower().lstrip(".")
+    if kind not in _FORMATS:
+        raise SceneError(f"{path}: a figure's suffix must be one of {', '.join(_FORMATS)}, got {kind or 'none'!r}")
+    with atomic_path(path) as part:
+        figure.savefig(part, format=kind, dpi=150.0)
