@@ -68,7 +68,7 @@ def slit_rows(sizes: list[tuple[float, float]], azimuths: list[int]) -> list[Row
             sample |= {"azimuth_deg": azimuth, "center_um": [7.0, 3.0]}
             given = {"sample": sample, "scan.nx": PIXELS, "scan.ny": PIXELS, "trace.rays": 64}
             stack = _with_noise(pipeline.simulate(load_scene(SALT, given)).only(), SEED)
-            found = find_cracks(_flat(stack), stack, [np.ones(stack.shape[1:], bool)]).cracks
+            found = find_cracks(_flat(stack), stack, np.ones(stack.shape[1:], bool)).cracks
             what = f"slit {width:.0f} x {depth:.0f} um at {azimuth} deg"
             if not found:
                 rows.append(row("slit", what, "not found", "found", False))
@@ -111,7 +111,7 @@ def salt_rows(height: Path, calibrated: Path) -> list[Row]:
     """List the cracks of the crystal's top."""
     rec, stack = read_height(height), read_stack(calibrated)
     inside = inside_polygon(parse_region(TOP), rec.raster_x, rec.raster_y)
-    found = find_cracks(rec, stack, [inside])
+    found = find_cracks(rec, stack, inside)
     density, std = (1e3 * v for v in found.density)
     rows = [row("8", "salt: cracks per area", f"{density:.2f} +- {std:.2f} mm/mm2", "picture", None)]
     for c in found.cracks:

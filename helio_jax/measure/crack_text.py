@@ -1,4 +1,4 @@
-"""Cracks and vertical edges as lines of text, and as one table with a row for each (CSV)."""
+"""Cracks and vertical edges as lines of text, and as a table with a row for each (CSV)."""
 
 import csv
 import io
@@ -9,45 +9,22 @@ from typing import Any
 from helio_jax.measure.cracks import Crack, Cracks
 from helio_jax.measure.walls import Walls
 
-COLUMNS = (
-    "what",
-    "number",
-    "kind",
-    "x0_um",
-    "y0_um",
-    "x1_um",
-    "y1_um",
-    "length_um",
-    "length_std_um",
-    "is_cut",
-    "direction_deg",
-    "width_um",
-    "width_std_um",
-    "depth_um",
-    "depth_std_um",
-    "depth_at_least_um",
-    "is_determined",
-    "score",
-    "false_alarms",
-    "note",
-)
+COLUMNS = ["what", "number", "kind", "x0_um", "y0_um", "x1_um", "y1_um", "length_um", "length_std_um", "is_cut", "direction_deg", "width_um", "width_std_um", "depth_um", "depth_std_um", "depth_at_least_um", "is_determined", "score", "false_alarms", "note"]
 """Columns of the table before those of the detectors; depth: of a groove, or height of a step."""
-
-
 _ALONG_SCAN = 5.0
-"""A crack at a smaller angle to the scan lines is told so [deg]."""
+"""Angle to the scan lines below which a crack is marked [deg]."""
 
 
 def crack_lines(found: Cracks) -> list[str]:
-    """Return a table of cracks, and what they amount to."""
+    """Format a summary and a table of cracks."""
     density, std = found.density
     total = sum(c.length_um for c in found.counted)
     lines = [
-        f"cracks: {len(found.counted)}, {total / 1e3:.2f} mm long in all, {1e3 * density:.2f} +- {1e3 * std:.2f} mm "
-        f"per mm2 of {found.area_um2 / 1e6:.2f} mm2; besides {len(found.cracks) - len(found.counted)} creases, steps "
+        f"cracks: {len(found.counted)}, total length {total / 1e3:.2f} mm, {1e3 * density:.2f} +- {1e3 * std:.2f} mm "
+        f"per mm2 of {found.area_um2 / 1e6:.2f} mm2; also {len(found.cracks) - len(found.counted)} creases, steps "
         "and other lines",
-        f"  noise alone is allowed {found.allowed:g} lines; {found.left_out} lines left out (one detector's alone, no "
-        f"concave kink); {found.n_ridges} ridges found the same way",
+        f"  allowed false alarms: {found.allowed:g} lines; {found.left_out} lines rejected (in one detector only, or "
+        f"no concave kink); {found.n_ridges} ridges detected in the same way",
         "  no kind     from (um)          to (um)       length (um)    width (um)  depth (um)     false alarms",
     ]
     for c in found.cracks:
@@ -65,16 +42,16 @@ def crack_lines(found: Cracks) -> list[str]:
         if c.is_cut:
             lines.append("     cut by the region's border: it may be longer")
         if c.along_scan_deg < _ALONG_SCAN:
-            lines.append(f"     {c.along_scan_deg:.0f} deg from the scan lines: drift within one of them looks alike")
+            lines.append(f"     {c.along_scan_deg:.0f} deg from the scan lines: may be drift within a scan line")
     return lines
 
 
 def wall_lines(found: Walls) -> list[str]:
-    """Return a table of vertical edges."""
-    sure = sum(w.is_determined for w in found.walls)
+    """Format a summary and a table of vertical edges."""
+    n_determined = sum(w.is_determined for w in found.walls)
     lines = [
-        f"vertical edges: {len(found.walls)}, the step of {sure} is determined; {found.share:.0%} of "
-        f"{int(found.marked.sum())} pixels flagged as a jump, masked or a floating rim belong to them",
+        f"vertical edges: {len(found.walls)}, {n_determined} with a determined step; {found.share:.0%} of "
+        f"{int(found.marked.sum())} pixels flagged as jump, masked or floating rim belong to them",
         "  no  from (um)          to (um)       length (um)  runs   falls (deg)  step (um)",
     ]
     for w in found.walls:
@@ -86,10 +63,10 @@ def wall_lines(found: Walls) -> list[str]:
 
 
 def table(measured: Mapping[str, Any]) -> str:
-    """Return one row for every crack and vertical edge of what `measure` found as CSV; what is not known is empty.
+    """Format a record of `measure_height_map` as CSV, one row for every crack and vertical edge; unknown: empty.
 
-    Behind `COLUMNS` every detector has two columns more, the contrast and its deviation: missing signal [um] of slits,
-    steps and lines, change of the signal over the flat's across grooves and creases.
+    After `COLUMNS` every detector has two columns, contrast and deviation: missing signal [um] of slits, steps and
+    lines, change of the signal over the substrate's across grooves and creases.
     """
     found = measured.get("cracks", {"lines": []})["lines"]
     walls = measured.get("vertical_edges", {"edges": []})["edges"]
@@ -104,21 +81,19 @@ def table(measured: Mapping[str, Any]) -> str:
 
 
 def _row(record: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """Return what a record has of the columns, its ends among them."""
+    """Take the columns and the ends from a record."""
     (x0, y0), (x1, y1) = record["start"], record["end"]
     ends = {"x0_um": x0, "y0_um": y0, "x1_um": x1, "y1_um": y1}
     return {name: record.get(name) for name in COLUMNS} | ends | more
 
 
 def _crack_row(c: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a crack's record."""
     value, std = (c["missing_um"], c["missing_std_um"]) if c["missing_um"] else (c["change"], c["change_std"])
     row = _row(c, what="crack", is_determined=c["depth_um"] is not None, note=c["depth_note"])
     return row | value | {f"{name}_std": v for name, v in std.items()}
 
 
 def _wall_row(w: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a vertical edge's record."""
     return _row(w, what="vertical edge", kind="jump", depth_um=w["step_um"], depth_std_um=w["step_std_um"])
 
 
@@ -127,16 +102,16 @@ def _place(p: tuple[float, float]) -> str:
 
 
 def _with_std(value: float, std: float, digits: int) -> str:
-    """Return "value +- std", or a dash where it is not known."""
+    """Format "value +- std", or a dash for an unknown value."""
     if not math.isfinite(value):
         return "-"
     return f"{value:.{digits}f}" + (f" +- {std:.{digits}f}" if math.isfinite(std) else "")
 
 
 def _contrast(c: Crack) -> str:
-    """Return a crack's contrast in every detector in words."""
+    """Describe a crack's contrast in every detector."""
     if c.missing_um:
         parts = (f"{n} {v:+.1f} +- {c.missing_std_um[n]:.1f}" for n, v in c.missing_um.items())
-        return f"missing signal (um of flat): {', '.join(parts)}"
+        return f"missing signal (um of substrate): {', '.join(parts)}"
     parts = (f"{n} {v:+.1%} +- {c.change_std[n]:.1%}" for n, v in c.change.items())
     return f"kink {c.kink_deg:.1f} +- {c.kink_std_deg:.1f} deg; change of signal: {', '.join(parts)}"

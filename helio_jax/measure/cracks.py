@@ -1,20 +1,19 @@
-"""Cracks: where they run, how long, wide and deep they are, with errors, and what is not known of them.
+"""Cracks of a surface: course, length, width and depth, with errors.
 
-Lines are found (`lines`) and told apart by their profiles (`crack_profiles`). A *slit* is thin, and dark in two
-detectors or more in a way that no step explains. The width of flat surface whose signal is missing needs no resolution,
-and bounds its depth from below: a floor at depth d hides at most d times the tangent of a detector's lowest direction
-across the slit, and the beam's slant as much again times its own; what scatters more often only adds. From above
-nothing bounds the depth. Slits lack less signal than they are wide, for their walls give most atoms back, and may even
-be bright in a detector that looks at the lit wall, or along them. A *groove* is open: its flanks are seen, and depth
-and width are measured in the heights. Listed, but not counted as cracks, are a *crease*, a concave kink without two
-flanks; a *step*; and a thin *line* that is none of these: perhaps a slit with lit walls, a scratch or a ridge.
+Lines are detected (`lines`) and classified by their profiles (`crack_profiles`). A *slit* is thin, and dark in two or
+more detectors in a way that no step explains. Its missing signal, given as a width of substrate, needs no resolution
+and bounds its depth from below: a floor at depth d masks at most d times the tangent of a detector's lowest direction
+across the slit, and shadows at most d times that of the beam; multiple scattering only adds signal. There is no bound
+from above. Slits lack less signal than they are wide, because their walls scatter most atoms back, and may be bright in
+a detector that faces the illuminated wall or looks along them. A *groove* is open: its flanks are visible, and depth
+and width are measured in the heights. Listed, but not counted as cracks, are a *crease* (a concave kink without two
+flanks), a *step*, and a thin *line* of neither kind: perhaps a slit with illuminated walls, a scratch or a ridge.
 
 Lengths and places are in beam positions. Sources of the formulas: own derivations, tests/unit/test_cracks.py.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,42 +21,41 @@ from scipy.spatial import cKDTree
 
 from helio_jax.arrays import as_json, line_angle_deg, pitch
 from helio_jax.errors import SceneError
-from helio_jax.measure.crack_profiles import CrackSettings, measure_line
+from helio_jax.measure.crack_profiles import measure_line
 from helio_jax.measure.line_paths import Path, trace_lines
-from helio_jax.measure.lines import ORDER, Found, contrast_of, find_lines
+from helio_jax.measure.lines import ORDER, Found, LineSettings, contrast_of, find_lines
+from helio_jax.measure.regions import check_micrographs
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 _SAME = 3.0
-"""Lines of two kinds so near to one another are one [pixels]."""
-_UM2_PER_MM2 = 1e6
+"""Distance below which lines of two kinds are the same [pixels]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Crack:
-    """One crack.
+    """One crack; NaN or empty where a quantity is not defined for its kind, or not known.
 
     Attributes:
         number: in order of significance, from 1.
         kind: "slit", "groove", "crease", "step" or "line".
-        start, end: its ends, beam positions (x, y) [um].
+        start, end: beam positions (x, y) [um].
         points: along it [n, 2], um.
         length_um, length_std_um: along it.
-        is_cut: it reaches the border of the region, and so may be longer.
+        is_cut: it reaches the border of the region, and may be longer.
         direction_deg: from end to end, from +x counter-clockwise, -90 to 90.
-        width_um, width_std_um: of the dark line if its profile resolves it (slits, steps); of a groove at half its
-            depth; else NaN.
-        width_range_um: what the width of the line is at least and at most, by two deviations (slits, steps).
-        missing_um, missing_std_um: width of flat surface whose signal is missing, by detector (slits, steps).
-        change, change_std: of the signal across the line in shares of the flat's, by detector (grooves, creases).
-        kink_deg, kink_std_deg: by how much the surface bends upward across the line, to first order (the same).
-        dark_in, bright_in: detectors in which it is so by three deviations (slits, steps).
-        depth_um, depth_std_um: of a groove, below the lower one of its shoulders; height of a step; else NaN.
-        depth_at_least_um: of a slit, with three deviations allowed; 0: no bound.
-        depth_note: what the depth is, or why it is not known.
+        width_um, width_std_um: of the dark line if its profile resolves it (slits, steps); of a groove at half depth.
+        width_range_um: limits of the width at two deviations (slits, steps, lines).
+        missing_um, missing_std_um: width of substrate whose signal is missing, by detector (slits, steps, lines).
+        change, change_std: of the signal across the line over the substrate's, by detector (grooves, creases).
+        kink_deg, kink_std_deg: upward change of the slope across the line, to first order (grooves, creases).
+        dark_in, bright_in: detectors in which it is dark or bright by two deviations (the same).
+        depth_um, depth_std_um: of a groove, below the lower of its shoulders; height of a step.
+        depth_at_least_um: lower bound for a slit, by two deviations; 0: no bound.
+        depth_note: meaning of the depth, or the reason why it is not known.
         score: largest amplitude along it over its deviation.
-        false_alarms: lines at least as significant that noise alone shows in the searched area.
-        along_scan_deg: angle to the lines of the scan; near 0, drift within a scan line looks like a crack.
+        false_alarms: mean number of lines at least as significant that noise alone shows in the searched area.
+        along_scan_deg: angle to the scan lines; near 0, drift within a scan line looks like a crack.
     """
 
     number: int
@@ -69,27 +67,27 @@ class Crack:
     length_std_um: float
     is_cut: bool
     direction_deg: float
-    width_um: float
-    width_std_um: float
-    width_range_um: tuple[float, float]
-    missing_um: dict[str, float]
-    missing_std_um: dict[str, float]
-    change: dict[str, float]
-    change_std: dict[str, float]
-    kink_deg: float
-    kink_std_deg: float
-    dark_in: tuple[str, ...]
-    bright_in: tuple[str, ...]
-    depth_um: float
-    depth_std_um: float
-    depth_at_least_um: float
+    width_um: float = math.nan
+    width_std_um: float = math.nan
+    width_range_um: tuple[float, float] = (math.nan, math.nan)
+    missing_um: dict[str, float] = field(default_factory=dict)
+    missing_std_um: dict[str, float] = field(default_factory=dict)
+    change: dict[str, float] = field(default_factory=dict)
+    change_std: dict[str, float] = field(default_factory=dict)
+    kink_deg: float = math.nan
+    kink_std_deg: float = math.nan
+    dark_in: tuple[str, ...] = ()
+    bright_in: tuple[str, ...] = ()
+    depth_um: float = math.nan
+    depth_std_um: float = math.nan
+    depth_at_least_um: float = 0.0
     depth_note: str
     score: float
     false_alarms: float
     along_scan_deg: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible record; what is not known is None."""
+        """Return a JSON-compatible record; unknown numbers are None."""
         return as_json(vars(self) | {"points": np.round(self.points, 1)})
 
 
@@ -98,12 +96,12 @@ class Cracks:
     """All cracks of some regions.
 
     Attributes:
-        cracks: the most significant first; creases among them.
-        area_um2: that was searched: five pixels beside unknown ones and the border are not.
-        n_ridges: convex kinks found in the same way: how rough the surface is.
-        left_out: lines that their profiles do not bear out, and bright ones.
+        cracks: the most significant first, creases, steps and lines included.
+        area_um2: searched area, without a margin at unknown pixels and the border.
+        n_ridges: convex kinks detected in the same way, a measure of the roughness.
+        left_out: detected lines that their profiles do not confirm.
         threshold: score that a line had to exceed, by kind.
-        allowed: false alarms that noise alone was allowed.
+        allowed: allowed false alarms.
     """
 
     cracks: tuple[Crack, ...]
@@ -115,7 +113,7 @@ class Cracks:
 
     @property
     def counted(self) -> tuple[Crack, ...]:
-        """Those that are cracks: slits and grooves."""
+        """Slits and grooves."""
         return tuple(c for c in self.cracks if c.kind in ("slit", "groove"))
 
     @property
@@ -130,7 +128,7 @@ class Cracks:
         return {
             "lines": [c.as_dict() for c in self.cracks],
             "n_cracks": len(self.counted),
-            "area_mm2": self.area_um2 / _UM2_PER_MM2,
+            "area_mm2": self.area_um2 / 1e6,
             "length_mm": density * self.area_um2 / 1e3,
             "length_per_area_per_mm": density * 1e3,
             "length_per_area_std_per_mm": std * 1e3,
@@ -142,51 +140,43 @@ class Cracks:
 
 
 def find_cracks(
-    rec: Reconstruction,
-    stack: MicrographStack,
-    regions: Sequence[np.ndarray],
-    settings: CrackSettings | None = None,
+    rec: Reconstruction, stack: MicrographStack, inside: np.ndarray, settings: LineSettings = LineSettings()
 ) -> Cracks:
     """Find and measure the cracks of a surface.
 
     Args:
-        rec: heights; where a region's level floats they count, for only differences across a crack are used.
-        stack: the calibrated micrographs that they were made of.
-        regions: where to look: True inside [y, x].
-        settings: how.
+        rec: heights; regions whose level floats are included, because only differences across a crack are used.
+        stack: the calibrated micrographs of these heights.
+        inside: True in the searched region [y, x].
+        settings: false alarms, shortest line.
 
     Raises:
-        SceneError: another raster, or a stack that is not calibrated.
+        SceneError: another raster, pixels that are not square, or a stack that is not calibrated.
         GuardError: no pixel can be searched.
     """
-    s, inside = settings or CrackSettings(), np.any(regions, axis=0)
-    if stack.shape[1:] != rec.height.shape:
-        raise SceneError(
-            f"{stack.name} has {stack.shape[2]} x {stack.shape[1]} pixels, the height map {rec.height.shape[1]} x "
-            f"{rec.height.shape[0]}: give the micrographs that it was made of"
-        )
+    check_micrographs(stack, rec.height.shape)
     steps = pitch(rec.raster_x), pitch(rec.raster_y)
     if not math.isclose(*steps, rel_tol=1e-3):
-        raise SceneError(f"cracks are looked for on square pixels, the raster has {steps[0]:g} x {steps[1]:g} um")
+        raise SceneError(f"the search for cracks needs square pixels, the raster has {steps[0]:g} x {steps[1]:g} um")
     contrast = contrast_of(stack)
     cracks: list[Crack] = []
     threshold, left_out, n = {}, 0, 0
     for kind in ORDER:
-        found = find_lines(contrast, inside, kind, s)
+        found = find_lines(contrast, inside, kind, settings)
         threshold[kind], n = found.threshold, found.n_pixels
-        for path in trace_lines(found, s):
-            seen = measure_line(path, contrast, inside, rec, stack, s)
-            left_out += seen is None
-            if seen is not None:
-                cracks.append(_crack(path, found, rec, stack, seen))
-    n_ridges = len(trace_lines(find_lines(contrast, inside, "groove", s, sign=-1.0), s))
-    cracks = _without_doubles(sorted(cracks, key=lambda c: -c.score), _SAME * steps[0])
+        for path in trace_lines(found, settings):
+            measured = measure_line(path, contrast, inside, rec, settings.min_length_px)
+            left_out += measured is None
+            if measured is not None:
+                cracks.append(_crack(path, found, rec, stack, measured))
+    n_ridges = len(trace_lines(find_lines(contrast, inside, "groove", settings, sign=-1.0), settings))
+    cracks = _without_duplicates(sorted(cracks, key=lambda c: -c.score), _SAME * steps[0])
     numbered = tuple(replace(c, number=i) for i, c in enumerate(cracks, 1))
-    return Cracks(numbered, n * steps[0] * steps[1], n_ridges, left_out, threshold, s.false_alarms)
+    return Cracks(numbered, n * steps[0] * steps[1], n_ridges, left_out, threshold, settings.false_alarms)
 
 
-def _without_doubles(cracks: list[Crack], near: float) -> list[Crack]:
-    """Leave out lines of which more than half lies beside a stronger one."""
+def _without_duplicates(cracks: list[Crack], near: float) -> list[Crack]:
+    """Discard lines of which more than half lies beside a stronger one."""
     kept: list[Crack] = []
     for crack in cracks:
         trees = [cKDTree(other.points) for other in kept]
@@ -222,8 +212,8 @@ def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack
         end=(float(points[-1, 0]), float(points[-1, 1])),
         points=points,
         direction_deg=direction,
-        score=score,
-        false_alarms=found.false_alarms(score),
+        score=path.score,
+        false_alarms=found.false_alarms(path.score),
         along_scan_deg=abs(direction) if stack.fast_axis == "x" else 90.0 - abs(direction),
-        **(unknown | seen),
+        **measured,
     )

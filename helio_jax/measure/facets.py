@@ -1,9 +1,9 @@
-"""Planar facets of a height map: where they are, the angles between them, their sides and areas.
+"""Planar facets of a height map: segmentation, angles between facets, side lengths and areas.
 
-Pixels are joined while a plane explains them; every facet's plane is then fitted robustly. The angle between two facets
-that touch is the interior one of the solid (180 deg: no edge), once from the two planes and once as in the paper, by
-straight lines fitted to profiles across the edge. Heights only; normals of the file are not used. Positions are the
-surface points' own, so tilt and oblique incidence are in. Source of the method: arXiv 2501.14833, sec. 4.
+Regions of similar local planes are grown, and a plane is fitted robustly to each. The angle between two touching facets
+is the interior angle of the solid (180 deg: no edge), once from the two planes and once as in the paper, from straight
+lines fitted to profiles across the edge. Uses heights only, at the surface points' own positions, so that tilt and
+oblique incidence are accounted for. Source of the method: arXiv 2501.14833, sec. 4.
 """
 
 import math
@@ -20,24 +20,24 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.settings import Settings
 
 _TUKEY = 4.685
-_ROUNDS = 30
+_ITERATIONS = 30
+_WINDOW = 5
+"""Side of the square in which the local plane is fitted [pixels]."""
+_RIM = 2
+"""Pixels along a facet's border that its plane is not fitted to, because edges are rounded."""
 _LEAST_CORE = 0.25
-"""A strip of which less is left without its rim is the rounding of an edge."""
+"""A region with less than this fraction inside its rim is the rounding of an edge, not a facet."""
 _NO_CORE = 1e-6
-"""Sum of Gaussian weights below which a facet is not continued."""
+"""Sum of Gaussian weights below which a facet is not extrapolated."""
 
 
 class FacetSettings(Settings):
-    """How facets are found."""
+    """Segmentation into facets."""
 
-    window: int = Field(default=5, ge=3, le=101)
-    """Side of the square in which the local plane is fitted [pixels]; odd."""
     max_turn_deg: float = Field(default=12.0, gt=0.0, le=60.0)
     """Largest angle between a pixel's local plane and its facet's [deg]."""
     min_pixels: int = Field(default=60, ge=9)
-    """Smaller facets are left out."""
-    rim_pixels: int = Field(default=2, ge=0, le=50)
-    """Pixels along a facet's border that its plane is not fitted to, for edges are rounded."""
+    """Smaller facets are discarded."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class Facet:
         number: label in the map of facets, from 1.
         slope: dz/dx, dz/dy of its plane.
         level: height of the plane at x = y = 0 [um].
-        slope_std: standard deviation of the slopes, from the heights' samples or else from the misfit.
+        slope_std: standard deviation of the slopes, from the posterior's samples or else from the misfit.
         tilt_deg, azimuth_deg: of its outward normal.
         area_um2, area_std_um2: in its own plane.
-        projected_um2: seen along the plate normal.
+        projected_um2: area projected along the plate normal.
         long_um, short_um (and _std): sides, in its plane, of the rectangle with the same second moments.
-        projected_long_um, projected_short_um: the same seen along the plate normal.
+        projected_long_um, projected_short_um: the same projected along the plate normal.
         rms_um: of the heights about the plane.
         n_pixels: its size.
-        is_cut: it touches the border of the reconstructed field (holes smaller than a facet are none), so sides and
-            areas are lower bounds.
+        is_cut: it touches the border of the reconstructed field (holes smaller than a facet do not count), so that
+            sides and areas are lower bounds.
     """
 
     number: int
@@ -87,7 +87,7 @@ class Facet:
 
 @dataclass(frozen=True)
 class Edge:
-    """Where two facets meet: interior angle of the solid [deg] (convex < 180 < concave), from planes and profiles."""
+    """Edge of two facets: interior angle of the solid [deg] (convex < 180 < concave), from planes and profiles."""
 
     facets: tuple[int, int]
     angle_deg: float
@@ -115,15 +115,15 @@ def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) 
     """Find the facets of a reconstruction and measure them.
 
     Args:
-        rec: heights; invalid pixels take no part.
-        settings: sizes and limits.
+        rec: heights; invalid pixels are excluded.
+        settings: smallest facet, largest angle within one.
 
     Raises:
         GuardError: no planar region of `min_pixels` pixels.
     """
     use = rec.is_valid & np.isfinite(rec.height)
     labels = _segment(rec, use, settings)
-    numbers = sorted((n for n in range(1, labels.max() + 1)), key=lambda n: -int(np.sum(labels == n)))
+    numbers = sorted(range(1, labels.max() + 1), key=lambda n: -int(np.sum(labels == n)))
     if not numbers:
         raise GuardError(
             f"no planar region of {settings.min_pixels} or more pixels found: lower min_pixels or raise "
@@ -133,20 +133,20 @@ def find_facets(rec: Reconstruction, settings: FacetSettings = FacetSettings()) 
     order[numbers] = np.arange(1, len(numbers) + 1)
     labels = order[labels]
     facets = tuple(_measure(rec, labels, n, use, settings) for n in range(1, len(numbers) + 1))
-    edges = [_edge(rec, labels, a, b, settings) for i, a in enumerate(facets) for b in facets[i + 1 :]]
+    edges = [_edge(rec, labels, a, b) for i, a in enumerate(facets) for b in facets[i + 1 :]]
     return Facets(labels, facets, tuple(e for e in edges if e is not None))
 
 
 def _normal(slope: np.ndarray) -> np.ndarray:
-    """Return unit normals, up, of slopes [..., 2]."""
+    """Compute the unit normals, up, of slopes [..., 2]."""
     n = np.concatenate([-slope, np.ones((*slope.shape[:-1], 1))], -1)
     return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
-def _local_slopes(rec: Reconstruction, use: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes of the plane fitted in a window about each pixel [y, x, 2], and their misfit; NaN where too few."""
+def _local_slopes(rec: Reconstruction, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a plane in a window around each pixel: slopes [y, x, 2], rms misfit; NaN where too few pixels are valid."""
     w = use.astype(float)
-    mean = lambda v: ndimage.uniform_filter(np.where(use, v, 0.0), window, mode="constant")  # noqa: E731
+    mean = lambda v: ndimage.uniform_filter(np.where(use, v, 0.0), _WINDOW, mode="constant")  # noqa: E731
     n = np.maximum(mean(w), 1e-12)
     x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), np.where(use, rec.height, 0.0)
     mx, my, mz = mean(x) / n, mean(y) / n, mean(z) / n
@@ -161,8 +161,8 @@ def _local_slopes(rec: Reconstruction, use: np.ndarray, window: int) -> tuple[np
 
 
 def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarray:
-    """Grow facets from the most planar pixels, then give each pixel near two of them to the nearer plane [y, x]."""
-    slope, misfit = _local_slopes(rec, use, s.window | 1)
+    """Grow facets from the most planar pixels, then assign pixels at their borders to the nearest plane [y, x]."""
+    slope, misfit = _local_slopes(rec, use)
     normal, known = _normal(slope), np.isfinite(misfit)
     labels = np.zeros(use.shape, int)
     n_facets = 0
@@ -184,41 +184,41 @@ def _segment(rec: Reconstruction, use: np.ndarray, s: FacetSettings) -> np.ndarr
             direction /= np.linalg.norm(direction)
         else:
             tried |= region
-            inner = ndimage.binary_erosion(region, iterations=max(s.rim_pixels, 1))
+            inner = ndimage.binary_erosion(region, iterations=_RIM)
             if region.sum() >= s.min_pixels and inner.sum() >= _LEAST_CORE * region.sum():
                 n_facets += 1
                 labels[region] = n_facets
         tried[seed] = True
-    return _shared_out(rec, labels, use, s)
+    return _assign_borders(rec, labels, use)
 
 
 def _pieces(mask: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the connected pieces of a mask, numbered from 1 [y, x], and how many there are."""
+    """Label the connected components of a mask from 1 [y, x]; return their number, too."""
     numbers = np.zeros(mask.shape, np.int32)
     return numbers, int(ndimage.label(mask, output=numbers))  # type: ignore[arg-type]
 
 
-def _core(region: np.ndarray, rim: int) -> np.ndarray:
-    """Return a region without its rim; less of it is taken off where little would be left."""
-    for n in range(rim, 0, -1):
+def _core(region: np.ndarray) -> np.ndarray:
+    """Remove the rim of a region; a narrower one where little would remain."""
+    for n in range(_RIM, 0, -1):
         inner = ndimage.binary_erosion(region, iterations=n)
         if inner.sum() >= 0.3 * region.sum():
             return np.asarray(inner)
     return region
 
 
-def _shared_out(rec, labels, use, s: FacetSettings) -> np.ndarray:
-    """Give pixels within a window of facets to the facet whose plane there is nearest in height; one piece each.
+def _assign_borders(rec: Reconstruction, labels: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Assign pixels within a window of facets to the facet whose local plane is nearest in height; one piece each.
 
-    Borders are local: a flank that is bent by 2 degrees over its length makes its plane as a whole miss its edge by
-    tens of um, and a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
+    The planes are local: the plane of a whole flank that is bent by 2 degrees over its length misses its edge by tens
+    of um, so that a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
     """
     out, best = labels.copy(), np.full(labels.shape, np.inf)
     numbers = range(1, int(labels.max()) + 1)
     for number in numbers:
         region = labels == number
-        away = np.abs(rec.height - _continued(rec, _core(region, s.rim_pixels), s.window | 1))
-        reach = ndimage.binary_dilation(region, iterations=(s.window | 1)) & use
+        away = np.abs(rec.height - _extrapolate(rec, _core(region)))
+        reach = ndimage.binary_dilation(region, iterations=_WINDOW) & use
         is_nearer = reach & (away < best)
         out, best = np.where(is_nearer, number, out), np.where(is_nearer, away, best)
     for number in numbers:
@@ -229,22 +229,19 @@ def _shared_out(rec, labels, use, s: FacetSettings) -> np.ndarray:
     return out
 
 
-def _continued(rec: Reconstruction, core: np.ndarray, reach: float) -> np.ndarray:
-    """Return the heights [y, x] of the planes fitted, about every pixel, to the core with Gaussian weights.
+def _extrapolate(rec: Reconstruction, core: np.ndarray) -> np.ndarray:
+    """Compute the heights [y, x] of the planes fitted, around every pixel, to a facet's core with Gaussian weights.
 
-    Args:
-        rec: heights.
-        core: pixels of a facet.
-        reach: standard deviation of the weights [pixels]; beyond 5 of them from the core: infinite.
+    The standard deviation of the weights is `_WINDOW`; beyond 5 of them from the core the result is infinite.
     """
 
-    def weighed(values: np.ndarray | float) -> np.ndarray:
-        return ndimage.gaussian_filter(np.where(core, values, 0.0), reach, mode="constant", truncate=5.0)
+    def weighted(values: np.ndarray | float) -> np.ndarray:
+        return ndimage.gaussian_filter(np.where(core, values, 0.0), _WINDOW, mode="constant", truncate=5.0)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return weighed(values) / total
+        return weighted(values) / total
 
-    total = np.maximum(weighed(1.0), np.finfo(float).tiny)
+    total = np.maximum(weighted(1.0), np.finfo(float).tiny)
     x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), rec.height
     at = np.stack([mean(x), mean(y)], -1)
     level = mean(z)
@@ -264,7 +261,7 @@ def _fit_plane(
     z = (rec.height if height is None else height)[region]
     design = np.stack([rec.x[region], rec.y[region], np.ones(z.size)], -1)
     weight = np.ones(z.size)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         root = np.sqrt(weight)[:, None]
         plane = np.linalg.lstsq(design * root, z * root[:, 0], rcond=None)[0]
         misfit = z - design @ plane
@@ -277,10 +274,10 @@ def _fit_plane(
 
 
 def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit: np.ndarray) -> np.ndarray:
-    """Return the covariance of a plane's slopes [2, 2]: from the posterior's samples, or else from the misfit.
+    """Compute the covariance of a plane's slopes [2, 2] from the posterior's samples, or else from the misfit.
 
-    Misfits of neighbouring pixels go together, for heights are integrals: their correlation length is taken as the
-    square root of the area over which the misfit keeps its sign.
+    Misfits of neighbouring pixels are correlated, because heights are integrals: the correlation area is estimated as
+    the mean area over which the misfit keeps its sign.
     """
     if rec.height_samples is not None:
         drawn = np.stack([_fit_plane(rec, core, rec.height + d)[0][:2] - plane[:2] for d in rec.height_samples])
@@ -288,26 +285,29 @@ def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit:
     signs = np.zeros(core.shape, int)
     signs[core] = np.where(misfit > 0, 1, 2)
     n_pieces = max(_pieces(signs == 1)[1] + _pieces(signs == 2)[1], 1)
-    together = max(misfit.size / n_pieces, 1.0)
+    correlated = max(misfit.size / n_pieces, 1.0)
     x, y = rec.x[core] - rec.x[core].mean(), rec.y[core] - rec.y[core].mean()
     moments = np.array([[np.sum(x * x), np.sum(x * y)], [np.sum(x * y), np.sum(y * y)]])
-    return np.linalg.inv(moments) * np.mean(misfit**2) * together
+    return np.linalg.inv(moments) * np.mean(misfit**2) * correlated
 
 
 def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarray, s: FacetSettings) -> Facet:
     """Measure one facet."""
     region = labels == number
-    core = _core(region, s.rim_pixels)
+    core = _core(region)
     plane, misfit = _fit_plane(rec, core)
     covariance = _slope_std(rec, core, plane, misfit)
     normal = _normal(plane[:2])
-    cell, step = pitch(rec.raster_x) * pitch(rec.raster_y), math.sqrt(pitch(rec.raster_x) * pitch(rec.raster_y))
+    cell = pitch(rec.raster_x) * pitch(rec.raster_y)
+    step = math.sqrt(cell)
     tx, ty = rec.instrument.beam_shift
-    stretch = abs(1.0 + plane[0] * tx + plane[1] * ty)  # raster cells to x, y: the beam may be oblique
+    stretch = abs(1.0 + plane[0] * tx + plane[1] * ty)  # raster cell over its area in x, y at oblique incidence
     projected = region.sum() * cell / stretch
     flat = np.stack([rec.x[region], rec.y[region]], -1)
     along = np.array([plane[0], plane[1]]) / (np.hypot(plane[0], plane[1]) or 1.0)
-    lift = np.outer(along, along) * (1.0 / normal[2] - 1.0)  # lengths up the slope grow by 1 / cos(tilt)
+    lift = np.outer(along, along) * (
+        1.0 / normal[2] - 1.0
+    )  # lengths up the slope are 1 / cos(tilt) times the projected
     sides, true_sides = (_sides(p, step) for p in (flat, flat + flat @ lift))
     rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
     edge_std = step * _roughness_of_rim(region)
@@ -337,15 +337,15 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
 
 
 def _outside(use: np.ndarray, min_pixels: int) -> np.ndarray:
-    """Return what is not reconstructed [y, x] but for holes smaller than a facet: these are not the field's border."""
+    """Mark the pixels that are not reconstructed [y, x], except holes smaller than a facet."""
     pieces, _ = _pieces(~use)
     return ~use & (np.bincount(pieces.ravel())[pieces] >= min_pixels)
 
 
 def _sides(points: np.ndarray, step: float) -> tuple[float, float]:
-    """Return the long and short side [um] of the rectangle with the second moments of points on a square grid.
+    """Compute the sides [um] of the rectangle with the second moments of points on a square grid, the longer first.
 
-    A rectangle a x b has the moments a^2/12, b^2/12; points at the middles of cells miss step^2/12 of it.
+    A rectangle a x b has the moments a^2/12, b^2/12; those of points at the middles of cells are step^2/12 smaller.
     """
     values = np.linalg.eigvalsh(np.cov(points.T, bias=True))
     short, long = np.sqrt(12.0 * np.maximum(values, 0.0) + step**2)
@@ -353,19 +353,18 @@ def _sides(points: np.ndarray, step: float) -> tuple[float, float]:
 
 
 def _roughness_of_rim(region: np.ndarray) -> float:
-    """Return how far a region's rim is from smooth [pixels]: rms of what closing and opening change, at least 0.3."""
+    """Estimate the roughness of a region's rim [pixels]: pixels changed by smoothing per pixel of the rim, >= 0.3."""
     smooth = ndimage.gaussian_filter(region.astype(float), 3.0) > 0.5
     changed = np.sum(smooth != region)
     rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region), bool))), 1)
     return max(float(changed) / rim, 0.3)
 
 
-def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetSettings) -> Edge | None:
+def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet) -> Edge | None:
     """Measure the edge of two facets; None where they do not touch over five or more pixels."""
-    near_a, near_b = (
-        np.asarray(ndimage.binary_dilation(labels == n, iterations=2), bool) for n in (a.number, b.number)
+    touching = np.logical_and(
+        *(ndimage.binary_dilation(labels == n, iterations=2) for n in (a.number, b.number))  # type: ignore[arg-type]
     )
-    touching = near_a & near_b
     if touching.sum() < 15:
         return None
     points = np.stack([rec.x[touching], rec.y[touching]], -1)
@@ -373,8 +372,7 @@ def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetS
     values, vectors = np.linalg.eigh(np.cov(points.T))
     along = vectors[:, 1]
     length = math.sqrt(12.0 * max(float(values[1]), 0.0))
-    step = pitch(rec.raster_x)
-    if length < 5 * step:
+    if length < 5 * pitch(rec.raster_x):
         return None
     nearby = np.asarray(ndimage.binary_dilation(touching, iterations=4), bool)  # a facet may surround the other
     side_a, side_b = (
@@ -385,7 +383,7 @@ def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetS
     angle = _interior(np.array(a.slope), np.array(b.slope), across)
     std = _angle_std(a, b, across, angle)
     ridge = 0.5 * (np.array(a.slope) + np.array(b.slope)) @ along
-    profiles = _profile_angles(rec, labels, a.number, b.number, middle, along, across, length, float(ridge), s)
+    profiles = _profile_angles(rec, labels, a.number, b.number, middle, along, across, length, float(ridge))
     n = len(profiles)
     mean = float(np.mean(profiles)) if n else math.nan
     spread = float(np.std(profiles, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
@@ -393,13 +391,13 @@ def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet, s: FacetS
 
 
 def _interior(slope_a: np.ndarray, slope_b: np.ndarray, across: np.ndarray) -> float:
-    """Return the interior angle [deg] of planes a and b, b lying on the side to which `across` points."""
-    turn = math.degrees(math.acos(float(np.clip(_normal(slope_a) @ _normal(slope_b), -1.0, 1.0))))
-    return 180.0 - turn if (slope_b - slope_a) @ across < 0 else 180.0 + turn
+    """Compute the interior angle [deg] of planes a and b; `across` points from a to b."""
+    bend = math.degrees(math.acos(float(np.clip(_normal(slope_a) @ _normal(slope_b), -1.0, 1.0))))
+    return 180.0 - bend if (slope_b - slope_a) @ across < 0 else 180.0 + bend
 
 
 def _angle_std(a: Facet, b: Facet, across: np.ndarray, angle: float) -> float:
-    """Return the angle's standard deviation [deg], by differences; the two planes count as independent."""
+    """Propagate the slopes' errors to the angle's standard deviation [deg]; the two planes count as independent."""
     total, slopes = 0.0, [np.array(a.slope), np.array(b.slope)]
     for i, facet in enumerate((a, b)):
         for axis in (0, 1):
@@ -409,11 +407,11 @@ def _angle_std(a: Facet, b: Facet, across: np.ndarray, angle: float) -> float:
     return math.sqrt(total)
 
 
-def _profile_angles(rec, labels, a, b, middle, along, across, length, ridge, s: FacetSettings) -> list[float]:
-    """Return the angle from each profile across an edge: straight lines fitted to its two sides, as in the paper.
+def _profile_angles(rec, labels, a, b, middle, along, across, length, ridge) -> list[float]:
+    """Compute the angle from each profile across an edge: straight lines fitted to its two sides, as in the paper.
 
-    A profile runs at right angles to the edge seen from above; where the edge climbs, its slope `ridge` is that of
-    both planes along it, and the angle is taken between the planes so fixed.
+    A profile runs at right angles to the edge in projection. Where the edge climbs, both planes have its slope `ridge`
+    along it, and the angle is that between these planes.
     """
     step = pitch(rec.raster_x)
     offset = np.stack([rec.x, rec.y], -1) - middle
@@ -423,7 +421,7 @@ def _profile_angles(rec, labels, a, b, middle, along, across, length, ridge, s: 
         line = (t >= low) & (t < low + step)
         fits = []
         for number, sign in ((a, -1.0), (b, 1.0)):
-            side = line & (labels == number) & (sign * u > s.rim_pixels * step)
+            side = line & (labels == number) & (sign * u > _RIM * step)
             if side.sum() < 5 or np.ptp(u[side]) < 4 * step:
                 break
             fits.append(np.polyfit(u[side], rec.height[side], 1)[0])

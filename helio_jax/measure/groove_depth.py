@@ -1,4 +1,4 @@
-"""Heights across a piece of a groove: its depth below the lower shoulder, and its width at half of that."""
+"""Heights across a piece of a groove: depth below the lower shoulder, and width at half of that depth."""
 
 import itertools
 from dataclasses import dataclass
@@ -7,10 +7,13 @@ import numpy as np
 
 from helio_jax.reconstruction import Reconstruction
 
+FLANK = 12
+"""Distance to both sides in which a groove's shoulders are searched [pixels]."""
+
 
 @dataclass(frozen=True)
 class HeightProfile:
-    """Heights across a piece of a line: pixels in bins a pixel wide; its bottom and shoulders, as bins."""
+    """Heights across a piece of a line: pixels in bins a pixel wide; bins of its bottom and shoulders."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -20,37 +23,34 @@ class HeightProfile:
     shoulders: tuple[int, int]
 
     @classmethod
-    def of(
-        cls, rec: Reconstruction, rows: np.ndarray, columns: np.ndarray, t: np.ndarray, reach: int
-    ) -> "HeightProfile | None":
-        """Return the profile of pixels at distances t, or None where too little is known on either side."""
-        place = np.round(t).astype(int) + reach
-        counts = np.bincount(place, minlength=2 * reach + 1)
+    def of(cls, rec: Reconstruction, rows: np.ndarray, columns: np.ndarray, t: np.ndarray) -> "HeightProfile | None":
+        """Bin pixels by their distances t; None where too few heights are known on either side."""
+        place = np.round(t).astype(int) + FLANK
+        counts = np.bincount(place, minlength=2 * FLANK + 1)
         known = counts >= max(2.0, 0.3 * float(np.median(counts)))
-        if not known[reach] or known[: reach - 1].sum() < 3 or known[reach + 2 :].sum() < 3:
+        if not known[FLANK] or known[: FLANK - 1].sum() < 3 or known[FLANK + 2 :].sum() < 3:
             return None
-        self = cls(rows, columns, place, known, reach, (reach, reach))
-        q = self.means(rec.height)
-        bottom = reach - 1 + int(np.argmin(np.where(known, q, np.inf)[reach - 1 : reach + 2]))
+        q = cls(rows, columns, place, known, 0, (0, 0)).means(rec.height)
+        bottom = FLANK - 1 + int(np.argmin(np.where(known, q, np.inf)[FLANK - 1 : FLANK + 2]))
         sides = np.flatnonzero(known[:bottom]), bottom + 1 + np.flatnonzero(known[bottom + 1 :])
         left, right = (int(side[np.argmax(q[side])]) for side in sides)
         return cls(rows, columns, place, known, bottom, (left, right))
 
     def means(self, height: np.ndarray) -> np.ndarray:
-        """Return the mean height in every bin."""
+        """Compute the mean height of every bin."""
         n = self.known.size
         total = np.bincount(self.place, height[self.rows, self.columns], n)
         return total / np.maximum(np.bincount(self.place, minlength=n), 1)
 
     def depth(self, height: np.ndarray) -> float:
-        """Return the depth of the bottom below the lower shoulder."""
+        """Compute the depth of the bottom below the lower shoulder."""
         q = self.means(height)
         return float(min(q[i] for i in self.shoulders) - q[self.bottom])
 
     def depth_and_std(self, rec: Reconstruction) -> tuple[float, float]:
-        """Return the depth and its deviation: of the samples, or else the scatter of the heights along the piece.
+        """Compute the depth and its deviation, from the samples or else from the heights' scatter along the piece.
 
-        That scatter is not divided by a number of pixels, for errors of neighbouring heights go together.
+        The scatter is not divided by a number of pixels, because errors of neighbouring heights are correlated.
         """
         depth, std = rec.spread(self.depth)
         if rec.height_samples is None:
@@ -58,7 +58,7 @@ class HeightProfile:
         return depth, std
 
     def width(self, height: np.ndarray) -> float:
-        """Return the width at half of the depth [pixels]."""
+        """Compute the width at half of the depth [pixels]."""
         q = self.means(height)
         level = q[self.bottom] + 0.5 * self.depth(height)
         bins = np.flatnonzero(self.known)
@@ -67,7 +67,7 @@ class HeightProfile:
 
 
 def _crossing(q: np.ndarray, bins: np.ndarray, level: float) -> float:
-    """Return how far from its first bin a profile first rises to a level."""
+    """Compute the distance from the first bin at which a profile first rises to a level."""
     for i, j in itertools.pairwise(bins):
         if q[j] >= level:
             return abs(float(i - bins[0])) + abs(float(j - i)) * float((level - q[i]) / (q[j] - q[i]))

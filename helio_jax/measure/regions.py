@@ -1,12 +1,13 @@
-"""Regions of a raster, as a user names them: corners of rectangles and polygons, in beam positions."""
+"""Regions of a raster (rectangles and polygons in beam positions), and the check of the micrographs to measure on."""
 
 import numpy as np
 
 from helio_jax.errors import SceneError
+from helio_jax.micrograph import MicrographStack
 
 
 def parse_region(text: str) -> np.ndarray:
-    """Return the corners [n, 2] of "X,Y X,Y ..." [um]: two of a rectangle, or three and more of a polygon.
+    """Parse "X,Y X,Y ..." [um] to corners [n, 2]: two corners of a rectangle, or three and more of a polygon.
 
     Raises:
         SceneError: another form.
@@ -24,10 +25,10 @@ def parse_region(text: str) -> np.ndarray:
 
 
 def inside_polygon(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return True for the raster positions within a polygon [y, x] (even-odd rule).
+    """Mark the raster positions within a polygon, True inside [y, x] (even-odd rule).
 
     Raises:
-        SceneError: none is.
+        SceneError: no pixel is inside.
     """
     grid_x, grid_y = np.meshgrid(x, y)
     inside = np.zeros(grid_x.shape, bool)
@@ -41,3 +42,18 @@ def inside_polygon(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndar
             f"{y[-1]:g} um"
         )
     return inside
+
+
+def check_micrographs(stack: MicrographStack, shape: tuple[int, ...] | None = None) -> None:
+    """Check that micrographs are calibrated and, where `shape` is given, that they are on that raster (y, x).
+
+    Raises:
+        SceneError: they are not.
+    """
+    if stack.n_rays is None:
+        raise SceneError(f"{stack.name}: its background is not known: use the file that helio calibrate wrote")
+    if shape is not None and stack.shape[1:] != shape:
+        raise SceneError(
+            f"{stack.name} has {stack.shape[2]} x {stack.shape[1]} pixels, the height map {shape[1]} x {shape[0]}: "
+            "use the micrographs that the height map was reconstructed from"
+        )

@@ -1,12 +1,11 @@
-"""Numbers of a surface's texture by ISO 25178-2, and profiles and steps. Heights in, numbers in um out.
+"""Surface texture parameters of ISO 25178-2, height profiles and steps. Heights in, numbers in um out.
 
-Sa, Sq, Sz, Ssk, Sku are taken from the mean plane (or, with `level="mean"`, the mean height) of the region; Sdq and Sdr
-from the slopes between neighbouring pixels. Only whole cells of four known pixels enter Sdq and Sdr.
+Sa, Sq, Sz, Ssk, Sku refer to the least-squares plane of the region; Sdq and Sdr to the slopes of cells of four known
+pixels.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import ndimage
@@ -18,7 +17,7 @@ from helio_jax.reconstruction import Reconstruction
 
 @dataclass(frozen=True)
 class Roughness:
-    """Areal height and hybrid parameters after ISO 25178-2.
+    """Areal height and hybrid parameters of ISO 25178-2.
 
     Attributes:
         Sa: arithmetical mean height, mean of |z| [um].
@@ -27,8 +26,8 @@ class Roughness:
         Ssk: skewness, mean of z^3 over Sq^3.
         Sku: kurtosis, mean of z^4 over Sq^4.
         Sdq: root mean square gradient.
-        Sdr: developed interfacial area ratio: how much larger the surface is than its projection [%].
-        n_pixels: how many heights they rest on.
+        Sdr: developed interfacial area ratio: area of the surface over its projection, minus 1 [%].
+        n_pixels: number of heights.
     """
 
     Sa: float
@@ -41,15 +40,12 @@ class Roughness:
     n_pixels: int
 
 
-def measure_roughness(
-    rec: Reconstruction, region: np.ndarray | None = None, level: Literal["plane", "mean"] = "plane"
-) -> Roughness:
-    """Measure the texture of a region of a height map.
+def measure_roughness(rec: Reconstruction, region: np.ndarray | None = None) -> Roughness:
+    """Measure the texture of a region of a height map, levelled by its least-squares plane.
 
     Args:
-        rec: heights; invalid pixels take no part.
-        region: True where to measure [y, x]; default: all valid pixels.
-        level: what heights are taken from: the least-squares plane, or the mean height.
+        rec: heights; invalid pixels are excluded.
+        region: True inside [y, x]; default: all valid pixels.
 
     Raises:
         GuardError: fewer than 16 valid pixels.
@@ -57,13 +53,9 @@ def measure_roughness(
     use = rec.is_valid & np.isfinite(rec.height) & (True if region is None else region)
     if use.sum() < 16:
         raise GuardError(f"roughness needs 16 or more valid pixels, got {int(use.sum())}")
-    z = rec.height
-    if level == "plane":
-        design = np.stack([rec.x[use], rec.y[use], np.ones(use.sum())], -1)
-        plane = np.linalg.lstsq(design, z[use], rcond=None)[0]
-        z = z - plane[0] * rec.x - plane[1] * rec.y - plane[2]
-    else:
-        z = z - z[use].mean()
+    design = np.stack([rec.x[use], rec.y[use], np.ones(use.sum())], -1)
+    plane = np.linalg.lstsq(design, rec.height[use], rcond=None)[0]
+    z = rec.height - plane[0] * rec.x - plane[1] * rec.y - plane[2]
     v = z[use]
     sq = float(np.sqrt(np.mean(v**2)))
     p, q = _cell_slopes(rec, z, use)
@@ -82,7 +74,7 @@ def measure_roughness(
 
 
 def _cell_slopes(rec: Reconstruction, z: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return dz/dx, dz/dy in the middle of every cell of four known pixels; normal or oblique incidence."""
+    """Compute dz/dx, dz/dy in the middle of every cell of four known pixels; normal or oblique incidence."""
     whole = use[1:, 1:] & use[1:, :-1] & use[:-1, 1:] & use[:-1, :-1]
     along = 0.5 * (z[:-1, 1:] - z[:-1, :-1] + z[1:, 1:] - z[1:, :-1])[whole] / pitch(rec.raster_x)
     up = 0.5 * (z[1:, :-1] - z[:-1, :-1] + z[1:, 1:] - z[:-1, 1:])[whole] / pitch(rec.raster_y)
@@ -93,7 +85,7 @@ def _cell_slopes(rec: Reconstruction, z: np.ndarray, use: np.ndarray) -> tuple[n
 
 @dataclass(frozen=True)
 class Profile:
-    """Heights along a straight line: distance from its start [um], height [um] (NaN: not known), deviation [um]."""
+    """Heights along a straight line: distance from its start [um], height [um] (NaN: unknown), deviation [um]."""
 
     distance: np.ndarray
     height: np.ndarray
@@ -101,10 +93,10 @@ class Profile:
 
 
 def measure_profile(rec: Reconstruction, start: tuple[float, float], end: tuple[float, float]) -> Profile:
-    """Read heights between two beam positions (x, y) [um], a pitch apart, bilinearly.
+    """Interpolate heights bilinearly between two beam positions (x, y) [um], a pitch apart.
 
     Raises:
-        SceneError: a point outside the raster, or both in one place.
+        SceneError: a point outside the raster, or equal points.
     """
     for name, (x, y) in (("start", start), ("end", end)):
         if not (rec.raster_x[0] <= x <= rec.raster_x[-1] and rec.raster_y[0] <= y <= rec.raster_y[-1]):
@@ -129,7 +121,7 @@ def measure_profile(rec: Reconstruction, start: tuple[float, float], end: tuple[
 
 @dataclass(frozen=True)
 class Step:
-    """Height of a step [um], its standard deviation, where it is along the profile [um], and the common slope."""
+    """Height of a step [um], its standard deviation, its place along the profile [um], and the common slope."""
 
     height: float
     height_std: float
@@ -138,14 +130,11 @@ class Step:
 
 
 _GAP = 0.1
-"""Share of a profile's length that is left out about a step. After ISO 5436-1, which leaves out a third."""
+"""Fraction of a profile's length that is excluded around a step. After ISO 5436-1, which excludes a third."""
 
 
 def measure_step(profile: Profile) -> Step:
-    """Fit two parallel lines to the two sides of the steepest place of a profile; their distance is the step.
-
-    Args:
-        profile: with one step.
+    """Fit two parallel lines to the sides of a profile's steepest place; their distance is the step.
 
     Raises:
         GuardError: fewer than 4 known heights on a side.
@@ -162,7 +151,7 @@ def measure_step(profile: Profile) -> Step:
     use = np.abs(d - position) > 0.5 * _GAP * (d[-1] - d[0])
     upper = (d > position) & use
     if upper.sum() < 4 or (use & ~upper).sum() < 4:
-        raise GuardError("a step needs 4 or more known heights on either side: take a longer profile")
+        raise GuardError("a step needs 4 or more known heights on either side: choose a longer profile")
     design = np.stack([np.ones(use.sum()), d[use] - position, upper[use].astype(float)], -1)
     found = np.linalg.lstsq(design, z[use], rcond=None)[0]
     misfit = z[use] - design @ found

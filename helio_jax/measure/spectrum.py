@@ -1,9 +1,9 @@
-"""Averaged two-dimensional power spectra of regions of any shape, and their floor.
+"""Multitaper power spectra of regions of any shape in two dimensions, and their noise floor.
 
-Multitaper: a region is looked at through several orthogonal weights whose spectra lie within a small disc of wave
-vectors (the Slepian functions of that region), and the power spectra are averaged; so all pixels count up to an
-irregular border, and what is strong elsewhere hardly leaks in. The floor of a wave number is the median over all
-directions of about the same wavelength. Knows nothing of what the fields mean; `ripple` does.
+Each block of a region is weighted by several orthogonal tapers whose spectra lie within a small disc of wave vectors
+(the Slepian functions of that block), and the power spectra are averaged. All pixels up to an irregular border count,
+and leakage from distant wave vectors is small. The noise floor at a wave number is a median over all directions of
+about the same wavelength. `ripple` interprets the spectra.
 
 Source: Slepian, Bell Syst. Tech. J. 43 (1964) 3009; Thomson, Proc. IEEE 70 (1982) 1055.
 """
@@ -21,64 +21,73 @@ from scipy.sparse.linalg import eigsh
 from helio_jax.errors import GuardError
 from helio_jax.settings import Settings
 
+_BLOCK = 32
+"""Regions larger than the square of this side are cut into blocks of about this side [pixels]."""
+_DEGREE = 3
+"""Degree of the polynomial trend that is subtracted from each block."""
 _SHANNON = 8.0
-"""Pixels of a block times area of the disc of wave vectors: about how many weights there are."""
+"""Shannon number: pixels of a block times the area of the disc of wave vectors, about the number of tapers."""
 _CONCENTRATED = 0.9
-"""Share of a weight's power that lies within the disc, at least."""
+"""Smallest fraction of a taper's power within the disc."""
 _MOST_TAPERS = 12
 _FULLEST = 0.4
-"""Blocks of less than this share of the largest one's pixels are left out."""
+"""Blocks with fewer pixels than this fraction of the largest block's are skipped."""
 _FEWEST_PIXELS = 64
 _RING = 0.3
-"""Half width of a ring of the floor, in the logarithm of the wave number."""
+"""Half width of a ring of the noise floor, in the logarithm of the wave number."""
 _RING_CELLS = 6.0
-"""Independent values that a ring holds at least."""
+"""Smallest number of independent values in a ring."""
 _RADII = 48
 _MEDIAN = 0.6
-"""A median knows a mean as well as the mean of so many times as few values."""
+"""Statistical efficiency of a median relative to a mean."""
 _MAXIMA = 3.0
-"""Maxima of a smooth spectrum exceed those of its independent points: so many times more chances for noise."""
+"""Ratio of the false alarms of a smooth spectrum's maxima to those of its independent values."""
+_CERTAIN = 1e-3
+"""False-alarm probability below which the highest peak is excluded from the noise floor."""
 
 
 class RippleSettings(Settings):
-    """How ripples are looked for."""
+    """Search range of ripples."""
 
-    block_px: int = Field(default=32, ge=12, le=64)
-    """Regions larger than the square of this are cut into blocks of about this side [pixels]."""
-    degree: int = Field(default=3, ge=0, le=6)
-    """Degree of the polynomial that is taken off each block first."""
     shortest_um: float | None = Field(default=None, gt=0.0)
-    """Shortest wavelength that is looked for; default: 3 pixels [um]."""
+    """Shortest wavelength; default: 3 pixels [um]."""
     longest_um: float | None = Field(default=None, gt=0.0)
-    """Longest one; default: that of 1.5 times the resolution [um]."""
+    """Longest wavelength; default: that of 1.5 times the resolution [um]."""
     along_axes: bool = False
-    """Whether wave vectors along the raster's axes count, too, where scan lines look like ripples."""
+    """Whether wave vectors along the raster's axes are searched, where scan lines look like ripples."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A piece of a region: its pixels and weights.
+    """A piece of a region.
 
     Attributes:
         rows, columns: of its pixels [pixel].
         tapers: orthonormal weights [taper, pixel].
+        trend: orthonormal basis of the polynomials over the pixels [pixel, term].
     """
 
     rows: np.ndarray
     columns: np.ndarray
     tapers: np.ndarray
+    trend: np.ndarray
+
+    def detrend(self, values: np.ndarray) -> np.ndarray:
+        """Subtract the least-squares polynomial from values [pixel, ...]."""
+        return values - self.trend @ (self.trend.T @ values)
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """All blocks, and the half width of their weights' spectra [cycles per pixel]."""
+    """All blocks, the half width of their tapers' spectra [cycles per pixel], and the pitches along x and y [um]."""
 
     blocks: tuple[Block, ...]
     bandwidth: float
+    steps: tuple[float, float]
 
     @property
     def averages(self) -> int:
-        """How many independent spectra are averaged."""
+        """Number of averaged spectra."""
         return sum(len(block.tapers) for block in self.blocks)
 
     @property
@@ -91,18 +100,23 @@ class Blocks:
         """Independent values in the whole plane of wave vectors: one for each disc."""
         return 1.0 / (math.pi * self.bandwidth**2)
 
+    @property
+    def widths(self) -> tuple[float, float]:
+        """Resolution along kx and ky [cycles per um]."""
+        return self.bandwidth / self.steps[0], self.bandwidth / self.steps[1]
 
-def make_blocks(regions: Sequence[np.ndarray], side: int) -> Blocks:
-    """Cut regions into blocks and find their weights.
+
+def make_blocks(regions: Sequence[np.ndarray], steps: tuple[float, float]) -> Blocks:
+    """Cut regions into blocks and compute their tapers.
 
     Args:
         regions: True inside [y, x].
-        side: of a block where a region is larger than its square [pixels].
+        steps: pitch along x and y [um].
 
     Raises:
         GuardError: there are too few pixels.
     """
-    pieces = [piece for region in regions for piece in _pieces(region, side)]
+    pieces = [piece for region in regions for piece in _pieces(region)]
     largest = max((rows.size for rows, _ in pieces), default=0)
     if largest < _FEWEST_PIXELS:
         raise GuardError(f"a ripple needs {_FEWEST_PIXELS} or more known pixels side by side, got {largest}")
@@ -112,30 +126,30 @@ def make_blocks(regions: Sequence[np.ndarray], side: int) -> Blocks:
     for rows, columns in pieces:
         tapers = _slepian(np.stack([rows - rows.min(), columns - columns.min()]).astype(float).tobytes(), bandwidth)
         if len(tapers):
-            blocks.append(Block(rows, columns, tapers))
+            blocks.append(Block(rows, columns, tapers, _polynomials(rows, columns)))
     if not blocks:
-        raise GuardError("the regions are too ragged for a spectrum: take larger or fuller ones")
-    return Blocks(tuple(blocks), bandwidth)
+        raise GuardError("the regions are too ragged for a spectrum: choose larger or more compact ones")
+    return Blocks(tuple(blocks), bandwidth, steps)
 
 
-def _pieces(region: np.ndarray, side: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pieces(region: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return rows and columns of the pieces of a region."""
     rows, columns = np.nonzero(region)
-    if rows.size <= side**2:
+    if rows.size <= _BLOCK**2:
         return [(rows, columns)] if rows.size else []
     tile = np.zeros(rows.size, int)
     for place in (rows, columns):
-        n = max(round(np.ptp(place) / side), 1)
+        n = max(round(np.ptp(place) / _BLOCK), 1)
         tile = tile * (n + 1) + np.minimum((place - place.min()) * n // (np.ptp(place) + 1), n - 1)
     return [(rows[tile == t], columns[tile == t]) for t in np.unique(tile)]
 
 
 @lru_cache(maxsize=64)
 def _slepian(places: bytes, bandwidth: float) -> np.ndarray:
-    """Return the orthonormal weights of some pixels whose spectra lie best within a disc [taper, pixel].
+    """Compute the Slepian tapers [taper, pixel] of pixels for a disc of wave vectors.
 
     Args:
-        places: rows and columns [2, pixel], as bytes: blocks of one shape share their weights, which take seconds.
+        places: rows and columns [2, pixel], as bytes: blocks of one shape share their tapers, which take seconds.
         bandwidth: radius of the disc [cycles per pixel].
     """
     rows, columns = np.frombuffer(places).reshape(2, -1)
@@ -148,17 +162,32 @@ def _slepian(places: bytes, bandwidth: float) -> np.ndarray:
     return tapers
 
 
+def _polynomials(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Compute an orthonormal basis of the polynomials over pixels [pixel, term]."""
+    u, v = (2.0 * (a - a.min()) / max(int(np.ptp(a)), 1) - 1.0 for a in (columns, rows))
+    terms = [u**i * v**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    return np.linalg.qr(np.stack(terms, -1))[0]
+
+
+def without_trend(field: np.ndarray, blocks: Blocks) -> np.ndarray:
+    """Subtract a polynomial from a field on each block; 0 outside all blocks [y, x]."""
+    out = np.zeros(field.shape)
+    for block in blocks.blocks:
+        out[block.rows, block.columns] = block.detrend(field[block.rows, block.columns])
+    return out
+
+
 @dataclass(frozen=True)
 class Spectrum:
-    """An averaged power spectrum and its floor; white noise of variance s^2 has the power s^2.
+    """An averaged power spectrum and its noise floor; white noise of variance s^2 has the power s^2.
 
     Attributes:
         kx, ky: wave numbers, increasing [cycles per um].
-        power: mean over all weights [ky, kx].
-        floor: of that power [ky, kx].
-        is_searched: True where a wave may be [ky, kx]: one half of the plane, within limits.
+        power: mean over all tapers [ky, kx].
+        floor: expected power of the noise [ky, kx].
+        is_searched: True at the searched wave vectors [ky, kx]: one half of the plane, within limits.
         ring: independent values behind the floor.
-        blocks: behind it.
+        blocks: of the fields.
     """
 
     kx: np.ndarray
@@ -175,32 +204,29 @@ class Spectrum:
         return self.power / self.floor
 
     def false_alarm(self, ratio: float) -> float:
-        """Return how likely noise alone exceeds a ratio at one of the wave vectors searched."""
+        """Compute the probability that noise alone exceeds a ratio at any searched wave vector."""
         n = self.is_searched.sum() * self.blocks.cells / self.power.size
         averages = self.blocks.averages
         single = float(stats.f.sf(ratio, 2 * averages, 2 * averages * self.ring))
         return float(-np.expm1(max(_MAXIMA * n, 1.0) * np.log1p(-min(single, 1.0 - 1e-15))))
 
     def floor_at(self, kx: float, ky: float) -> float:
-        """Return the floor at the wave vector of the grid nearest to one [cycles per um]."""
+        """Return the floor at the grid point nearest to a wave vector [cycles per um]."""
         return float(self.floor[np.argmin(np.abs(self.ky - ky)), np.argmin(np.abs(self.kx - kx))])
 
 
-def take_spectrum(
-    fields: Sequence[np.ndarray], blocks: Blocks, steps: tuple[float, float], settings: RippleSettings
-) -> Spectrum:
-    """Return the averaged spectrum of one field, or of the part along the wave vector of a field of slopes (x, y).
+def take_spectrum(fields: Sequence[np.ndarray], blocks: Blocks, settings: RippleSettings) -> Spectrum:
+    """Compute the spectrum of one field, or of the component along the wave vector of a field of slopes (x, y).
 
     Args:
-        fields: [y, x]; only the blocks' pixels are looked at, less a polynomial.
+        fields: without trend [y, x].
         blocks: from `make_blocks`.
-        steps: pitch along x and y [um].
         settings: range of wavelengths.
 
     Raises:
         GuardError: no wave vector is left to search.
     """
-    width = blocks.bandwidth / steps[0], blocks.bandwidth / steps[1]
+    steps, width = blocks.steps, blocks.widths
     extent = max(int(max(np.ptp(b.rows), np.ptp(b.columns))) for b in blocks.blocks) + 1
     n = fft.next_fast_len(max(extent, math.ceil(6.0 / blocks.bandwidth)))
     kx, ky = (fft.fftshift(fft.fftfreq(n, step)) for step in steps)
@@ -213,16 +239,15 @@ def take_spectrum(
     searched = half & (k >= 1.0 / longest) & (k <= 1.0 / shortest)
     if not searched.any():
         raise GuardError(
-            f"no wavelength between {shortest:g} and {longest:g} um can be told from the raster's axes with a "
-            f"resolution of {1e3 * max(width):.2g} cycles per mm: enlarge the region, or "
-            "look along the axes, too (along_axes)"
+            f"no wavelength between {shortest:g} and {longest:g} um can be separated from the raster's axes at a "
+            f"resolution of {1e3 * max(width):.2g} cycles per mm: enlarge the region, or search along the axes "
+            "(along_axes)"
         )
     floor, ring = _floor(power, k, half, searched, blocks)
     found = Spectrum(kx, ky, power, floor, searched, ring, blocks)
     i, j = np.unravel_index(np.argmax(np.where(searched, found.ratio, -1.0)), power.shape)
-    lobe = np.hypot((kx - kx[j]) / width[0], ((ky - ky[i]) / width[1])[:, None]) < 1.5
-    if found.false_alarm(float(found.ratio[i, j])) <= 1e-3:  # a wave that is certain is no part of its own floor
-        half &= ~lobe
+    if found.false_alarm(float(found.ratio[i, j])) <= _CERTAIN:
+        half &= np.hypot((kx - kx[j]) / width[0], ((ky - ky[i]) / width[1])[:, None]) >= 1.5
         floor, ring = _floor(power, k, half, searched, blocks)
     if len(fields) == 2:
         floor = floor * _by_direction(power / floor, np.arctan2(ky[:, None], kx), half & (k >= 1.0 / longest), blocks)
@@ -230,21 +255,21 @@ def take_spectrum(
 
 
 def _by_direction(ratio: np.ndarray, theta: np.ndarray, use: np.ndarray, blocks: Blocks) -> np.ndarray:
-    """Return the noise of slopes by direction over its mean [ky, kx]: u' S u for a unit wave vector u.
+    """Fit the noise of slopes by direction, relative to its mean [ky, kx]: u' S u for a unit wave vector u.
 
-    White noise of two slopes with the covariance S has that power along u, whatever the wave number. S is fitted
-    to the ratios, cut at three times their median; where there are too few, noise is taken as equal.
+    White noise of two slopes with the covariance S has that power along u at every wave number. S is fitted to the
+    ratios, clipped at three times their median; isotropic noise is assumed where there are too few.
     """
     if use.sum() * blocks.cells / ratio.size < _RING_CELLS:
         return np.ones_like(ratio)
-    cut = np.minimum(ratio[use], 3.0 * np.median(ratio[use]))
+    clipped = np.minimum(ratio[use], 3.0 * np.median(ratio[use]))
     basis = np.stack([np.ones_like(theta), np.cos(2.0 * theta), np.sin(2.0 * theta)], -1)
-    level, b, c = np.linalg.lstsq(basis[use], cut, rcond=None)[0]
+    level, b, c = np.linalg.lstsq(basis[use], clipped, rcond=None)[0]
     return np.maximum(1.0 + (basis[..., 1] * b + basis[..., 2] * c) / level, 0.3)
 
 
 def _power(fields: Sequence[np.ndarray], blocks: Blocks, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
-    """Return the mean power over all weights [ky, kx]."""
+    """Compute the mean power over all tapers [ky, kx]."""
     n, k = kx.size, np.hypot(kx, ky[:, None])
     unit = [np.ones_like(k)] if len(fields) == 1 else [kx / (k + (k == 0)), ky[:, None] / (k + (k == 0))]
     power = np.zeros((n, n))
@@ -263,8 +288,7 @@ def _power(fields: Sequence[np.ndarray], blocks: Blocks, kx: np.ndarray, ky: np.
 def _floor(
     power: np.ndarray, k: np.ndarray, use: np.ndarray, searched: np.ndarray, blocks: Blocks
 ) -> tuple[np.ndarray, float]:
-    """Return the mean of the noise at every wave number [ky, kx], from the median over rings; and what that is worth in
-    independent values."""
+    """Compute the noise's mean power [ky, kx] from medians over rings, and the independent values behind it."""
     order = np.argsort(k[use])
     log_k, values = np.log(k[use][order]), power[use][order]
     per_point = blocks.cells / power.size
@@ -279,23 +303,7 @@ def _floor(
             high = low + fewest
         floors.append(np.median(values[low:high]))
         counts.append((high - low) * per_point)
-    to_mean = blocks.averages / special.gammaincinv(blocks.averages, 0.5)
+    mean_over_median = blocks.averages / special.gammaincinv(blocks.averages, 0.5)
     log_all = np.log(np.where(k > 0, k, np.exp(radii[0])))
-    floor = np.exp(np.interp(log_all, radii, np.log(np.maximum(floors, 1e-300)))) * to_mean
+    floor = np.exp(np.interp(log_all, radii, np.log(np.maximum(floors, 1e-300)))) * mean_over_median
     return floor, max(_MEDIAN * float(np.median(counts)), 1.0)
-
-
-def polynomial_basis(block: Block, degree: int) -> np.ndarray:
-    """Return an orthonormal basis of the polynomials over a block's pixels [pixel, term]."""
-    u, v = (2.0 * (a - a.min()) / max(int(np.ptp(a)), 1) - 1.0 for a in (block.columns, block.rows))
-    terms = [u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)]
-    return np.linalg.qr(np.stack(terms, -1))[0]
-
-
-def without_trend(field: np.ndarray, blocks: Blocks, degree: int) -> np.ndarray:
-    """Return a field less a polynomial on each block; 0 outside all blocks [y, x]."""
-    out = np.zeros(field.shape)
-    for block in blocks.blocks:
-        basis, values = polynomial_basis(block, degree), field[block.rows, block.columns]
-        out[block.rows, block.columns] = values - basis @ (basis.T @ values)
-    return out

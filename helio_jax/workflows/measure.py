@@ -1,6 +1,10 @@
-"""What `helio measure` answers: facets, profile, step, roughness, ripple, cracks, edges, as JSON and lines of text."""
+"""Measurements of `helio measure`: facets, profile, step, roughness, ripple, cracks, vertical edges.
+
+Each measurer returns a JSON-compatible record and lines of text; figures are drawn on request.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +17,11 @@ from helio_jax.figures.cracks import crack_panel
 from helio_jax.figures.overlay import facet_map
 from helio_jax.figures.ripple import ripple_panel
 from helio_jax.measure.crack_text import crack_lines, wall_lines
-from helio_jax.measure.cracks import CrackSettings, find_cracks
+from helio_jax.measure.cracks import find_cracks
 from helio_jax.measure.facets import Facets, FacetSettings, find_facets
+from helio_jax.measure.lines import LineSettings
 from helio_jax.measure.regions import inside_polygon, parse_region
-from helio_jax.measure.ripple import (
-    compare_with_images,
-    height_ripple,
-    image_spectra,
-)
+from helio_jax.measure.ripple import compare_with_images, height_ripple, image_spectra
 from helio_jax.measure.roughness import measure_profile, measure_roughness, measure_step
 from helio_jax.measure.spectrum import RippleSettings
 from helio_jax.measure.walls import WallSettings, find_walls
@@ -29,7 +30,10 @@ from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """What to measure; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`): where; `settings`: how."""
+    """Requested measurements; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`) and `settings` apply to them.
+
+    `table`: a row for every crack and vertical edge will be written.
+    """
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None
@@ -42,160 +46,213 @@ class Wanted(NamedTuple):
     table: bool = False
     settings: Mapping[str, Any] = {}
 
+    @property
+    def lines(self) -> bool:
+        """Whether cracks or vertical edges are requested."""
+        return self.cracks or self.vertical_edges
 
-_SETTINGS = {"facets": FacetSettings, "ripple": RippleSettings, "cracks": CrackSettings, "vertical_edges": WallSettings}
+
+@dataclass
+class _Job:
+    """Input of the measurers, and their results: record, lines of text."""
+
+    rec: Reconstruction
+    wanted: Wanted
+    regions: list[np.ndarray]
+    settings: dict[str, Any]
+    figure: str | Path | None
+    stack: MicrographStack | None
+    found: dict[str, Any] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+
+
+_SETTINGS = {"facets": FacetSettings, "ripple": RippleSettings, "cracks": LineSettings, "vertical_edges": WallSettings}
 """Settings of each measurement, by its field of `Wanted`."""
 
 
 def _settings(wanted: Wanted) -> dict[str, Any]:
-    """Return the settings of each measurement: those of `wanted.settings` that it has."""
+    """Return the settings of each requested measurement, with the entries of `wanted.settings` that belong to it."""
     has = {name: kind.model_fields.keys() for name, kind in _SETTINGS.items() if getattr(wanted, name)}
     known = sorted(set().union(*has.values()))
     for key in wanted.settings:
         if key not in known:
-            raise SceneError(f"--set {key}: what is measured has no such setting, only: {', '.join(known) or 'none'}")
+            raise SceneError(
+                f"--set {key}: the requested measurements have no such setting, only: {', '.join(known) or 'none'}"
+            )
     chosen = {name: {k: v for k, v in wanted.settings.items() if k in has.get(name, ())} for name in _SETTINGS}
     return {name: kind().changed(**chosen[name]) for name, kind in _SETTINGS.items()}
+
+
+def _check(wanted: Wanted, has_figure: bool, has_stack: bool) -> None:
+    """Check that the options go together.
+
+    Raises:
+        SceneError: they do not.
+    """
+    w = wanted
+    refused = (
+        (
+            not (w.facets or w.profile or w.roughness or w.ripple or w.lines),
+            "measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple, --cracks, "
+            "--vertical-edges",
+        ),
+        (w.step and not w.profile, "--step needs --profile X0 Y0 X1 Y1 across the step"),
+        (
+            has_figure and w.facets + w.ripple + w.lines != 1,
+            "--figure draws the facets, the ripple, or cracks and vertical edges: add --facets, --ripple, or --cracks "
+            "and/or --vertical-edges, and none of the others",
+        ),
+        (
+            w.regions and not (w.ripple or w.roughness or w.lines),
+            "--region limits --ripple, --roughness, --cracks and --vertical-edges: add one of them",
+        ),
+        (has_stack and not (w.ripple or w.cracks), "--stack is used by --ripple and --cracks: add one of them"),
+        (w.cracks and not has_stack, "--cracks needs the micrographs: add --stack FILE.h5, from helio calibrate"),
+        (
+            w.table and not w.lines,
+            "--table has a row for every crack and vertical edge: add --cracks or --vertical-edges",
+        ),
+    )
+    for is_wrong, message in refused:
+        if is_wrong:
+            raise SceneError(message)
 
 
 def measure_height_map(
     rec: Reconstruction, wanted: Wanted, figure: str | Path | None = None, stack: MicrographStack | None = None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Measure what is wanted; return a JSON-compatible record and lines to print.
+    """Make the requested measurements; return a JSON-compatible record and lines to print.
 
     Args:
         rec: heights.
-        wanted: what to measure.
-        figure: picture of the facets, of the ripple, or of cracks and vertical edges.
-        stack: calibrated micrographs of these heights: to ask about the ripple, to find cracks in.
+        wanted: requested measurements.
+        figure: file for the figure of the facets, of the ripple, or of cracks and vertical edges.
+        stack: calibrated micrographs of these heights, for the test of the ripple and for cracks.
 
     Raises:
-        SceneError: nothing is wanted, a step or a figure without what it needs, or a setting that nothing wanted has.
-        GuardError: too little is known there.
+        SceneError: options that do not go together, or an unknown setting.
+        GuardError: too few heights are known.
     """
-    lines_wanted = wanted.cracks or wanted.vertical_edges
-    if not (wanted.facets or wanted.profile or wanted.roughness or wanted.ripple or lines_wanted):
-        raise SceneError(
-            "measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple, --cracks, "
-            "--vertical-edges"
-        )
-    if wanted.step and not wanted.profile:
-        raise SceneError("--step needs --profile X0 Y0 X1 Y1 across the step")
-    if figure and wanted.facets + wanted.ripple + lines_wanted != 1:
-        raise SceneError(
-            "--figure draws the facets, the ripple, or cracks and vertical edges: give --facets, --ripple, or --cracks "
-            "and/or --vertical-edges with it, and none of the others"
-        )
-    if wanted.regions and not (wanted.ripple or wanted.roughness or lines_wanted):
-        raise SceneError(
-            "--region says where --ripple, --roughness, --cracks and --vertical-edges measure: give one of them, too"
-        )
-    if stack is not None and not (wanted.ripple or wanted.cracks):
-        raise SceneError("--stack is asked about the ripple, and for cracks: give --ripple or --cracks, too")
-    if stack is None and wanted.cracks:
-        raise SceneError("--cracks are found in the micrographs: give --stack FILE.h5, which helio calibrate wrote")
-    if wanted.table and not lines_wanted:
-        raise SceneError("--table has a row for every crack and vertical edge: give --cracks or --vertical-edges, too")
+    _check(wanted, figure is not None, stack is not None)
     how = _settings(wanted)
     regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
-    where = regions or [np.ones(rec.height.shape, bool)]
-    found: dict[str, Any] = {"reconstructed": reconstructed_area(rec)}
-    lines = [f"reconstructed: {found['reconstructed']['share']:.1%} of the raster"]
-    if wanted.facets:
-        facets = find_facets(rec, how["facets"])
-        found["facets"] = facets.as_dict()
-        lines += _facet_lines(facets)
-        if figure:
-            save_figure(facet_map(rec, facets.labels), figure)
-    if wanted.profile:
-        line = measure_profile(rec, wanted.profile[:2], wanted.profile[2:])
-        found["profile"] = {
-            "distance_um": line.distance,
-            "height_um": line.height,
-            "height_std_um": line.height_std,
-        }
-        if wanted.step:
-            step = measure_step(line)
-            found["step"] = vars(step)
-            lines.append(f"step: {step.height:.2f} +- {step.height_std:.2f} um at {step.position:.0f} um")
-        else:
-            lines += [f"{d:10.2f} {h:10.3f}" for d, h in zip(line.distance, line.height, strict=True)]
-    if wanted.roughness:
-        numbers = vars(measure_roughness(rec, np.any(regions, axis=0) if regions else None))
-        found["roughness"] = numbers
-        units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
-        lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
-    if wanted.ripple:
-        found["ripple"], more = _ripple(rec, where, figure, stack, how["ripple"])
-        lines += more
-    if lines_wanted:
-        cracks = find_cracks(rec, stack, where, how["cracks"]) if wanted.cracks and stack is not None else None
-        walls = find_walls(rec, np.any(where, axis=0), how["vertical_edges"]) if wanted.vertical_edges else None
-        if cracks is not None:
-            found["cracks"] = cracks.as_dict()
-            lines += crack_lines(cracks)
-            if not regions:
-                lines.append("  all of the raster was searched, feet of steps and debris too: --region takes one face")
-        if walls is not None:
-            found["vertical_edges"] = walls.as_dict()
-            lines += wall_lines(walls)
-        if figure:
-            save_figure(crack_panel(rec, np.any(where, axis=0), stack, cracks, walls), figure)
-    return as_json(found), lines
+    job = _Job(rec, wanted, regions or [np.ones(rec.height.shape, bool)], how, figure, stack)
+    job.found["reconstructed"] = area = reconstructed_area(rec)
+    job.lines.append(f"reconstructed: {area['share']:.1%} of the raster")
+    for is_wanted, measure in (
+        (wanted.facets, _measure_facets),
+        (wanted.profile, _measure_profile),
+        (wanted.roughness, _measure_roughness),
+        (wanted.ripple, _measure_ripple),
+        (wanted.lines, _measure_lines),
+    ):
+        if is_wanted:
+            measure(job)
+    return as_json(job.found), job.lines
 
 
-def _ripple(
-    rec: Reconstruction,
-    regions: list[np.ndarray],
-    figure: str | Path | None,
-    stack: MicrographStack | None,
-    settings: RippleSettings,
-) -> tuple[dict[str, Any], list[str]]:
-    """Measure the strongest ripple; return a record and lines."""
-    r, spectrum, along = height_ripple(rec, regions, settings)
-    lines = [
+def _measure_facets(job: _Job) -> None:
+    facets = find_facets(job.rec, job.settings["facets"])
+    job.found["facets"] = facets.as_dict()
+    job.lines += _facet_lines(facets)
+    if job.figure:
+        save_figure(facet_map(job.rec, facets.labels), job.figure)
+
+
+def _measure_profile(job: _Job) -> None:
+    """Read a profile and, if requested, its step."""
+    assert job.wanted.profile is not None  # the caller checks
+    line = measure_profile(job.rec, job.wanted.profile[:2], job.wanted.profile[2:])
+    job.found["profile"] = {
+        "distance_um": line.distance,
+        "height_um": line.height,
+        "height_std_um": line.height_std,
+    }
+    if job.wanted.step:
+        step = measure_step(line)
+        job.found["step"] = vars(step)
+        job.lines.append(f"step: {step.height:.2f} +- {step.height_std:.2f} um at {step.position:.0f} um")
+    else:
+        job.lines += [f"{d:10.2f} {h:10.3f}" for d, h in zip(line.distance, line.height, strict=True)]
+
+
+def _measure_roughness(job: _Job) -> None:
+    numbers = vars(measure_roughness(job.rec, np.any(job.regions, axis=0)))
+    job.found["roughness"] = numbers
+    units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
+    job.lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
+
+
+def _measure_ripple(job: _Job) -> None:
+    """Measure the strongest ripple, and test it on the micrographs."""
+    how, stack = job.settings["ripple"], job.stack
+    r, spectrum, along = height_ripple(job.rec, job.regions, how)
+    excluded = "" if how.along_axes else ", which are excluded because of scan lines"
+    job.lines += [
         f"ripple: wavelength {r.wavelength_um:.1f} +- {r.wavelength_std_um:.1f} um, amplitude {r.amplitude:.3f} +- "
         f"{r.amplitude_std:.3f} um, wave vector at {r.direction_deg:+.1f} +- {r.direction_std_deg:.1f} deg from x",
-        f"  peak {r.peak_over_floor:.1f} x floor, mean of {r.averages} spectra; noise alone anywhere in the range: "
-        f"{r.false_alarm:.1e}",
-        f"  {r.axis_angle_deg:.0f} deg from the raster's axes, where nothing was looked for: scan lines are there",
+        f"  peak {r.peak_over_floor:.1f} x noise floor, mean of {r.averages} spectra; false-alarm probability in the "
+        f"searched range {r.false_alarm:.1e}",
+        f"  {r.axis_angle_deg:.0f} deg from the raster's axes{excluded}",
     ]
     record = r.as_dict()
+    spectra = {"heights": spectrum}
     if stack is not None:
-        a = compare_with_images(stack, r, regions, settings)
-        record["micrographs"] = vars(a) | {"verdict": a.verdict}
-        for name, share in a.shares.items():
-            lines.append(
-                f"  {name}: {share:.2%} +- {a.shares_std[name]:.2%} of the signal, a wave of the surface: "
-                f"{a.expected[name]:.2%}"
+        check = compare_with_images(stack, r, job.regions, how)
+        record["micrographs"] = vars(check) | {"verdict": check.verdict}
+        for name, share in check.shares.items():
+            std, expected = check.shares_std[name], check.expected[name]
+            job.lines.append(f"  {name}: {share:.2%} +- {std:.2%} of the signal, surface wave: {expected:.2%}")
+        job.lines.append(
+            f"  {check.verdict} (amplitude {check.amplitude_um:.3f} um; false alarm {check.false_alarm:.1e}, misfit "
+            f"{check.misfit:.1e})"
+        )
+    job.found["ripple"] = record
+    if job.figure:
+        spectra |= image_spectra(stack, job.regions, how) if stack is not None else {}
+        save_figure(ripple_panel(job.rec, along, job.regions, r, spectra), job.figure)
+
+
+def _measure_lines(job: _Job) -> None:
+    """Find cracks and vertical edges."""
+    wanted, inside = job.wanted, np.any(job.regions, axis=0)
+    cracks = walls = None
+    if wanted.cracks and job.stack is not None:
+        cracks = find_cracks(job.rec, job.stack, inside, job.settings["cracks"])
+        job.found["cracks"] = cracks.as_dict()
+        job.lines += crack_lines(cracks)
+        if not wanted.regions:
+            job.lines.append(
+                "  the whole raster was searched, including feet of steps and debris: --region selects one face"
             )
-        lines.append(f"  {a.verdict} ({a.amplitude_um:.3f} um high; noise {a.false_alarm:.1e}, misfit {a.misfit:.1e})")
-    if figure:
-        images = image_spectra(stack, regions, settings) if stack is not None else {}
-        save_figure(ripple_panel(rec, along, regions, r, {"heights": spectrum, **images}), figure)
-    return record, lines
+    if wanted.vertical_edges:
+        walls = find_walls(job.rec, inside, job.settings["vertical_edges"])
+        job.found["vertical_edges"] = walls.as_dict()
+        job.lines += wall_lines(walls)
+    if job.figure:
+        save_figure(crack_panel(job.rec, inside, job.stack, cracks, walls), job.figure)
 
 
 def reconstructed_area(rec: Reconstruction, max_std_um: float = 20.0) -> dict[str, Any]:
-    """Return the share of the raster that is reconstructed: valid, and its height known to `max_std_um` if stated.
+    """Compute the fraction of the raster that is valid and whose height is known to `max_std_um` if stated.
 
-    With a free border heights count from their median, for their common level means nothing there.
+    With a free border the errors are taken relative to their median, because the common level is not determined.
     """
     good = rec.is_valid & np.isfinite(rec.height)
     std = rec.height_std
     if rec.height_samples is not None and good.any() and rec.provenance.get("reconstruct", {}).get("border") == "free":
         level = np.median(rec.height_samples[:, good], axis=1)
         std = np.sqrt(np.mean((rec.height_samples - level[:, None, None]) ** 2, axis=0))
-    sure = good if std is None else good & (std <= max_std_um)
+    known = good if std is None else good & (std <= max_std_um)
     return {
-        "share": float(sure.mean()),
+        "share": float(known.mean()),
         "valid_share": float(good.mean()),
         "max_std_um": max_std_um if rec.height_std is not None else None,
     }
 
 
 def _facet_lines(facets: Facets) -> list[str]:
-    """Return a table of facets and one of edges."""
+    """Format a table of facets and one of edges."""
     lines = ["facet  tilt  azimuth  area (mm2)         long (um)   short (um)  projected  rms (um)"]
     for f in facets.facets:
         lines.append(

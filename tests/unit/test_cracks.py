@@ -1,4 +1,4 @@
-"""Cracks against closed forms and our own tracer: slits, grooves, creases, steps, and what is none of them."""
+"""Cracks against closed forms and the tracer: slits, grooves, creases, steps, and other lines."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ from helio_jax.measure.cracks import find_cracks
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.workflows.measure import Wanted, measure_height_map
 
-EVERYWHERE = [np.ones((SIZE, SIZE), bool)]
+EVERYWHERE = np.ones((SIZE, SIZE), bool)
 TURN = math.radians(33.0)
 ACROSS = -math.sin(TURN) * GRID_X + math.cos(TURN) * GRID_Y - 41.0
 ALONG = math.cos(TURN) * GRID_X + math.sin(TURN) * GRID_Y
@@ -49,11 +49,11 @@ def slit(depth=(0.5, 0.4, 0.6), width=40.0, length=LENGTH, blur=10.0) -> np.ndar
 
 
 def test_a_slit_is_measured():
-    """16 noises with drift, scan lines and ripple: found once each, in its place; pulls of length and missing signal.
+    """16 seeds of noise with drift, scan lines and ripple: one slit each, in its place; length and missing signal.
 
-    True: 700 um long, 40 um wide, missing 20, 16 and 24 um. Pulls are chi-square within a factor of 1.6 in the errors,
-    the width within 5 um. Catches the filter's length added to the line (+100 um), a missing signal without the pixel's
-    size, errors of one pixel, and a fit that takes the bottom of the line for its surroundings.
+    True: 700 um long, 40 um wide, missing 20, 16 and 24 um. The pulls' sum of squares is chi-square for errors up to
+    1.6 times the stated ones, the width is within 5 um. Catches the filter's length added to the line (+100 um), a
+    missing signal without the pixel's size, errors of one pixel, and a fit of the line's bottom as its surroundings.
     """
     lengths, missing, widths = [], [], []
     for seed in range(16):
@@ -75,11 +75,11 @@ def test_a_slit_is_measured():
     assert np.nanmean(widths) == pytest.approx(40.0, abs=5.0)
 
 
-def test_what_is_no_crack():
-    """Noise, drift, scan lines and ripple alone: nothing. One detector's line, a bright line, a ridge: not counted.
+def test_other_lines_are_not_counted():
+    """Noise, drift, scan lines and ripple alone: nothing. A bright line, a ridge: not counted.
 
-    A line of one detector alone is left out; of a bright one and of a ridge nothing is counted. Catches lines judged by
-    their score alone, the sign of the kink, and the sign of the contrast.
+    A line in one detector only is rejected. Catches lines judged by their score alone, the sign of the kink, and the
+    sign of the contrast.
     """
     for seed in range(4):
         assert find_cracks(make_rec(), make_stack(nuisance(seed), 50 + seed), EVERYWHERE).counted == ()
@@ -92,17 +92,17 @@ def test_what_is_no_crack():
 
 
 def groove_height(width: float, slope: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return heights of a groove across the field, -slope width exp(-|t| / width), and its slope along the normal."""
+    """Heights of a groove across the field, -slope width exp(-|t| / width), and its slope along the normal."""
     t = ACROSS / width
     return -slope * width * np.exp(-np.abs(t)), slope * np.sign(t) * np.exp(-np.abs(t))
 
 
 @pytest.mark.parametrize("reason", ["valid", "floating"])
 def test_a_groove_is_measured(reason):
-    """Depth 18 um, kink 2 x 0.2: found also where the level floats; depth below shoulders 12 pixels away, 16.2 um.
+    """Depth 18 um, kink 2 x 0.2, also where the level floats; depth below shoulders 12 pixels away 16.2 um.
 
-    Full width at half of that depth 83 um (both closed forms). Catches heights that are thrown away where only their
-    level floats, the depth below one shoulder, and the slope of one flank given for the kink.
+    Full width at half of that depth 83 um (both closed forms). Catches heights discarded where only their level
+    floats, the depth below one shoulder, and the slope of one flank reported as the kink.
     """
     height, slope = groove_height(90.0, 0.2)
     found = find_cracks(make_rec(height, reason=reason), make_stack(shaped(slope), 4), EVERYWHERE)
@@ -116,11 +116,11 @@ def test_a_groove_is_measured(reason):
     assert [k for k in found.counted if k.number != c.number] == []
 
 
-def test_a_crease_and_a_step_are_none():
-    """The foot of a slope is a crease; a sharp edge of 15 um between flats is a step of that height; neither counts.
+def test_a_crease_and_a_step_are_not_counted():
+    """The foot of a slope is a crease; a sharp edge of 15 um between planes is a step of that height; neither counts.
 
-    Catches a step taken for a slit (it is dark in two detectors or one), a foot taken for a groove, also
-    by the roughness of heights whose method gives no deviations.
+    Catches a step classified as a slit (it is dark in one or two detectors), a foot classified as a groove, also for
+    rough heights without deviations.
     """
     foot = np.where(ACROSS > 0.0, 0.3, 0.0)
     found = find_cracks(make_rec(np.maximum(ACROSS, 0.0) * 0.3), make_stack(shaped(foot), 5), EVERYWHERE)
@@ -136,12 +136,12 @@ def test_a_crease_and_a_step_are_none():
 
 @pytest.mark.parametrize(("azimuth", "kind"), [(45.0, "slit"), (90.0, "slit"), (120.0, "slit"), (75.0, "line")])
 def test_traced_slits(azimuth, kind):
-    """Slits 40 x 200 x 500 um from our own tracer, noise of the measured salt: found, as long and in that direction.
+    """Traced slits of 40 x 200 x 500 um, noise of the measured salt: detected with their length and direction.
 
-    The bound of the depth is below the depth, and no detector lacks more than the opening. Lit walls make one of them
-    bright in two detectors: then it is a line that nobody calls a slit. Length: within 3 deviations. Catches a slit's
-    brightness taken for constant along it (400 instead of 500 um at 120 deg), a bound without the beam's slant where it
-    matters, and a detection that only the drawn profiles of the tests pass.
+    The bound of the depth is below the depth, and no detector lacks more than the opening. Illuminated walls make one
+    of them bright in two detectors: it is a line, not a slit. Length: within 3 deviations. Catches a slit's brightness
+    assumed constant along it (400 instead of 500 um at 120 deg), a bound without the beam's slant, and a detection that
+    works for the synthetic profiles of the tests only.
     """
     from pathlib import Path
 
@@ -168,7 +168,7 @@ def test_traced_slits(azimuth, kind):
         np.zeros(shape), stack.x, stack.y, stack.instrument, "linear", up, np.ones(shape), np.ones(shape, bool),
         np.zeros(shape, int),
     )  # fmt: skip
-    c = find_cracks(flat, stack, [np.ones(shape, bool)]).cracks[0]
+    c = find_cracks(flat, stack, np.ones(shape, bool)).cracks[0]
     assert c.kind == kind and c.false_alarms < 1e-20
     turned = (c.direction_deg - azimuth + 90.0) % 180.0 - 90.0
     assert abs(turned) < 4.0

@@ -1,4 +1,4 @@
-"""Lines in micrographs: what filters answer to, false alarms in noise with scan lines, drift and ripple, courses."""
+"""Lines in micrographs: filter responses, false alarms in noise with scan lines, drift and ripple, paths."""
 
 import math
 
@@ -17,7 +17,7 @@ PITCH, SIZE = 20.0, 80
 AXIS = (np.arange(SIZE) - 0.5 * (SIZE - 1)) * PITCH
 GRID_X, GRID_Y = np.meshgrid(AXIS, AXIS)
 NOISE = (0.025, 0.034, 0.053)
-"""Of one pixel over the flat's signal, as on the measured salt."""
+"""Standard deviation of one pixel over the substrate's signal, as on the measured salt."""
 AZIMUTHS = (0.0, 2.0 * math.pi / 3.0, -2.0 * math.pi / 3.0)
 
 
@@ -38,7 +38,7 @@ def make_stack(contrast=0.0, seed=0, noise=NOISE, **changes) -> MicrographStack:
 
 
 def nuisance(seed: int) -> np.ndarray:
-    """Drift of 10 %, scan lines of 8 % and a ripple of 1 %: what salt has, and no line of the surface."""
+    """Drift of 10 %, scan lines of 8 % and a ripple of 1 %, as on salt: no line of the surface."""
     rng = np.random.default_rng(1000 + seed)
     drift = 0.05 * np.sin(GRID_Y / 400.0 + np.array([0.0, 1.0, 2.0])[:, None, None]) + 0.05 * GRID_X / 800.0
     ripple = 0.01 * np.sin(2.0 * np.pi * (GRID_X - GRID_Y) / math.sqrt(2.0) / 114.0)
@@ -46,10 +46,10 @@ def nuisance(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_answers_of_the_filters(order):
-    """A line lacking 2 pixels' signal answers with 2, a step of 0.3 with 0.3, in any direction; a level with 0.
+def test_filter_responses(order):
+    """Responses: a line lacking 2 pixels of signal 2, a step of 0.3 0.3, in any direction; a constant 0.
 
-    To 5 % (pixels of finite size). Catches a kernel that is not normalised, and one turned the wrong way.
+    To 5 % (pixels of finite size). Catches a kernel that is not normalised or rotated the wrong way.
     """
     for angle in np.radians([0.0, 30.0, 77.0, 120.0]):
         k = kernel(order, 1.6, angle)
@@ -57,7 +57,7 @@ def test_answers_of_the_filters(order):
         y, x = np.mgrid[-n : n + 1, -n : n + 1]
         t = math.cos(angle) * x + math.sin(angle) * y
         thin = -2.0 * np.exp(-0.5 * (t / 0.5) ** 2) / (0.5 * math.sqrt(2.0 * math.pi))
-        wide = (1.0 + (0.5 / 1.6) ** 2) ** -1.5  # by which a line of deviation 0.5 answers less
+        wide = (1.0 + (0.5 / 1.6) ** 2) ** -1.5  # response of a line of deviation 0.5
         expected = {1: (0.15 * np.sign(t), 0.3), 2: (thin, 2.0 * wide)}[order]
         assert np.sum(k * expected[0]) == pytest.approx(expected[1], rel=0.05)
         assert abs(np.sum(k)) < 1e-6
@@ -72,11 +72,10 @@ def test_density_of_maxima():
 
 
 def test_false_alarms():
-    """14 images of noise, drift, scan lines and ripple, 10 false alarms allowed in each: as many at most, but some.
+    """14 images of noise, drift, scan lines and ripple, 10 false alarms allowed in each: at most 140 lines, but some.
 
-    Counted are lines of both kinds; allowed are 140. Catches a threshold of one pixel instead of all, directions that
-    are not counted (40 times as many), scan lines that are taken for lines (hundreds), and a threshold so high that
-    nothing is ever seen.
+    Catches a threshold for one pixel instead of all, directions that are not counted (40 times as many lines), scan
+    lines detected as lines (hundreds), and a threshold so high that nothing is ever detected.
     """
     s = LineSettings(false_alarms=10.0, min_length_px=3.0)
     everywhere, n = np.ones((SIZE, SIZE), bool), 0
@@ -88,10 +87,10 @@ def test_false_alarms():
     assert n > 5
 
 
-def test_scan_lines_are_taken_off():
-    """Offsets of 8 % of whole lines: their jumps fall to twice the noise of a mean; along the wrong axis they stay.
+def test_offsets_of_scan_lines_are_subtracted():
+    """Offsets of 8 % of whole lines: their jumps fall below twice the noise of a mean; along the wrong axis they stay.
 
-    Catches offsets taken along the slow axis.
+    Catches offsets determined along the slow axis.
     """
     lines = 0.08 * np.random.default_rng(5).standard_normal((3, SIZE, 1))
     right, wrong = (contrast_of(make_stack(lines, 1, fast_axis=axis)) for axis in ("x", "y"))
@@ -99,10 +98,10 @@ def test_scan_lines_are_taken_off():
     assert jumps[0] < 2.0 * NOISE[0] * math.sqrt(2.0 / SIZE) and jumps[1] > 0.08
 
 
-def test_course_of_a_bent_line():
+def test_path_of_a_bent_line():
     """A dark arc of 600 um radius, 90 deg long: one path of 942 um, every point within half a pixel of the arc.
 
-    Catches a line broken at every change of direction, two paths side by side, and a course that wanders.
+    Catches a line broken at every change of direction, two paths side by side, and a wandering path.
     """
     r, a = np.hypot(GRID_X + 300.0, GRID_Y + 200.0), np.arctan2(GRID_Y + 200.0, GRID_X + 300.0)
     arc = -0.4 * np.exp(-0.5 * ((r - 600.0) / 12.0) ** 2) * ((a > 0.0) & (a < 0.5 * math.pi))
@@ -115,7 +114,7 @@ def test_course_of_a_bent_line():
 
 
 def test_pieces_of_a_path():
-    """An extended path of 10 pixels is 16 long; parts of it lie where they lay; moved left by 1."""
+    """A path of 10 pixels extended by 3 at both ends is 16 long; its parts keep their places; shifted left by 1."""
     path = Path(np.stack([np.linspace(3.0, 9.0, 11), np.linspace(4.0, 12.0, 11)], -1), 9.0)
     assert path.length == pytest.approx(10.0) and path.extended(3.0).length == pytest.approx(16.0)
     piece = path.extended(3.0).between(3.0, 13.0)
@@ -126,8 +125,8 @@ def test_pieces_of_a_path():
     assert path.moved(1.0).points[0] == pytest.approx(np.array([3.0 - 0.8, 4.0 + 0.6]))
 
 
-def test_what_lines_need():
-    """A stack that is not calibrated, of unknown noise or of two detectors, and a region without pixels are told."""
+def test_refused_stacks():
+    """A stack that is not calibrated or of unknown noise, and a region without pixels are refused."""
     stack = make_stack()
     for changes, words in (({"n_rays": None}, "helio calibrate"), ({"variance": None}, "variance")):
         with pytest.raises(SceneError, match=words):
@@ -136,8 +135,8 @@ def test_what_lines_need():
         find_lines(contrast_of(stack), np.zeros((SIZE, SIZE), bool), "line", LineSettings())
 
 
-def test_a_known_background_is_no_signal():
-    """Catches contrasts over the reading: a background of twice the signal would make them three times too small."""
+def test_a_known_background_is_subtracted():
+    """Catches contrast relative to the reading: a background of twice the signal would make it three times too small."""
     plain = make_stack(0.1 * nuisance(1))
     read = plain.replace(counts=plain.counts + 2.0, background=np.full(3, 2.0))
     assert contrast_of(read).values == pytest.approx(contrast_of(plain).values)

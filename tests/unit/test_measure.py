@@ -128,12 +128,12 @@ def test_area_of_a_tilted_plane(incidence):
 
 
 def test_roughness_of_a_sinusoid():
-    """z = a sin(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 times the cell's transfer.
+    """z = a cos(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 times the cell's transfer.
 
     Catches peak-to-valley for amplitude, excess kurtosis, and slopes of half the step.
     """
     a, k = 7.0, 2 * math.pi / 404.0  # 101 pixels hold five whole periods
-    rough = measure_roughness(make_rec(lambda x, y: a * np.sin(k * x)), level="mean")
+    rough = measure_roughness(make_rec(lambda x, y: a * np.cos(k * x)))
     assert rough.Sa == pytest.approx(2 * a / math.pi, rel=2e-3)
     assert rough.Sq == pytest.approx(a / math.sqrt(2), rel=1e-9)
     assert abs(rough.Ssk) < 1e-9 and rough.Sku == pytest.approx(1.5, rel=1e-9)
@@ -144,10 +144,11 @@ def test_roughness_of_a_sinusoid():
 
 
 def test_roughness_is_levelled_by_a_plane():
-    """A tilted plane has Sq = 0 but Sdr = 0, too, once levelled; unlevelled Sdr is 1/cos - 1."""
+    """A tilted plane has Sq = 0 and Sdr = 0; a roof of slopes +-0.5 on it has Sdr = sqrt(1.25) - 1."""
     rec = make_rec(lambda x, y: 0.5 * x)
     assert measure_roughness(rec).Sq < 1e-9 and measure_roughness(rec).Sdr < 1e-9
-    assert measure_roughness(rec, level="mean").Sdr == pytest.approx(100 * (math.sqrt(1.25) - 1), rel=1e-9)
+    roof = measure_roughness(make_rec(lambda x, y: 0.5 * np.abs(x) + 0.3 * y))
+    assert roof.Sdr == pytest.approx(100 * (math.sqrt(1.25) - 1), rel=1e-9)
     with pytest.raises(GuardError, match="16 or more valid pixels, got 0"):
         measure_roughness(rec, np.zeros(rec.height.shape, bool))
 

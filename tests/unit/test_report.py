@@ -145,6 +145,6 @@ def test_refusals_and_atomic_write(tmp_path, monkeypatch):
     with pytest.raises(SceneError, match="must name one of"):
         Reference("beauty", 1.0)
     monkeypatch.setattr("helio_jax.formats.safe.os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(SceneError, match="r.html: disk full"):
+    with pytest.raises(SceneError, match="disk full"):
         write_report(tmp_path / "r.html", stack, rec)
     assert list(tmp_path.iterdir()) == []

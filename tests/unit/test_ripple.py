@@ -12,11 +12,7 @@ from test_measure import PITCH, make_rec
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.measure.regions import inside_polygon, parse_region
-from helio_jax.measure.ripple import (
-    compare_with_images,
-    height_ripple,
-    image_ripple,
-)
+from helio_jax.measure.ripple import compare_with_images, height_ripple, image_spectra
 from helio_jax.measure.spectrum import RippleSettings, make_blocks, take_spectrum, without_trend
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS
@@ -51,10 +47,10 @@ def surface_response(slope: float) -> tuple[float, ...]:
 
 
 def test_wavelength_amplitude_and_errors():
-    """A wave of 0.3 um in heights with white noise: 48 noises; squares of the pulls are chi-square.
+    """A wave of 0.3 um in heights with white noise, 48 seeds: the sum of the squared pulls is chi-square.
 
-    Half of crest to trough, corrected for the central difference (0.75 of the slope at 4.75 pixels). Catches that
-    correction left out (6 deviations of each), crest to trough for amplitude, and errors wrong by a factor of 2.
+    Amplitude: half of crest to trough, corrected for the central difference (0.75 of the slope at 4.75 pixels).
+    Catches that correction omitted (6 deviations of each), crest to trough for amplitude, errors wrong by a factor 2.
     """
     pulls = []
     for seed in range(48):
@@ -75,9 +71,9 @@ def test_wavelength_amplitude_and_errors():
 
 
 def test_floating_regions_ripple_too():
-    """Where only a region's level floats its ripple is measured; where it is masked it is not.
+    """The ripple of a region whose level floats is measured, that of a masked region is not.
 
-    Catches floating pixels left out: a crystal whose level nothing fixes then has no ripple.
+    Catches floating pixels excluded: a crystal whose level is not determined then has no ripple.
     """
     rec = make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01)
     for name in ("floating", "masked in too many detectors"):
@@ -91,42 +87,48 @@ def test_floating_regions_ripple_too():
 
 
 def test_noise_alone():
-    """White noise in an image, and in slopes of unequal noise: 60 each; a false alarm below 0.1 in few more than 6.
+    """White noise in an image, and in slopes of unequal noise, 60 each: false-alarm probability below 0.1 in about 6.
 
-    Fewer is allowed (the stated probability is an upper limit), but not none of 0.9. Catches a single point's
-    probability given for that of the whole range (0.1 is then passed in nearly all), and a floor too low by 1.5.
+    Fewer are allowed (the probability is an upper limit), but some must be below 0.9. Catches the probability of a
+    single wave vector instead of the whole range (below 0.1 in nearly all cases), and a floor too low by 1.5.
     """
-    blocks, settings = make_blocks([TRIANGLE], RippleSettings().block_px), RippleSettings()
+    blocks = make_blocks([TRIANGLE], (PITCH, PITCH))
     rng = np.random.default_rng(3)
     for mix in (np.eye(1), np.array([[1.0, 0.5], [0.0, 0.6]])):
         alarms = []
         for _ in range(60):
             noise = np.tensordot(mix, rng.standard_normal((len(mix), 60, 60)), 1)
-            fields = [without_trend(field, blocks, settings.degree) for field in noise]
-            spectrum = take_spectrum(fields, blocks, (PITCH, PITCH), settings)
+            fields = [without_trend(field, blocks) for field in noise]
+            spectrum = take_spectrum(fields, blocks, RippleSettings())
             alarms.append(spectrum.false_alarm(float(spectrum.ratio[spectrum.is_searched].max())))
         assert_likely(float(stats.binom.sf(np.sum(np.array(alarms) < 0.1) - 1, 60, 0.1)), f"{sorted(alarms)[:8]}")
         assert np.min(alarms) < 0.9
 
 
 def test_scan_lines_are_no_ripple():
-    """Offsets of whole rows, ten times the noise: passed over about the axes; with `along_axes` they are the peak.
+    """Offsets of whole rows, ten times the noise: excluded near the axes; with `along_axes` they are the peak.
 
-    Catches line noise taken for a ripple, and an exclusion that takes real ones along (asked for, they are found).
+    Catches line noise reported as a ripple, and an exclusion that `along_axes` does not lift.
     """
     stack = make_stack(noise=0.01)
     lines = stack.replace(counts=stack.counts + 0.1 * np.random.default_rng(9).standard_normal((3, 60, 1)))
-    assert image_ripple(lines, 0, [TRIANGLE]).false_alarm > 1e-3
-    along = image_ripple(lines, 0, [TRIANGLE], RippleSettings(along_axes=True))
-    assert along.false_alarm < 1e-3 and along.axis_angle_deg < 10.0 and abs(along.direction_deg) > 80.0
+
+    def strongest(along_axes: bool) -> tuple[float, float]:
+        s = image_spectra(lines, [TRIANGLE], RippleSettings(along_axes=along_axes))["forward"]
+        i, j = np.unravel_index(np.argmax(np.where(s.is_searched, s.ratio, -1.0)), s.ratio.shape)
+        return s.false_alarm(float(s.ratio[i, j])), abs(math.degrees(math.atan2(s.ky[i], s.kx[j])))
+
+    assert strongest(False)[0] > 1e-3
+    false_alarm, direction = strongest(True)
+    assert false_alarm < 1e-3 and 80.0 < direction < 100.0
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
 def test_wave_on_a_tilted_plane_at_oblique_incidence(slope):
     """z = slope x + 0.3 cos(k.x) at 30 deg: wavelength and amplitude of the sample, not of the raster.
 
-    Without noise, to 1 %. Catches the raster's wavelength (19 % too long along x on this slope), and the height along a
-    ray taken for that at a place.
+    Without noise, to 1 %. Catches the raster's wavelength (19 % too long along x on this slope), and the amplitude
+    along the beam taken for that along z.
     """
     rec = make_rec(lambda x, y: slope * x + 0.3 * wave(x, y), n=(60, 60), incidence=30.0)
     inside = inside_polygon(parse_region("-320,-320 320,320"), AXIS, AXIS)
@@ -136,11 +138,11 @@ def test_wave_on_a_tilted_plane_at_oblique_incidence(slope):
     assert found.amplitude == pytest.approx(0.3, rel=0.03)
 
 
-def test_micrographs_tell_a_wave_of_the_surface_from_others():
-    """In all three by the law of the flat: agrees, with its height; in one alone: disagrees; in none: not shown.
+def test_micrographs_separate_a_surface_wave_from_others():
+    """A wave by the first-order law in all three: agrees, with its height; in one alone: disagrees; in none: not shown.
 
-    The wave that the heights have is the same in all cases. Catches a response without its sign, for
-    amplitudes alone do not tell an albedo (equal factors in all three) from a slope.
+    The heights have the same wave in all cases. Catches a response without its sign: amplitudes alone do not separate
+    albedo (equal factors in all three) from slope.
     """
     found, _, _ = height_ripple(make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01), [TRIANGLE])
     slope = 0.3 * 2 * math.pi / WAVELENGTH
@@ -155,7 +157,7 @@ def test_micrographs_tell_a_wave_of_the_surface_from_others():
 
 
 def test_regions():
-    """A triangle of 880 um legs has 22 x 44 pixels, two corners are a rectangle; other texts, empty ones are told."""
+    """A triangle of 880 um legs has 22 x 44 pixels, two corners are a rectangle; wrong or empty regions are refused."""
     assert TRIANGLE.sum() == pytest.approx(44 * 44 / 2, abs=30) and TRIANGLE[10, 10] and not TRIANGLE[40, 40]
     assert inside_polygon(parse_region("-100,0 100,50"), AXIS, AXIS).sum() == pytest.approx(10 * 2.5, abs=6)
     for text in ("1,2", "1 2 3", "a,b c,d", "1,2 3,4,5", "nan,0 1,1"):
@@ -164,11 +166,11 @@ def test_regions():
     with pytest.raises(SceneError, match="holds no pixel"):
         inside_polygon(parse_region("9000,0 9100,10"), AXIS, AXIS)
     with pytest.raises(GuardError, match="64 or more known pixels"):
-        make_blocks([inside_polygon(parse_region("0,0 100,100"), AXIS, AXIS)], 40)
+        make_blocks([inside_polygon(parse_region("0,0 100,100"), AXIS, AXIS)], (PITCH, PITCH))
 
 
-def test_measure_answers_about_ripples(tmp_path):
-    """The command's record is JSON, its lines have the numbers, the picture is drawn; options out of place are told."""
+def test_measure_reports_ripples(tmp_path):
+    """The record is JSON, the lines hold the numbers, the figure is drawn; options without their measurement fail."""
     rec = make_rec(lambda x, y: 0.3 * wave(x, y), n=(60, 60), noise=0.01)
     wanted = Wanted(ripple=True, regions=("-450,-450 430,-450 -450,430",))
     stack = make_stack(surface_response(0.02))

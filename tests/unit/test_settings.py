@@ -47,6 +47,6 @@ def test_settings_of_a_measurement():
     wanted = Wanted(facets=True, cracks=True, settings={"max_turn_deg": "20", "min_pixels": 9})
     how = _settings(wanted)
     assert how["facets"].max_turn_deg == 20.0 and how["facets"].min_pixels == 9 and how["ripple"] == RippleSettings()
-    with pytest.raises(SceneError, match="along_axes: what is measured has no such setting"):
+    with pytest.raises(SceneError, match="along_axes: the requested measurements have no such setting"):
         _settings(wanted._replace(settings={"along_axes": "true"}))
     assert _settings(Wanted(ripple=True, settings={"along_axes": "true"}))["ripple"].along_axes

@@ -27,7 +27,7 @@ def make_rec(height, reason, level=0.0) -> Reconstruction:
 
 
 def terrace(floats: bool = False) -> Reconstruction:
-    """A terrace 50 um high beyond a straight wall at 40 deg, 900 um of it and 60 um further on flagged; lone pixels."""
+    """A terrace 50 um high behind a straight wall at 40 deg, flagged over 900 um and 60 um farther on; single pixels."""
     high = ACROSS > 0.0
     reason = np.where(high & floats, FLOATING, 0)
     reason[(np.abs(ACROSS) < 15.0) & (np.abs(ALONG) < 450.0)] = JUMP
@@ -38,10 +38,10 @@ def terrace(floats: bool = False) -> Reconstruction:
 
 
 def test_a_wall_is_listed():
-    """One edge of 900 um at 40 deg that falls at -50 deg by 50 +- 1.5 um; short pieces are none.
+    """One edge of 900 um at 40 deg that falls at -50 deg by 50 +- 1.5 um; short pieces are discarded.
 
-    The deviation is that of the two levels' difference, not of one pixel. Catches the direction of the rise, heights
-    read on the flagged pixels, short pieces and lone pixels taken for edges, and deviations of pixels averaged away.
+    The deviation is that of the difference of the two levels. Catches the direction of the rise, heights read on the
+    flagged pixels, short pieces and single pixels reported as edges, and deviations averaged over pixels.
     """
     found = find_walls(terrace())
     (w,) = found.walls
@@ -55,9 +55,9 @@ def test_a_wall_is_listed():
 
 
 def test_a_floating_side_is_not_determined():
-    """The terrace floats: the edge, now with its unflagged ends as the rim, says so; both sides floating is determined.
+    """A floating terrace: the step is not determined, the rim extends the edge; with both sides floating it is.
 
-    Catches a step of a floating region that is passed on as known.
+    Catches a step of a floating region reported as determined.
     """
     (w, *_) = find_walls(terrace(floats=True)).walls
     assert not w.is_determined and w.note.startswith("floating") and w.n_rim > 0
@@ -68,7 +68,7 @@ def test_a_floating_side_is_not_determined():
     assert w.is_determined and w.note.startswith("both sides float")
 
 
-def test_corners_part_edges():
+def test_corners_separate_edges():
     """A square block of 800 um: four edges of about its side, falling outwards in four directions.
 
     Catches edges that run around corners.
@@ -81,12 +81,12 @@ def test_corners_part_edges():
     assert all(700.0 < w.length_um < 840.0 and w.is_determined for w in found.walls)
 
 
-def test_nothing_known_beside():
-    """Above the wall all is masked: no step, a reason; in a region without it no edge; without samples no deviation."""
+def test_unknown_heights_beside_a_wall():
+    """Masked above the wall: no step, a reason; in a region without wall: no edge; without samples: no deviation."""
     rec = terrace()
     reason = np.where((ACROSS > 15.0) & (ACROSS < 600.0), MASKED, rec.reason)
     hidden = find_walls(rec.replace(reason=reason, is_valid=reason == 0), np.abs(ACROSS) < 60.0)
-    assert hidden.walls and all(not w.is_determined and "too little is known" in w.note for w in hidden.walls)
+    assert hidden.walls and all(not w.is_determined and "too few heights are known" in w.note for w in hidden.walls)
     assert math.isnan(hidden.walls[0].step_um)
     assert find_walls(rec, GRID_X > 600.0).walls == ()
     (w,) = find_walls(rec.replace(height_samples=None)).walls
