@@ -9,7 +9,11 @@ from typing import Any
 from helio_jax.measure.cracks import Crack, Cracks
 from helio_jax.measure.walls import Walls
 
-COLUMNS = ["what", "number", "kind", "x0_um", "y0_um", "x1_um", "y1_um", "length_um", "length_std_um", "is_cut", "direction_deg", "width_um", "width_std_um", "depth_um", "depth_std_um", "depth_at_least_um", "is_determined", "score", "false_alarms", "note"]
+COLUMNS = (
+    "what", "number", "kind", "x0_um", "y0_um", "x1_um", "y1_um", "length_um", "length_std_um", "is_cut",
+    "direction_deg", "width_um", "width_std_um", "depth_um", "depth_std_um", "depth_at_least_um", "is_determined",
+    "score", "false_alarms", "note",
+)  # fmt: skip
 """Columns of the table before those of the detectors; depth: of a groove, or height of a step."""
 _ALONG_SCAN = 5.0
 """Angle to the scan lines below which a crack is marked [deg]."""

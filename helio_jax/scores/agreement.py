@@ -1,8 +1,8 @@
-"""How far a simulation agrees with measured micrographs: residuals in standard errors, chi-square, causes of contrast.
+"""Agreement of a simulation with measured micrographs: residuals in standard errors, chi-square, causes of contrast.
 
-Measured counts and a simulation on the same raster -> per detector the gain, offset and slow drift that bring the
-simulation onto the data (linear, robust), and what is left. The offset is an unknown, never a dark region. Only
-normalises and judges; does not simulate, and does not move the sample (but says by how much it seems to be moved).
+Fits, for each detector, the gain, offset and slow drift that bring the simulation onto the measured counts on the same
+raster (linear, robust), and judges the residuals. The offset is always fitted, never read from a dark region. Does not
+simulate, and does not shift the sample, but estimates its shift.
 """
 
 from collections.abc import Mapping
@@ -18,28 +18,28 @@ from helio_jax.micrograph import MicrographStack
 
 OUTLIER = 3.0
 """Residuals beyond this many robust deviations weigh less (Huber), so that scratches do not set gain and offset."""
-ROUNDS = 6
-"""Of reweighting."""
+N_ITERATIONS = 6
+"""Iterations of reweighting."""
 REACH = 0.15
-"""The sample is looked for up to this share of the field away from where the scene has it."""
+"""Largest shift of the sample that is searched, over the field."""
 N_STEPS = 5
-"""... in so many steps to either side."""
+"""Steps of that search to either side."""
 AGREES = 1.2
-"""Chi-square per pixel up to which data and simulation are said to agree within the noise."""
+"""Chi-square per pixel up to which data and simulation agree within the noise."""
 FLAGGED = 5.0
-"""Pixels farther off than this many robust deviations in any detector are flagged (scratches, dirt)."""
+"""Robust deviations beyond which a pixel is flagged in any detector (scratches, dirt)."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What brings a simulation onto measured counts, per detector.
+    """Terms fitted beside the gain, for each detector.
 
     Attributes:
-        offset: a constant background is an unknown; False: none.
+        offset: whether a constant background is fitted.
         drift: degree of the polynomial in scan time; 0: none.
-        along: a slope along the fast axis.
+        along: whether a slope along the fast axis is fitted.
         lag: response time of the detector in pixels (exponential, in scan order).
-        gain_drift: degree of the polynomial in scan time that the gain follows; 0: it is constant.
+        gain_drift: degree of the gain's polynomial in scan time; 0: constant.
     """
 
     offset: bool = True
@@ -49,7 +49,7 @@ class Terms:
     gain_drift: int = 0
 
     def basis(self, shape: tuple[int, int], is_row_slow: bool) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return the images of the background whose sum is fitted, and what the gain is changed by [term, y, x]."""
+        """Return the background's images and the factors of the gain's drift [term, y, x]."""
         time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in shape), indexing="ij")
         if not is_row_slow:
             time, along = along, time
@@ -59,7 +59,7 @@ class Terms:
 
 
 def lagged(image: np.ndarray, pixels: float, is_row_slow: bool) -> np.ndarray:
-    """Return an image [y, x] as a detector with an exponential response of so many pixels records it.
+    """Apply the exponential response of a detector, with a time constant of `pixels`, to an image [y, x].
 
     The scan is a raster with fly-back: every line starts settled on its first pixel.
     """
@@ -74,18 +74,18 @@ def lagged(image: np.ndarray, pixels: float, is_row_slow: bool) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Data against a normalised simulation.
+    """Measured data and normalised simulation.
 
     Attributes:
         detectors: names.
         gain: counts per detection probability [detector].
         offset: background [detector], counts (0 where none is fitted).
-        model: the simulation brought onto the data [detector, y, x], counts.
+        model: the normalised simulation [detector, y, x], counts.
         residuals: (data - model) / standard error [detector, y, x], NaN where not observed.
-        n_parameters: fitted numbers.
-        shift: where the sample seems to be, relative to the scene (x, y) [um].
-        gain_drift: coefficients of the Legendre polynomials in scan time, from -1 to 1, that the gain follows, over the
-            mean gain [detector, degree].
+        n_parameters: number of fitted parameters.
+        shift: of the sample, relative to the scene (x, y) [um].
+        gain_drift: coefficients of the gain's Legendre polynomials in scan time, from -1 to 1, over the mean gain
+            [detector, degree].
     """
 
     detectors: tuple[str, ...]
@@ -99,7 +99,7 @@ class Agreement:
 
     @property
     def is_flagged(self) -> np.ndarray:
-        """Pixels too far off to be noise or a smooth model error in any detector: scratches, dirt, edges [y, x]."""
+        """Pixels whose residual is no noise or smooth model error in any detector: scratches, dirt, edges [y, x]."""
         spread = robust_std(self.residuals, (1, 2))
         return np.any(np.abs(np.nan_to_num(self.residuals)) > FLAGGED * np.maximum(spread, 1.0), axis=0)
 
@@ -127,7 +127,7 @@ class Agreement:
         return float(np.nansum(self.residuals**2) + self.n_parameters * np.log(self.n_data))
 
     def verdict(self) -> str:
-        """Return in a sentence how far data and simulation agree."""
+        """Return a sentence on the agreement of data and simulation."""
         total, clean = float(np.mean(self.chi2)), float(np.mean(self.chi2_unflagged))
         if total <= AGREES:
             return f"data and simulation agree within the noise: chi-square per pixel {total:.2f}"
@@ -158,10 +158,10 @@ class Agreement:
 
 
 def _fit(data: np.ndarray, std: np.ndarray, seen: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return robust coefficients of images [term, y, x] for one detector's data (Huber weights)."""
+    """Fit images [term, y, x] to one detector's data robustly (Huber weights); return their coefficients."""
     columns, target, scale = basis[:, seen].T, data[seen], std[seen]
     weight = np.ones(target.size)
-    for _ in range(ROUNDS):
+    for _ in range(N_ITERATIONS):
         w = weight / scale
         coefficients = np.linalg.lstsq(columns * w[:, None], target * w, rcond=None)[0]
         misfit = np.abs(target - columns @ coefficients) / scale
@@ -178,20 +178,22 @@ def normalise(
     own_variance: np.ndarray | float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Agreement:
-    """Bring simulated images onto measured ones.
+    """Fit gain, offset and drift that bring simulated images onto measured ones.
 
     Args:
         stack: measured counts with their variance.
         probability: simulated detection probability per beam atom, same raster [detector, y, x].
-        terms: what is fitted beside the gain.
-        own_variance: of `probability`, by the simulation's own noise [detector, y, x].
-        shift: of the sample, kept in the result [um].
+        terms: fitted beside the gain.
+        own_variance: of `probability`, from the simulation's noise [detector, y, x].
+        shift: of the sample, copied to the result [um].
 
     Raises:
         GuardError: the noise of the data is not known, or a detector shows none of the simulated contrast.
     """
     if stack.variance is None:
-        raise GuardError(f"{stack.name}: the variance of its counts is not known, so nothing can be compared with it")
+        raise GuardError(
+            f"{stack.name}: the variance of its counts is not known: no simulation can be compared with it"
+        )
     is_row_slow = stack.fast_axis == "x"
     background, gain_changes = terms.basis(stack.shape[1:], is_row_slow)
     std = np.sqrt(np.maximum(stack.variance, 1e-300))
@@ -218,10 +220,10 @@ def normalise(
 def find_shift(
     stack: MicrographStack, probability: np.ndarray, terms: Terms = Terms(), reach: float = REACH
 ) -> tuple[float, float]:
-    """Return how far (x, y) the sample lies from where it was simulated [um].
+    """Find the shift (x, y) of the sample from its simulated place [um].
 
-    The simulated images are moved, at first in steps over `reach` times the field, and normalised anew; the smallest
-    robust misfit wins. Beyond the simulated field the border is repeated, which is right for a flat one.
+    Minimises the robust misfit of the shifted and normalised images, first on a grid over `reach` times the field.
+    Beyond the simulated field the border is repeated, which is exact for a uniform border.
     """
     step = np.array([pitch(stack.y), pitch(stack.x)])
     size = max(2.0, reach * max(stack.shape[1:]))
@@ -239,13 +241,13 @@ def find_shift(
         options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-2, "maxfev": 80},
     )
     if not np.isfinite(found.fun):
-        raise GuardError("the simulated contrast is not in the data at any place: check detectors and orientation")
+        raise GuardError("the data do not show the simulated contrast at any shift: check detectors and orientation")
     y, x = found.x * step
     return float(x), float(y)
 
 
 def _thinned(stack: MicrographStack, thin: int) -> MicrographStack:
-    """Return what `normalise` needs of every `thin`-th row and column."""
+    """Take every `thin`-th row and column of a stack."""
     every = np.s_[..., ::thin, ::thin]
     return MicrographStack(
         counts=stack.counts[every], x=stack.x[::thin], y=stack.y[::thin], instrument=stack.instrument,
@@ -255,7 +257,7 @@ def _thinned(stack: MicrographStack, thin: int) -> MicrographStack:
 
 
 def _misfit(stack: MicrographStack, probability: np.ndarray, terms: Terms, move: np.ndarray, thin: int = 1) -> float:
-    """Return the robust misfit (Huber) of images moved by `move` pixels [y, x]; every `thin`-th row and column."""
+    """Compute the robust misfit (Huber) of images shifted by `move` pixels [y, x] at every `thin`-th row and column."""
     moved = np.stack([shift_image(image, move, order=1, mode="nearest")[::thin, ::thin] for image in probability])
     try:
         r = np.abs(normalise(stack, moved, terms).residuals)
@@ -265,10 +267,10 @@ def _misfit(stack: MicrographStack, probability: np.ndarray, terms: Terms, move:
 
 
 def contrast_by_cause(unmasked: np.ndarray, single: np.ndarray, multiple: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Return the contrast that each cause makes, as a share of the flat's signal (median) [detector].
+    """Compute the contrast of each cause, as a fraction of the substrate's signal (median) [detector].
 
     Args:
-        unmasked: probability of single scattering if nothing hid the apertures [detector, y, x].
+        unmasked: probability of single scattering without masking [detector, y, x].
         single, multiple: the simulated probabilities [detector, y, x].
     """
     flat = np.median(single, axis=(1, 2))

@@ -1,9 +1,8 @@
-"""Scores of a reconstruction against a known surface: height, shape and slope errors, honesty of the error bars.
+"""Scores of a reconstruction against a known surface: height, shape and slope errors, calibration of the error bars.
 
-Everything is compared in the beam frame: our height of a pixel against the true first hit of the same ray. A
-piston is removed before (nobody measures it); nothing else is fitted, except the centre of a measured sphere.
-Where a pixel's surface point lies is decided by the TRUE height, so that no error can move it out of the region.
-Does not draw, and does not know how the truth was made.
+Heights are compared in the beam frame, pixel by pixel, with the true first hit of the same ray. A piston is removed
+before, because the level is not measured; nothing else is fitted, except the centre of a measured sphere. The region of
+a pixel follows from its TRUE height, so that no error can move it out of the region.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,20 +15,20 @@ from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.reconstruction import Reconstruction
 
 RING_FRACTION = 0.15
-"""Width of the rim ring inside the region, as a fraction of its radius: where masking and depth jumps are."""
+"""Width of the rim ring inside the region, where masking and depth jumps are, as a fraction of its radius."""
 BORDER_FRACTION = 0.05
-"""Without a region, the level is taken on a frame of this fraction of the raster's width on every side."""
+"""Width of the frame that sets the level without a region, as a fraction of the raster's width."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Where a sphere (or another feature on a flat) is scored, sample frame (frozen, checked when made).
+    """Scoring region of a sphere or another feature on a substrate, sample frame (frozen, checked when made).
 
     Attributes:
         height: known height H of the feature above the substrate [um]; errors are given as fractions of it.
         center: axis of the feature (x, y) [um].
-        radius: pixels whose true first hit lies within this distance of the axis are the sample [um].
-        substrate_radius: beyond this distance lies the flat substrate, which fixes the level [um], >= radius.
+        radius: pixels whose true first hit lies within this distance of the axis are scored [um].
+        substrate_radius: beyond this distance lies the substrate, which sets the level [um], >= radius.
     """
 
     height: float
@@ -50,12 +49,12 @@ class Region:
 
 @dataclass(frozen=True)
 class Truth:
-    """The surface as the beam sees it, pixel by pixel (frozen, checked when made).
+    """The true surface seen by the beam, pixel by pixel (frozen, checked when made).
 
     Attributes:
         height: true height of the first hit of each pixel's ray [y, x], um; NaN where the ray meets nothing.
         normals: true unit normals there, up [y, x, 3], or None.
-        region: where to score a feature on a flat, or None: every pixel counts.
+        region: of a feature on a substrate, or None: every pixel is scored.
     """
 
     height: np.ndarray
@@ -100,19 +99,19 @@ SCORE_ROWS: dict[str, tuple[str, str, float, int]] = {
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of one reconstruction; error = our height - true height - level. None: not defined for this case.
+    """Errors of one reconstruction; error = reconstructed height - true height - level. None: not defined here.
 
-    "Region" is the sample (`Truth.region`), or all scored pixels where no region is given. Pixels without a finite
-    height in the reconstruction or in the truth are left out, and seen in `n_pixels` and `valid_fraction`.
+    "Region" is `Truth.region`, or all scored pixels without one. Pixels without a finite height in the reconstruction
+    or in the truth are excluded; `n_pixels` and `valid_fraction` count the others.
 
     Attributes:
         rms_region: sqrt(mean(error^2)) / H over the region, valid or not.
         rms_image: the same over all pixels.
         rms_valid: the same over all pixels with `is_valid`.
         ring_error: the same over the outer `RING_FRACTION` of the region; None without a region.
-        shape_error: the same over the region after z -> a z + b, with the flat brought to its true height and our
-            extreme height in the region to the known one (not fitted).
-        recovered_height: our height at the pixel of the true apex, over H.
+        shape_error: the same over the region after z -> a z + b, with the substrate at its true height and the extreme
+            reconstructed height in the region at the known one (not fitted).
+        recovered_height: reconstructed height at the pixel of the true apex, over H.
         recovered_height_um: the same, not divided [um].
         recovered_height_std_um: `height_std` of that pixel [um], or None.
         mean_error: mean(error) / H over the region.
@@ -120,7 +119,7 @@ class Scores:
         highest_error: max(error) / H over the region.
         p95_error: 95th percentile of |error| / H over the region.
         max_error: max |error| / H over the region.
-        slope_rms: root mean square angle between our and the true normals, region [rad]; None without true normals.
+        slope_rms: rms angle between reconstructed and true normals, region [rad]; None without true normals.
         slope_median: median of that angle [rad].
         pull_mean: mean of error / height_std over valid pixels; None without error bars.
         pull_std: standard deviation of error / height_std; 1 for honest error bars.
@@ -157,48 +156,48 @@ class Scores:
     H_um: float
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """Return the scores as plain JSON-compatible numbers (None where not defined)."""
+        """Return the scores as JSON-compatible numbers (None where not defined)."""
         return asdict(self)
 
     def as_table(self, names: Sequence[str] = tuple(SCORE_ROWS)) -> list[tuple[str, str, str]]:
-        """Return rows (label, value, unit) for people, without the scores that are not defined here."""
+        """Format rows (label, value, unit) of the defined scores."""
         known = [name for name in names if getattr(self, name) is not None]
         return [(SCORE_ROWS[n][0], format_score(n, getattr(self, n)), SCORE_ROWS[n][1]) for n in known]
 
 
 def format_score(name: str, value: float) -> str:
-    """Return `value` of the score `name` in the unit and with the decimals of `SCORE_ROWS`."""
+    """Format a score in the unit and with the decimals of `SCORE_ROWS`."""
     _, _, factor, decimals = SCORE_ROWS[name]
     return f"{value * factor:.{decimals}f}"
 
 
 def axis_distance(rec: Reconstruction, true_height: np.ndarray, center: tuple[float, float]) -> np.ndarray:
-    """Return how far each pixel's true first hit lies from the vertical axis at `center` [y, x], um.
+    """Compute the distance of each pixel's true first hit from the vertical axis at `center` [y, x], um.
 
-    Source: DESIGN.md section 1: a point of height h seen in pixel (X, Y) lies at (X - h tan t, Y).
+    Source: docs/conventions.md, Frames and units: a point of height h seen in pixel (X, Y) lies at (X - h tan t, Y).
     """
     x, y = rec.instrument.surface_position(rec.raster_x[None, :], rec.raster_y[:, None], true_height)
     return np.hypot(x - center[0], y - center[1])
 
 
 def flat_mask(rec: Reconstruction, truth: Truth) -> np.ndarray:
-    """Return True where the level is taken: the substrate beyond the region, or the raster's border [y, x]."""
+    """Mark the pixels that set the level: the substrate beyond the region, or the raster's border [y, x]."""
     if truth.region is None:
         return border_mask(rec.height.shape, BORDER_FRACTION)  # type: ignore[arg-type]
     return axis_distance(rec, truth.height, truth.region.center) > truth.region.substrate_radius
 
 
 def _levels(rec: Reconstruction, truth: Truth, is_scored: np.ndarray) -> tuple[float, float]:
-    """Return the level of our flat minus the true one, and the true one [um].
+    """Compute the reconstructed level of the substrate minus the true one, and the true one [um].
 
-    On a substrate: the median of ours minus the median of the true. On a border, which may hold several planes (a
-    step, a trench): the median of the differences.
+    On a substrate: difference of the medians. On a border, which may hold several planes (a step, a trench): median of
+    the differences.
     """
     use = flat_mask(rec, truth) & is_scored
     if not use.any():
         limit = "the border" if truth.region is None else f"beyond {truth.region.substrate_radius:g} um of the axis"
         raise GuardError(
-            f"the level needs pixels of the flat, got none {limit}: enlarge the scan or reduce substrate_radius"
+            f"the level needs pixels of the substrate, got none {limit}: enlarge the scan or reduce substrate_radius"
         )
     base = float(np.median(truth.height[use]))
     if truth.region is None:
@@ -207,11 +206,11 @@ def _levels(rec: Reconstruction, truth: Truth, is_scored: np.ndarray) -> tuple[f
 
 
 def height_error(rec: Reconstruction, truth: Truth) -> tuple[np.ndarray, float]:
-    """Return our height minus the true one, levelled [y, x], um, and the level that was removed [um].
+    """Compute the levelled height error [y, x], um; return it and the removed level [um].
 
     Raises:
         InputFileError: the truth has another raster.
-        GuardError: no pixel has both heights, or none lies on the flat.
+        GuardError: no pixel has both heights, or none lies on the substrate.
     """
     if truth.height.shape != rec.height.shape:
         raise InputFileError(
@@ -226,7 +225,7 @@ def height_error(rec: Reconstruction, truth: Truth) -> tuple[np.ndarray, float]:
 
 
 def normal_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angle between unit vectors [...], rad; accurate for small angles too (atan2 of cross and dot)."""
+    """Compute the angle between unit vectors [...], rad; accurate for small angles, too (atan2 of cross and dot)."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
 
 
@@ -237,9 +236,9 @@ def _rms(values: np.ndarray) -> float | None:
 def _height_scores(
     rec: Reconstruction, truth: Truth, height: np.ndarray, region: np.ndarray, base: float, H: float
 ) -> dict[str, float | None]:
-    """Return the recovered-height scores and the shape error; `height` is ours, levelled.
+    """Compute the recovered-height scores and the shape error; `height` is the levelled reconstruction.
 
-    With a region the apex counts over the known H; without, over the true extreme's height above (or below) the base.
+    The height at the apex is divided by the known H, or, without a region, by the true extreme's distance to the base.
     """
     true = truth.height
     sign = 1.0 if np.max(true[region]) - base >= base - np.min(true[region]) else -1.0
@@ -266,7 +265,7 @@ def _slope_scores(rec: Reconstruction, truth: Truth, region: np.ndarray) -> dict
 
 
 def _pull_scores(rec: Reconstruction, error: np.ndarray) -> dict[str, float | None]:
-    """Return mean and standard deviation of error / height_std and its coverage, over valid pixels."""
+    """Compute mean and standard deviation of error / height_std and its coverage, over valid pixels."""
     names = ("pull_mean", "pull_std", "coverage_1", "coverage_2")
     if rec.height_std is None:
         return dict.fromkeys(names)
@@ -279,17 +278,17 @@ def _pull_scores(rec: Reconstruction, error: np.ndarray) -> dict[str, float | No
 
 
 def evaluate_height(rec: Reconstruction, truth: Truth) -> Scores:
-    """Score a reconstruction against the truth, as DATA.md scores spheres.
+    """Score a reconstruction against the truth.
 
-    Valid for one raster in the beam frame. With a region: H is its known height and the level is the median of our
-    flat beyond the substrate radius minus that of the true flat. Without: every pixel counts, H is the range of the
-    true heights and the level is the median difference on the raster's border.
+    Valid for one raster in the beam frame. With a region: H is its known height, and the level is the median of the
+    reconstructed minus that of the true substrate beyond the substrate radius. Without: every pixel is scored, H is the
+    range of the true heights, and the level is the median difference on the raster's border.
 
     Raises:
         InputFileError: the truth has another raster.
-        GuardError: no common pixel, no flat, nothing in the region, or a truth without any height range.
+        GuardError: no common pixel, no substrate, an empty region, or a truth without any height range.
 
-    Source: A. Radić et al., arXiv 2501.14833 (RMS and shape error, with the square its formula lacks).
+    Source: A. Radić et al., arXiv 2501.14833 (RMS and shape error, with the square missing in its formula).
     """
     error, level = height_error(rec, truth)
     is_scored = np.isfinite(error)
@@ -331,8 +330,8 @@ def fit_center(
     """Find the centre of a measured sphere, whose radius and height are taken as nominal.
 
     Minimises the mean of the robust residual sqrt(1 + (error / s)^2) - 1, s = 2 % of H, over the region, which moves
-    along: first on a grid of 5 x 5 centres, then by Nelder-Mead to 0.01 raster pitches. Valid when the start is
-    within `reach_um` of the centre in x and in y.
+    with the centre: first on a grid of 5 x 5 centres, then by Nelder-Mead to 0.01 raster pitches. Valid when the start
+    is within `reach_um` of the centre in x and in y.
 
     Args:
         rec: the reconstruction.
@@ -365,7 +364,7 @@ def fit_center(
     grid = [(x0 + dx, y0 + dy) for dy in shifts for dx in shifts]
     first = np.array(min(grid, key=cost))
     simplex = first + 0.25 * reach_um * np.array([[0, 0], [1, 0], [0, 1]])
-    # the place alone says when to stop: the cost jumps as pixels enter and leave the region
+    # only xatol stops: the cost jumps as pixels enter and leave the region
     options = {"initial_simplex": simplex, "xatol": 0.01 * smallest, "fatol": np.inf, "maxiter": 400}
     best = minimize(cost, first, method="Nelder-Mead", options=options)
     moved = np.abs(best.x - start.center).max()

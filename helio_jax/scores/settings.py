@@ -1,4 +1,4 @@
-"""What is known about the sample's true shape and how it is scored: table `[truth]`."""
+"""Known shape of the sample and scoring region: table `[truth]`."""
 
 from pydantic import Field
 
@@ -6,7 +6,7 @@ from helio_jax.settings import Settings
 
 
 class TruthSettings(Settings):
-    """Regions of the sample that the scores refer to (positions on the sample, where the true first hit lies)."""
+    """Regions of the sample that are scored (by the position of the true first hit on the sample)."""
 
     region_center_um: tuple[float, float] = (0.0, 0.0)
     """Axis (x, y) of the structure [um]."""

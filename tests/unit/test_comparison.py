@@ -1,4 +1,4 @@
-"""Simulation against experiment: normalisation, where the sample is, verdicts, and which effect explains the data."""
+"""Simulation against experiment: normalisation, shift of the sample, verdicts, and evidence for effects."""
 
 import json
 
@@ -70,9 +70,9 @@ def blob_stack(rng, gain=4e5, offset=5000.0):
 
 
 def test_normalise_recovers_gain_and_offset():
-    """Known gain, offset and drift come back within 5 standard errors and chi-square is that of noise.
+    """Known gain, offset and drift are recovered within 5 standard errors, and chi-square is that of noise.
 
-    Rejects 3 % of the gain (0.5 % standard error); catches a missing term, swapped axes and a lost weight.
+    Rejects 3 % of the gain (0.5 % standard error); catches a missing term, swapped axes and a missing weight.
     """
     signal, stack = blob_stack(np.random.default_rng(1))
     found = normalise(stack, signal)
@@ -83,10 +83,10 @@ def test_normalise_recovers_gain_and_offset():
     assert found.bic < normalise(stack, signal, Terms(drift=0)).bic < normalise(stack, signal, Terms(offset=False)).bic
 
 
-def test_a_drifting_gain_is_told_from_a_drifting_background():
-    """A gain that falls by 30 % over the scan is found to 3 %, and leaves a chi-square of noise.
+def test_a_drifting_gain_is_separated_from_a_drifting_background():
+    """A gain that falls by 30 % over the scan is found to 3 %, with the chi-square of noise.
 
-    A drift of the background does not. Catches a drift along the fast axis, and parameters that are not counted.
+    A drift of the background does not fit. Catches a drift along the fast axis, and parameters that are not counted.
     """
     signal, stack = blob_stack(np.random.default_rng(3))
     time = np.linspace(-1.0, 1.0, 40)[:, None]
@@ -111,14 +111,14 @@ def test_scratches_do_not_set_the_gain():
 
 
 def test_negative_contrast_is_refused():
-    """An inverted picture is no measurement of this scene: the message names the detector and the remedy."""
+    """An inverted image does not fit this scene: the message names the detector and the remedy."""
     signal, stack = blob_stack(np.random.default_rng(3))
     with pytest.raises(GuardError, match=r"'a'.*orientation"):
         normalise(stack, 0.05 - signal)
 
 
 def test_lag_is_an_exponential_along_each_line():
-    """A step comes out as 1 - exp(-n / lag) from the pixel on; lines start settled; the slow axis is untouched."""
+    """A step becomes 1 - exp(-n / lag) from its pixel on; lines start settled; the slow axis is unchanged."""
     step = np.zeros((3, 12))
     step[1:, 5:] = 1.0
     exact = 1.0 - np.exp(-(np.arange(7) + 1.0) / 2.0)
@@ -128,7 +128,7 @@ def test_lag_is_an_exponential_along_each_line():
 
 
 def test_find_shift():
-    """A blob moved by a known, sub-pixel way is found within 0.15 pixel in each direction; catches swapped axes."""
+    """A known subpixel shift of a blob is found within 0.15 pixel in each direction; catches swapped axes."""
     signal, stack = blob_stack(np.random.default_rng(4))
     time, along = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40), indexing="ij")
     dx, dy = 0.1, -0.15  # of the half field, 19.5 pixels
@@ -172,9 +172,9 @@ def test_compare_finds_the_sample_and_agrees(scene_path, tmp_path):
 
 
 def test_explain_names_the_effect(scene_path, tmp_path):
-    """Data of a rough-diffuse surface: of all effects that law is named by the evidence; no effect is lost silently.
+    """Data of a rough-diffuse surface: of all effects that law has the best evidence; no effect is lost silently.
 
-    Catches a table whose rows do not simulate what they say, and a BIC of the wrong sign.
+    Catches a table whose rows do not simulate their effects, and a BIC of the wrong sign.
     """
     rough = {"material.r": {"kind": "rough_diffuse", "roughness": 0.3}, "sample.spheres.0.material": "r"}
     data = measured(scene_path, rough | {"sample.material": "r"})

@@ -179,11 +179,11 @@ def test_traced_slits(azimuth, kind):
         assert c.depth_at_least_um > 1.0
 
 
-def test_the_command_answers(tmp_path):
-    """Record, lines, picture and table of cracks and edges; what is out of place is told with its remedy.
+def test_command_reports_cracks(tmp_path):
+    """Record, lines, figure and table of cracks and edges; wrong combinations of options are refused with a remedy.
 
-    The length per area is that of the one slit over the region. Of a region that ends across the slit
-    only its part counts. Catches an area of the whole raster, and a line that runs out of the region.
+    The length per area is that of the one slit over the region; a region that ends across the slit cuts it. Catches the
+    area of the whole raster, and a line that runs out of the region.
     """
     stack = make_stack(slit(), 2)
     wanted = Wanted(cracks=True, vertical_edges=True, regions=("-600,-600 600,600",), table=True)

@@ -136,7 +136,7 @@ def test_refused_stacks():
 
 
 def test_a_known_background_is_subtracted():
-    """Catches contrast relative to the reading: a background of twice the signal would make it three times too small."""
+    """Catches contrast relative to the reading: with a background of twice the signal it is three times too small."""
     plain = make_stack(0.1 * nuisance(1))
     read = plain.replace(counts=plain.counts + 2.0, background=np.full(3, 2.0))
     assert contrast_of(read).values == pytest.approx(contrast_of(plain).values)

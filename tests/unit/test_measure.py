@@ -48,8 +48,8 @@ def octahedron(x, y):
 def test_angles_of_a_truncated_octahedron(noise, limit):
     """Top to side 125.26 deg, side to side 109.47 deg, side to floor 234.74 deg, from planes and from profiles.
 
-    Catches the angle of the normals given for the interior one, convex taken for concave, a profile across a climbing
-    edge whose slope is forgotten (side to side would be 98.5 deg), and facets that swallow their neighbours.
+    Catches the angle between normals reported as the interior one, convex for concave, a profile across a climbing edge
+    without the edge's slope (side to side would be 98.5 deg), and facets that absorb their neighbours.
     """
     found = find_facets(make_rec(octahedron, noise=noise))
     tilts = {f.number: f.tilt_deg for f in found.facets}
@@ -82,9 +82,9 @@ def test_sides_and_area_of_the_top_face():
 
 
 def test_small_holes_do_not_cut_a_facet():
-    """A top face with pixels not reconstructed at its rim is whole; beside a strip wider than a facet it is cut.
+    """A top face with a few pixels not reconstructed at its rim is whole; beside a strip wider than a facet it is cut.
 
-    Catches holes taken for the border of the field: no facet of a measured crystal was whole then.
+    Catches holes treated as the border of the field: then no facet of a measured crystal is whole.
     """
     top_of = lambda rec: max(find_facets(rec).facets, key=lambda f: f.level if f.tilt_deg < 5 else -1e9)  # noqa: E731
     for lost, is_cut in ((slice(46, 54), False), (slice(0, 101), True)):
@@ -94,9 +94,9 @@ def test_small_holes_do_not_cut_a_facet():
 
 
 def test_a_top_face_keeps_its_size_beside_bent_flanks():
-    """Flanks that get steeper downwards, 52 to 58 deg over 500 um: the area stays within 5 %, the sides within a pixel.
+    """Flanks that get steeper downwards, 52 to 58 deg over 500 um: area within 5 %, sides within a pixel.
 
-    Catches borders drawn where the planes of whole flanks meet the top: these pass 20 um above the rim (area +20 %).
+    Catches borders where the planes of whole flanks meet the top: these pass 20 um above the rim (area +20 %).
     """
 
     def bent(x, y):
@@ -113,7 +113,7 @@ def test_a_top_face_keeps_its_size_beside_bent_flanks():
 def test_area_of_a_tilted_plane(incidence):
     """A plane that climbs along x by 30 deg: area in the plane is 1 / cos 30 deg times the projected one.
 
-    At oblique incidence the raster is not the surface's x, y; catches cells taken as such (15 % here).
+    At oblique incidence the raster is not the surface's x, y; catches its cells used as areas in x, y (15 % here).
     """
     slope = math.tan(math.radians(30.0))
     rec = make_rec(lambda x, y: slope * x, incidence=incidence)
@@ -173,8 +173,8 @@ def test_profile_leaves_gaps_and_refuses_what_is_outside():
         measure_profile(rec, (0.0, 0.0), (2000.0, 0.0))
 
 
-def test_measure_answers_in_json(tmp_path):
-    """All parts at once are JSON, and the picture is drawn; nothing wanted is an error."""
+def test_measure_reports_json(tmp_path):
+    """All parts at once are JSON, and the figure is drawn; no measurement is an error."""
     wanted = Wanted(True, (-900.0, 0.0, 900.0, 0.0), False, True)
     found, lines = measure_height_map(make_rec(octahedron), wanted, tmp_path / "f.png")
     assert set(json.loads(json.dumps(found))) == {"reconstructed", "facets", "profile", "roughness"}
@@ -186,9 +186,9 @@ def test_measure_answers_in_json(tmp_path):
 
 @pytest.mark.parametrize("border, share", [("free", 0.75), ("flat", 0.0)])
 def test_reconstructed_area_of_a_free_border_counts_from_the_median(border, share):
-    """Heights that are known to 5 um but for a common 50 um, a quarter of them to 30 um, at a limit of 20 um.
+    """Heights with a common error of 50 um and independent ones of 5 um (30 um for a quarter), at a limit of 20 um.
 
-    Catches the common level counted where it means nothing: all of such a map would be called not reconstructed.
+    Catches the common error counted although the level is not determined: nothing would count as reconstructed.
     """
     rng, shape = np.random.default_rng(1), (20, 20)
     own = np.where(np.arange(20) < 5, 30.0, 5.0)[:, None]

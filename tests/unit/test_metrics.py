@@ -30,7 +30,7 @@ def in_region(rec, truth):
 
 
 def test_truth_scores_zero(case):
-    """Catches: any offset between the two rasters, a level taken on the sphere, H taken from the pixels."""
+    """Catches: any offset between the two rasters, a level determined on the sphere, H taken from the pixels."""
     _, rec, truth = case
     s = evaluate_height(rec, truth)
     for name in ("rms_region", "rms_image", "rms_valid", "ring_error", "mean_error", "p95_error", "max_error"):
@@ -118,7 +118,7 @@ def test_ring_is_the_outer_part_of_the_region(case):
 
 
 def test_missing_heights_are_left_out_and_counted(case):
-    """Catches: NaN spreading into a score, or missing pixels counted as perfect or as valid."""
+    """Catches: NaN in a score, or missing pixels counted as correct or as valid."""
     _, rec, truth = case
     height = 0.85 * truth.height
     height[40:45, 45:50] = np.nan
@@ -145,7 +145,7 @@ def test_slopes_are_angles_between_normals(case):
     assert normal_angle(flat, np.array([1e-9, 0.0, 1.0])) == pytest.approx(1e-9, rel=1e-6)
 
 
-def test_honest_error_bars_are_recognised(case):
+def test_calibrated_error_bars_have_the_nominal_coverage(case):
     """Normal errors of the stated size: coverage 68.3 / 95.4 %, pull 0 +- 1, each within 5 standard errors of 7371
     pixels. Catches: variance for standard deviation, a pull before levelling, coverage over invalid pixels."""
     _, rec, truth = case
@@ -219,7 +219,7 @@ def test_center_of_a_measured_sphere_is_found():
 
 
 def test_center_out_of_reach_is_refused():
-    """Catches: a centre at the limit of the search that is returned as if it were found."""
+    """Catches: a centre at the limit of the search returned as a result."""
     _, rec, truth = make_case()
     height, _ = first_hit(rec.raster_x, rec.raster_y, (150.0, 0.0))
     with pytest.raises(GuardError, match="state a centre that is nearer"):

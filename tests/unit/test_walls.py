@@ -27,7 +27,7 @@ def make_rec(height, reason, level=0.0) -> Reconstruction:
 
 
 def terrace(floats: bool = False) -> Reconstruction:
-    """A terrace 50 um high behind a straight wall at 40 deg, flagged over 900 um and 60 um farther on; single pixels."""
+    """A terrace of 50 um behind a straight wall at 40 deg, flagged over 900 um and over 60 um; single pixels."""
     high = ACROSS > 0.0
     reason = np.where(high & floats, FLOATING, 0)
     reason[(np.abs(ACROSS) < 15.0) & (np.abs(ALONG) < 450.0)] = JUMP
