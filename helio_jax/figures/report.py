@@ -8,8 +8,6 @@ Computes no scores.
 import base64
 import html
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +18,13 @@ from helio_jax.figures.interactive import figure_json, plotly_script, report_gro
 from helio_jax.formats.safe import atomic_path
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
-from helio_jax.scores.metrics import SCORE_ROWS, Scores, Truth, format_score
+from helio_jax.scores.metrics import Scores, Truth
 
 CITATION = (
     "A. Radić, S. Lambrick, C. Zhao et al., Heliometric stereo: a new frontier in surface profilometry, "
     "arXiv:2501.14833 (the method).",
     "helio_jax, version as given under provenance (this software).",
 )
-
-
-@dataclass(frozen=True)
-class Reference:
-    """A published number to print beside a score.
-
-    Attributes:
-        score: field of `Scores`.
-        value: in that field's unit (a fraction, um or rad).
-        label: its source, e.g. "paper".
-    """
-
-    score: str
-    value: float
-    label: str = "paper"
-
-    def __post_init__(self) -> None:
-        if self.score not in SCORE_ROWS:
-            raise SceneError(f"a reference must name one of {', '.join(SCORE_ROWS)}, got {self.score!r}")
 
 
 def write_report(
@@ -57,7 +36,6 @@ def write_report(
     *,
     panel_png: bytes | str | Path | None = None,
     title: str = "Helium microscopy: height reconstruction",
-    references: Sequence[Reference] = (),
 ) -> Path:
     """Write the report as one HTML file, atomically.
 
@@ -69,7 +47,6 @@ def write_report(
         scores: from `evaluate_height`.
         panel_png: the printed panel to embed, as bytes or as a file.
         title: heading of the page.
-        references: published numbers to print beside the scores.
 
     Returns:
         The path.
@@ -82,7 +59,7 @@ def write_report(
     if path.suffix.lower() not in (".html", ".htm"):
         raise SceneError(f"{path}: a report is HTML: give it the suffix .html, got {path.suffix!r}")
     sections, figures = _sections(stack, rec, truth)
-    body = [f"<h1>{html.escape(title)}</h1>", _headline(stack, rec), _score_table(rec, scores, references)]
+    body = [f"<h1>{html.escape(title)}</h1>", _headline(stack, rec), _score_table(rec, scores)]
     body += sections
     if panel_png is not None:
         body.append(f'<h2>Panel</h2><img alt="Printed panel" src="data:image/png;base64,{_read_png(panel_png)}">')
@@ -128,23 +105,16 @@ def _headline(stack: MicrographStack | None, rec: Reconstruction) -> str:
     return f'<p class="facts">{html.escape(" · ".join(facts))}{status}</p>'
 
 
-def _score_table(rec: Reconstruction, scores: Scores | None, references: Sequence[Reference]) -> str:
-    """Return the scores as a table beside published numbers; without scores, the fraction of valid pixels."""
-    labels = list(dict.fromkeys(r.label for r in references))
-    marks = {(r.score, r.label): format_score(r.score, r.value) for r in references}
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in ("", "this work", *labels, ""))
-    if scores is None:
-        valid = 100 * float(np.mean(rec.is_valid & np.isfinite(rec.height)))
-        rows = [("valid_fraction", ("valid pixels", f"{valid:.1f}", "%"))]
-    else:
-        rows = [(name, row) for name in SCORE_ROWS for row in scores.as_table([name])]
+def _score_table(rec: Reconstruction, scores: Scores | None) -> str:
+    """Return the scores as a table; without scores, the fraction of valid pixels."""
+    valid = 100 * float(np.mean(rec.is_valid & np.isfinite(rec.height)))
+    rows = [("valid pixels", f"{valid:.1f}", "%")] if scores is None else scores.as_table()
     lines = []
-    for name, (label, value, unit) in rows:
-        cells = "".join(f"<td>{marks.get((name, label_), '')}</td>" for label_ in labels)
+    for label, value, unit in rows:
         shown = unit.replace("um", "µm").replace("deg", "°")
-        lines.append(f"<tr><th>{html.escape(label)}</th><td><b>{value}</b></td>{cells}<td>{shown}</td></tr>")
+        lines.append(f"<tr><th>{html.escape(label)}</th><td><b>{value}</b></td><td>{shown}</td></tr>")
     note = "" if scores is None else "<p>Percentages of heights are fractions of the known height H.</p>"
-    return f"<h2>Numbers</h2><table><tr>{head}</tr>{''.join(lines)}</table>{note}"
+    return f"<h2>Numbers</h2><table><tr><th></th><th>this work</th><th></th></tr>{''.join(lines)}</table>{note}"
 
 
 def _provenance(stack: MicrographStack | None, rec: Reconstruction, scores: Scores | None) -> str:

@@ -79,11 +79,6 @@ class Facet:
     n_pixels: int
     is_cut: bool
 
-    @property
-    def normal(self) -> np.ndarray:
-        """Unit normal, up [3]."""
-        return _normal(np.array(self.slope))
-
 
 @dataclass(frozen=True)
 class Edge:
@@ -309,7 +304,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
         1.0 / normal[2] - 1.0
     )  # lengths up the slope are 1 / cos(tilt) times the projected
     sides, true_sides = (_sides(p, step) for p in (flat, flat + flat @ lift))
-    rim = region & ~np.asarray(ndimage.binary_erosion(region), bool)
+    n_rim = _rim(region).sum()
     edge_std = step * _roughness_of_rim(region)
     lower = ndimage.binary_dilation(region) & _outside(use, s.min_pixels)
     border = np.zeros_like(region)
@@ -322,7 +317,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
         tilt_deg=math.degrees(math.acos(min(float(normal[2]), 1.0))),
         azimuth_deg=math.degrees(math.atan2(normal[1], normal[0])),
         area_um2=float(projected / normal[2]),
-        area_std_um2=float(edge_std * step * math.sqrt(rim.sum()) / normal[2] * 2.0),
+        area_std_um2=float(edge_std * step * math.sqrt(n_rim) / normal[2] * 2.0),
         projected_um2=float(projected),
         long_um=true_sides[0],
         short_um=true_sides[1],
@@ -332,7 +327,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
         projected_short_um=sides[1],
         rms_um=float(np.sqrt(np.mean(misfit**2))),
         n_pixels=int(region.sum()),
-        is_cut=bool(np.any(region & border) or lower.sum() > 0.1 * rim.sum()),
+        is_cut=bool(np.any(region & border) or lower.sum() > 0.1 * n_rim),
     )
 
 
@@ -352,12 +347,16 @@ def _sides(points: np.ndarray, step: float) -> tuple[float, float]:
     return float(long), float(short)
 
 
+def _rim(region: np.ndarray) -> np.ndarray:
+    """Mark the outermost pixels of a region [y, x]."""
+    return region & ~np.asarray(ndimage.binary_erosion(region), bool)
+
+
 def _roughness_of_rim(region: np.ndarray) -> float:
     """Estimate the roughness of a region's rim [pixels]: pixels changed by smoothing per pixel of the rim, >= 0.3."""
     smooth = ndimage.gaussian_filter(region.astype(float), 3.0) > 0.5
     changed = np.sum(smooth != region)
-    rim = max(int(np.sum(region & ~np.asarray(ndimage.binary_erosion(region), bool))), 1)
-    return max(float(changed) / rim, 0.3)
+    return max(float(changed) / max(int(_rim(region).sum()), 1), 0.3)
 
 
 def _edge(rec: Reconstruction, labels: np.ndarray, a: Facet, b: Facet) -> Edge | None:

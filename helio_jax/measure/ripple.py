@@ -8,8 +8,7 @@ plane waves in noise of that floor; they are too small for a ripple that bends o
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, optimize, stats
@@ -59,10 +58,6 @@ class Ripple:
     resolution_um: float
     n_pixels: int
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible record."""
-        return asdict(self) | {"unit": "um"}
-
 
 def height_ripple(
     rec: Reconstruction, regions: Sequence[np.ndarray], settings: RippleSettings = RippleSettings()
@@ -92,13 +87,34 @@ def height_ripple(
     start, ratio = _peak(spectrum)
     unit = np.array(start) / math.hypot(*start)
     along = unit[0] * slopes[0] + unit[1] * slopes[1]
-    fit = _fit_wave(along, spectrum, start)
+    raster_k, covariance, size, size_std = _fit_wave(along, spectrum, start)
     # a central difference passes sin(2 pi k step) / step instead of 2 pi k
-    passed = sum(u * math.sin(2.0 * math.pi * ki * step) / step for u, ki, step in zip(unit, fit.k, steps, strict=True))
+    passed = sum(u * math.sin(2.0 * math.pi * k * s) / s for u, k, s in zip(unit, raster_k, steps, strict=True))
     together = np.any(inside, axis=0)
     to_sample = np.eye(2) - np.outer(rec.instrument.beam_shift, (columns[together].mean(), rows[together].mean()))
     scale = abs(passed) * abs(float(np.linalg.det(to_sample)))  # x = X - h tan t: the wave is higher along z
-    return _ripple(spectrum, fit, ratio, scale, to_sample), spectrum, along
+    back = np.linalg.inv(to_sample).T
+    kx, ky = back @ np.array(raster_k)
+    covariance = back @ covariance @ back.T
+    length = math.hypot(kx, ky)
+    to_crest, across = np.array([kx, ky]) / length, np.array([-ky, kx]) / length
+    angle = math.degrees(math.atan2(raster_k[1], raster_k[0])) % 90.0
+    ripple = Ripple(
+        wavelength_um=float(1.0 / length),
+        wavelength_std_um=float(math.sqrt(max(to_crest @ covariance @ to_crest, 0.0)) / length**2),
+        direction_deg=math.degrees(math.atan(ky / kx)) if kx else 90.0,
+        direction_std_deg=math.degrees(math.sqrt(max(across @ covariance @ across, 0.0)) / length),
+        amplitude=size / scale,
+        amplitude_std=size_std / scale,
+        raster_k=raster_k,
+        axis_angle_deg=min(angle, 90.0 - angle),
+        peak_over_floor=ratio,
+        false_alarm=spectrum.false_alarm(ratio),
+        averages=blocks.averages,
+        resolution_um=max(steps) / blocks.bandwidth,
+        n_pixels=blocks.n_pixels,
+    )
+    return ripple, spectrum, along
 
 
 def image_spectra(
@@ -221,18 +237,11 @@ def _peak(spectrum: Spectrum) -> tuple[Pair, float]:
     return (float(spectrum.kx[j]), float(spectrum.ky[i])), float(candidates[i, j])
 
 
-@dataclass(frozen=True)
-class _Wave:
-    """A fitted wave vector, its covariance [2, 2] (cycles per um), amplitude of the field and its deviation."""
-
-    k: Pair
-    covariance: np.ndarray
-    size: float
-    size_std: float
-
-
-def _fit_wave(field: np.ndarray, spectrum: Spectrum, start: Pair) -> _Wave:
+def _fit_wave(field: np.ndarray, spectrum: Spectrum, start: Pair) -> tuple[Pair, np.ndarray, float, float]:
     """Fit one wave vector to all blocks by least squares, with amplitude, phase and polynomial for each block.
+
+    Returns:
+        Wave vector, its covariance [2, 2] (cycles per um), amplitude of the field, its deviation.
 
     Source: least squares; the noise is the spectrum's floor there. tests/unit/test_ripple.py.
     """
@@ -253,38 +262,4 @@ def _fit_wave(field: np.ndarray, spectrum: Spectrum, start: Pair) -> _Wave:
     noise, n = spectrum.floor_at(k[0], k[1]), blocks.n_pixels
     covariance = 2.0 * noise * np.linalg.pinv(hessian) * np.outer(width, width)
     square = 2.0 * (-cost(best) - 2.0 * noise * len(blocks.blocks)) / n
-    return _Wave((float(k[0]), float(k[1])), covariance, math.sqrt(max(square, 0.0)), math.sqrt(2.0 * noise / n))
-
-
-def _ripple(spectrum: Spectrum, fit: _Wave, ratio: float, passed: float, to_sample: np.ndarray) -> Ripple:
-    """Convert a fit in beam positions to a ripple of the surface.
-
-    Args:
-        spectrum: with the peak.
-        fit: in beam positions.
-        ratio: peak over floor.
-        passed: field per amplitude.
-        to_sample: d(x, y) / d(X, Y) [2, 2].
-    """
-    blocks = spectrum.blocks
-    back = np.linalg.inv(to_sample).T
-    kx, ky = back @ np.array(fit.k)
-    covariance = back @ fit.covariance @ back.T
-    length = math.hypot(kx, ky)
-    along, across = np.array([kx, ky]) / length, np.array([-ky, kx]) / length
-    angle = math.degrees(math.atan2(fit.k[1], fit.k[0])) % 90.0
-    return Ripple(
-        wavelength_um=float(1.0 / length),
-        wavelength_std_um=float(math.sqrt(max(along @ covariance @ along, 0.0)) / length**2),
-        direction_deg=math.degrees(math.atan(ky / kx)) if kx else 90.0,
-        direction_std_deg=math.degrees(math.sqrt(max(across @ covariance @ across, 0.0)) / length),
-        amplitude=fit.size / passed,
-        amplitude_std=fit.size_std / passed,
-        raster_k=fit.k,
-        axis_angle_deg=min(angle, 90.0 - angle),
-        peak_over_floor=ratio,
-        false_alarm=spectrum.false_alarm(ratio),
-        averages=blocks.averages,
-        resolution_um=max(blocks.steps) / blocks.bandwidth,
-        n_pixels=blocks.n_pixels,
-    )
+    return (float(k[0]), float(k[1])), covariance, math.sqrt(max(square, 0.0)), math.sqrt(2.0 * noise / n)

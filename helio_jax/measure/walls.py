@@ -70,10 +70,6 @@ class Wall:
     n_masked: int
     n_rim: int
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible record; unknown numbers are None."""
-        return as_json(vars(self))
-
 
 @dataclass(frozen=True)
 class Walls:
@@ -86,7 +82,7 @@ class Walls:
     def as_dict(self) -> dict[str, Any]:
         """Return a JSON-compatible record."""
         return {
-            "edges": [w.as_dict() for w in self.walls],
+            "edges": [as_json(vars(w)) for w in self.walls],
             "n_marked": int(self.marked.sum()),
             "share_in_edges": self.share,
             "n_determined": sum(w.is_determined for w in self.walls),

@@ -112,23 +112,16 @@ class Scores:
         shape_error: the same over the region after z -> a z + b, with the substrate at its true height and the extreme
             reconstructed height in the region at the known one (not fitted).
         recovered_height: reconstructed height at the pixel of the true apex, over H.
-        recovered_height_um: the same, not divided [um].
-        recovered_height_std_um: `height_std` of that pixel [um], or None.
-        mean_error: mean(error) / H over the region.
-        lowest_error: min(error) / H over the region.
-        highest_error: max(error) / H over the region.
-        p95_error: 95th percentile of |error| / H over the region.
-        max_error: max |error| / H over the region.
-        slope_rms: rms angle between reconstructed and true normals, region [rad]; None without true normals.
-        slope_median: median of that angle [rad].
-        pull_mean: mean of error / height_std over valid pixels; None without error bars.
-        pull_std: standard deviation of error / height_std; 1 for honest error bars.
-        coverage_1: fraction of valid pixels with |error| <= 1 height_std (0.683 for honest normal errors).
-        coverage_2: the same for 2 height_std (0.954).
+        recovered_height_um, recovered_height_std_um: that height, and `height_std` there [um].
+        mean_error, lowest_error, highest_error: of error / H over the region.
+        p95_error, max_error: 95th percentile and maximum of |error| / H over the region.
+        slope_rms, slope_median: angle between reconstructed and true normals, region [rad]; None without true normals.
+        pull_mean, pull_std: of error / height_std over valid pixels; 0 and 1 for correct normal error bars.
+        coverage_1, coverage_2: fraction of valid pixels with |error| <= 1 (2) height_std; 0.683 (0.954) likewise.
         valid_fraction: fraction of all pixels that are valid and have a height.
         n_pixels: number of pixels scored in the region.
-        level_um: piston subtracted from our heights [um].
-        H_um: the height that the errors are fractions of [um].
+        level_um: piston subtracted from the reconstructed heights [um].
+        H_um: height that the errors are fractions of [um].
     """
 
     rms_region: float

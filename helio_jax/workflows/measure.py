@@ -163,11 +163,7 @@ def _measure_profile(job: _Job) -> None:
     """Read a profile and, if requested, its step."""
     assert job.wanted.profile is not None  # the caller checks
     line = measure_profile(job.rec, job.wanted.profile[:2], job.wanted.profile[2:])
-    job.found["profile"] = {
-        "distance_um": line.distance,
-        "height_um": line.height,
-        "height_std_um": line.height_std,
-    }
+    job.found["profile"] = {"distance_um": line.distance, "height_um": line.height, "height_std_um": line.height_std}
     if job.wanted.step:
         step = measure_step(line)
         job.found["step"] = vars(step)
@@ -195,7 +191,7 @@ def _measure_ripple(job: _Job) -> None:
         f"searched range {r.false_alarm:.1e}",
         f"  {r.axis_angle_deg:.0f} deg from the raster's axes{excluded}",
     ]
-    record = r.as_dict()
+    record = vars(r) | {"unit": "um"}
     spectra = {"heights": spectrum}
     if stack is not None:
         check = compare_with_images(stack, r, job.regions, how)

@@ -89,8 +89,10 @@ def test_unknown_heights_beside_a_wall():
     assert hidden.walls and all(not w.is_determined and "too few heights are known" in w.note for w in hidden.walls)
     assert math.isnan(hidden.walls[0].step_um)
     assert find_walls(rec, GRID_X > 600.0).walls == ()
-    (w,) = find_walls(rec.replace(height_samples=None)).walls
-    assert math.isnan(w.step_std_um) and "no deviation" in w.note and w.as_dict()["step_std_um"] is None
+    found = find_walls(rec.replace(height_samples=None))
+    (w,) = found.walls
+    assert math.isnan(w.step_std_um) and "no deviation" in w.note
+    assert found.as_dict()["edges"][0]["step_std_um"] is None
     flat = find_walls(make_rec(np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE), int)))
     assert flat.walls == () and flat.share == 0.0
 
