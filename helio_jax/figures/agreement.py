@@ -40,7 +40,7 @@ def save_agreement(stack: MicrographStack, found: Agreement, contrast: Mapping[s
         axes[0].set_ylabel("y [um]")
         _draw_histogram(axes[3], found.residuals[k])
         causes = "\n".join(f"{name}: {100 * values[k]:.1f} %" for name, values in contrast.items())
-        axes[3].set_title(f"contrast, fraction of the substrate's signal\n{causes}", fontsize=8)
+        axes[3].set_title(f"contrast over the substrate's signal\n{causes}", fontsize=8)
     for ax in grid[-1][:3]:
         ax.set_xlabel("x [um]")
     fig.suptitle(f"{stack.name}: {found.verdict()}", fontsize=10)

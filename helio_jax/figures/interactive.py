@@ -84,7 +84,7 @@ def report_groups(stack: MicrographStack | None, rec: Reconstruction, truth: Tru
     x, y, height = rec.raster_x, rec.raster_y, rec.height - level
     maps = [_map(x, y, height, step, "height", "um")]
     if error is not None:
-        maps.append(_map(x, y, error, step, "error: ours - true", "um", "RdBu_r", symmetric_range(error)))
+        maps.append(_map(x, y, error, step, "error: reconstructed - true", "um", "RdBu_r", symmetric_range(error)))
     if rec.height_std is not None:
         maps.append(_map(x, y, rec.height_std, step, "standard deviation", "um", "Magma"))
     groups.append(Group("Height", "In the beam frame: one pixel per beam position.", maps))

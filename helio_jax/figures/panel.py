@@ -173,7 +173,7 @@ def _extra_maps(rec: Reconstruction, error: np.ndarray | None) -> list[tuple[np.
     out: list[tuple[np.ndarray, str, str, dict[str, Any]]] = []
     if error is not None:
         style = {"cmap": canvas.ERROR_MAP, "limits": symmetric_range(error)}
-        out.append((error, "Height error (ours - true)", "error (µm)", style))
+        out.append((error, "Height error (reconstructed - true)", "error (µm)", style))
     if rec.height_std is not None:
         out.append((rec.height_std, "Standard deviation of height", "std (µm)", {"cmap": canvas.FRACTION_MAP}))
     if rec.residuals is not None:

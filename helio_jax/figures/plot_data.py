@@ -89,7 +89,7 @@ def profile_line(
 def profile_band(
     rec: Reconstruction, height: np.ndarray, along: str, pixel: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Outline height +- height_std along one raster line: positions and heights [um], missing points left out."""
+    """Outline height +- height_std along one raster line: positions and heights [um], without missing points."""
     assert rec.height_std is not None  # callers check
     low, high = (profile_line(rec, height + s * rec.height_std, along, pixel) for s in (-1, 1))
     use = np.isfinite(low[1]) & np.isfinite(high[1])

@@ -64,6 +64,6 @@ def save_spots(points: np.ndarray, spots: Sequence[Mapping[str, float]], title: 
         bottom.legend(fontsize=8, loc="upper right")
         bottom.set_ylim(0.0, 1.35 * bottom.get_ylim()[1])
     axes[0, 0].set_ylabel("across the beam [um]")
-    axes[1, 0].set_ylabel("fraction of the atoms per um")
+    axes[1, 0].set_ylabel("density of atoms [1/um]")
     fig.suptitle(title)
     save_figure(fig, path)

@@ -107,8 +107,8 @@ def test_error_colours_are_symmetric(case):
     assert low == -high < 0
 
 
-def test_surface_is_cut_at_the_shadow_only(case):
-    """The sphere's shadow gap, from x = R sin(60 deg) = 866 um at h = 220 um down the ray to x = 993 um, is cut; the
+def test_surface_is_cut_at_the_occlusion_edge_only(case):
+    """The sphere's occlusion gap, from x = R sin(60 deg) = 866 um at h = 220 um down the ray to x = 993 um, is cut; the
     flat and the top are whole. Catches: a curtain over the gap, holes elsewhere, cells off by one."""
     _, rec, _ = make_case(161, 91, pitch=20.0)
     cut = ~plot_data.surface_cells(rec)
@@ -124,7 +124,7 @@ def test_surface_is_cut_at_the_shadow_only(case):
 
 
 def test_profile_is_at_the_points_own_positions(case):
-    """The apex is drawn at x = 0, not at X = H tan t; the shadow gap is reported. Catches: raster positions."""
+    """The apex is drawn at x = 0, not at X = H tan t; the occlusion gap is reported. Catches: raster positions."""
     _, rec, truth = make_case(161, 91, pitch=20.0)
     pixel = plot_data.apex_pixel(truth.height)
     at, height, gaps = plot_data.profile_line(rec, truth.height, "x", pixel)

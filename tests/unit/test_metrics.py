@@ -93,7 +93,7 @@ def test_error_map_has_orientation(case):
 
 def test_region_follows_the_true_hit(case):
     """The apex is seen at X = +H tan t, and the region is a circle in the sample, not in the raster. Catches: a
-    region from raster positions, from our own heights, or with the shift's sign wrong."""
+    region from raster positions, from the reconstructed heights, or with the shift's sign wrong."""
     _, rec, truth = case
     truth = replace(truth, region=Region(CAP, radius=600.0))
     gx, gy = np.meshgrid(rec.raster_x, rec.raster_y)
@@ -102,7 +102,9 @@ def test_region_follows_the_true_hit(case):
     assert gx[wanted].mean() > 250.0  # the raster positions' own circle would have its middle at 0
     row, column = np.unravel_index(np.argmax(truth.height), truth.height.shape)
     assert rec.raster_x[column] == pytest.approx(CAP * TAN, abs=20.0) and rec.raster_y[row] == pytest.approx(0, abs=20)
-    far = rec.replace(height=np.where(wanted, truth.height - 900.0, truth.height))  # our own heights move nothing
+    far = rec.replace(
+        height=np.where(wanted, truth.height - 900.0, truth.height)
+    )  # reconstructed heights do not move the region
     scores = evaluate_height(far, truth)
     assert scores.n_pixels == wanted.sum() and scores.mean_error == pytest.approx(-900.0 / CAP)
 

@@ -114,7 +114,7 @@ def test_size_at_the_reference_raster(tmp_path, n_detectors):
 
 
 def test_surface_is_drawn_at_its_own_positions():
-    """The apex is at x = 0 (not at H tan t = 416 um), in metres of the sample; no triangle spans the shadow gap.
+    """The apex is at x = 0 (not at H tan t = 416 um), in metres of the sample; no triangle spans the occlusion gap.
     Catches: raster positions in 3-D, a curtain over jumps, wrong vertex numbers after thinning."""
     stack, rec, truth = make_case(304, 351, pitch=11.0)
     groups = {g.title: g for g in report_groups(stack, rec, truth)}
