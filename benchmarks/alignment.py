@@ -1,4 +1,4 @@
-"""How well turned scans are aligned without a hand: row 10 (30 traced cases) and row 4 (the alum crystal) of issue 5.
+"""How well rotated scans are aligned automatically: row 10 (30 traced cases) and row 4 (the alum crystal).
 
 python benchmarks/alignment.py [--shared ../shared] [--output benchmarks/out] [--cases N] [--tiny]
 

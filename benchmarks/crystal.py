@@ -1,4 +1,4 @@
-"""Rows 5 to 7 of issue 5 on a crystal whose faces are known, and on the measured one: which stage makes which error.
+"""Angles and sides of a crystal whose faces are known, and of the measured one: which stage makes which error.
 
 python benchmarks/crystal.py [--output benchmarks/out] [--size N] [--tiny]
                              [--sample crystal|tall|hills|pyramids|rough|measured] [--law JSON]

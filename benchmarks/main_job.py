@@ -90,7 +90,7 @@ def linear_rows(scene, stack) -> list[Row]:
     truth = true_height(scene, base)
     signal, variance = signal_of(stack)
     own = stack.provenance["metadata"]["param"]["detector_vector"]
-    vectors = np.array([[-v[0], -v[1], v[2]] for v in own])  # their x reversed; y as in DATA.md
+    vectors = np.array([[-v[0], -v[1], v[2]] for v in own])  # their x reversed, y kept
     flat = signal[:, :20].mean(axis=(1, 2))
     vectors = vectors / np.linalg.norm(vectors, axis=1)[:, None]
     phi_own = vectors * (flat / vectors[:, 2])[:, None]

@@ -1,4 +1,4 @@
-"""How true the fitted heights are, how honest their error bars, how long they take: the rows of issue 3.
+"""Accuracy of the fitted heights, honesty of their error bars, and time: rows 1 to 10 (docs/results.md).
 
 python benchmarks/reconstruction.py [--shared ../shared] [--output benchmarks/out] [--rows 1,2,...] [--fits N] [--tiny]
 
@@ -78,7 +78,7 @@ class Record:
 
 
 def score(scene: SceneFile, stack: MicrographStack, rec, seconds: float) -> Case:
-    """Return the numbers of row 1: errors over H (DATA.md), level taken on the flat."""
+    """Return the numbers of row 1: errors over H (docs/results.md), level taken on the substrate."""
     truth = true_height(scene, rec)
     s = pipeline.evaluate(rec, truth)
     tx, ty = stack.instrument.beam_shift

@@ -1,4 +1,4 @@
-"""Row 1 of the tracer's issue: every count of the reference program against ours, as one family of p-values.
+"""Every count of the reference program against ours, as one family of p-values.
 
 python benchmarks/reference_counts.py [--shared ../shared] [--output benchmarks/out] [--tiny]
 

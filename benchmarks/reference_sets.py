@@ -1,7 +1,7 @@
 """The reference program's counts in our frame, and our expectation for each set; used by tests and benchmarks.
 
 Frame of the files: plate y = 0, sample at y < 0, apertures in (x, z), mm. Ours: x = x, y = -z, z = y. The sample moves
-by (X, Z), so the beam meets it at our (-X, +Z) (DATA.md).
+by (X, Z), so the beam meets it at our (-X, +Z).
 """
 
 import json

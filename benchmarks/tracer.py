@@ -2,7 +2,7 @@
 
 python benchmarks/tracer.py [--output benchmarks/out] [--rows 3,4,5,8,10,11,12,14] [--tiny]
 
-Row numbers are those of the tracer's issue. Times are CPU times of one thread; ratios are taken within one run.
+Times are CPU times of one thread; ratios are taken within one run.
 """
 
 import argparse

@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 REFERENCE = 3.6e3, 8.6e3
-"""Triangles, and rays per second there, of the reference program, which falls as 1 / N (issue 4)."""
+"""Triangles, and rays per second there, of the reference program, which falls as 1 / N."""
 
 
 def draw(table: Path, path: Path) -> None:

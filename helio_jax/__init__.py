@@ -1,27 +1,193 @@
-"""helio_jax: simulate scanning helium micrographs and turn three or more of them into a height map.
+"""helio_jax: simulate scanning helium micrographs and reconstruct height maps from three or more of them.
 
 ```
-Scene - trace -> MicrographStack - prepare -> MicrographStack - reconstruct -> Reconstruction - evaluate -> report
+Scene -- trace --> MicrographStack -- calibration, alignment --> MicrographStack -- inverse --> Reconstruction
+                        forward: heights and optics -> expected counts, differentiable; used by inverse
 ```
 
-Reading order: `arrays` (conventions), the nouns `instrument`, `micrograph`, `heightmap`, `reconstruction`, then one
-folder per verb. Which file does what:
+Imports go downwards only: commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward,
+trace, formats > scene > nouns (tests/test_architecture.py). Frames, units, physics: docs/conventions.md. Public names
+are loaded on first use, so that `import helio_jax` is instant.
 
-* `scene/` what is imaged: `sample` (kinds of samples), `placement` (where they stand), `surfaces` (their geometry),
-  `scan` (positions), `views` (distances, rotations), `scene`.
-* `trace/` Scene -> MicrographStack, NumPy + Embree + numba: `intersect` (ray-surface hits), `source` (the beam),
-  `random`, `direct` (form factor), `experiment`, `transport` (paths), `next_event` (the expected estimator), `tally`,
-  `masks` (masked fraction, shadow), `denoise`, `run` (blocks on threads), `converge` (a wanted error), `job`, `units`
-  (units of work), `scan` (threads, processes, cluster), `follow` (single atoms).
-* `prepare/` `noise` (counting noise), `response` (lag, drift), `calibrate` (first background and gain).
-* `reconstruct/` JAX: `solve` (entry), `beamframe`, `formfactor`, `linear` (photometric solution), `integrate*` (slopes
-  -> heights), `render` (the differentiable model), `refine` (the fit of the heights).
-* `evaluate/` `metrics` (scores), `figures` (PNG), `report` (HTML).
-* `formats/` `hdf5` (NeXus), `parts` (finished units), `matlab` (import), `export`, `safe` (untrusted files).
-* `config` (scene files), `predict` (tracer and masks for the fit), `checkpoint` (long simulations), `pipeline` (joins
-  the stages), `study` (sweeps), `__main__` (command line).
+Where is ... the shadow mask? trace/masks (maps of a simulation), forward/masking (in a reconstruction). The integration
+of slopes? inverse/integrate. A new scattering law? Its table in scene/scattering, its density in trace/lobes, its
+draws in trace/laws.
 
-Public names are loaded on first use, so that `import helio_jax` is instant.
+Module map (one line each, complete: tests/unit/test_project_files.py):
+
+```
+.                     nouns and rules
+  arrays              conventions of every array; checks and small array functions
+  errors              typed errors and their exit codes
+  settings            base class of all settings tables
+  kernel              how inner loops are compiled (numba)
+  detector            apertures in the plate and cones at infinity
+  instrument          beam, plate and detectors, and the geometry that follows from them
+  micrograph          MicrographStack, MicrographSet
+  heightmap           HeightMap on a regular grid
+  reconstruction      Reconstruction: height, error bars, validity, reasons
+  __main__            entry point of the command line
+scene/                what is imaged: settings tables and geometry; no tracing
+  scene               Scene: instrument, sample and scan, checked against each other
+  sample              the [sample] table by kind; mesh files (the only door to trimesh for samples)
+  shapes              samples from numbers: flat, spheres, step, trench, pyramid
+  rough               random rough samples
+  maps                samples from height maps and reconstructions
+  placement           scale, rotation and position of any sample
+  surfaces            triangles and exact spheres of a sample; closed-form first hits
+  body                Body: triangles and spheres with material names
+  runout              continuation of a surface beyond its image
+  scattering          the [material] tables: scattering laws
+  mtl                 scattering laws in the .mtl file of an OBJ mesh
+  plates              plates from mesh files
+  drill               makes the mesh of a plate with channels
+  scan                the [scan] table: rasters, lines, lists of positions
+  views               distances and rotations of a scan
+  rays                beams from a file of rays
+  files               bounded reading of the files that a sample names
+trace/                Scene -> MicrographStack by Monte Carlo (NumPy, numba, Embree); no JAX
+  settings            the [trace] table
+  intersect           ray-surface intersection; the only door to embreex
+  source              start points and directions of the beam's atoms
+  random              counter-based random numbers and low-discrepancy points
+  direct              form factor of the tracer; direct detection
+  lobes               each scattering distribution: trial directions and density
+  laws                draw from and evaluate the law of a material
+  lawtable            laws as flat arrays for the kernels
+  experiment          inputs of a block and state of the atoms in flight
+  transport           paths of a block of pixels, step by step
+  analog              fast inner loop for cosine-law surfaces
+  next_event          expected estimator: next-event estimation
+  plate               underside of a scattering plate
+  meshplate           plates with channels
+  tally               integer fates, hits and sums
+  masks               maps of masking and shadowing
+  denoise             averaging of traced images within smooth regions
+  run                 blocks of pixels on threads
+  converge            rays per pixel until a target error is reached
+  job                 a scan as a keyed list of units
+  units               units of work
+  scan                all units of a scan on threads, processes or a cluster
+  follow              single atoms (helio rays)
+forward/              heights and optics -> expected counts, differentiable (JAX); no optimiser
+  beam_frame          slopes and normals in the beam frame
+  form_factor         vector form factor of an elliptical aperture
+  aiming              form factors of misaimed apertures
+  horizon             horizon search along a march over the surface
+  masking             masked part of each form factor: the shadow mask of a reconstruction
+  radiosity           multiple scattering by radiosity
+  readout             drift and scan-line offsets of the detectors
+  render              single-scattering render model
+inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
+  settings            the [reconstruct] table
+  methods             entry: runs linear, nearfield or refine
+  linear              linear photometric solution of every pixel
+  nearfield           photometric methods at the current height
+  bootstrap           error bars of the photometric methods
+  integrate           slopes -> heights: chooses the integrator
+  integrate_poisson   Poisson integrators and their operators
+  integrate_jumps     weighted Poisson integration that cuts depth jumps
+  integrate_bilateral bilateral normal integration
+  integrate_sylvester integration after Harker and O'Leary
+  edges               edges of the raster: smooth, kink or jump
+  regions             segmentation of the images into regions behind depth jumps
+  levels              level search of such regions
+  occlusion           depth jumps where the surface leaves the beam
+  residuals           residuals of the fit as a function of its unknowns
+  problem             state of one fit
+  solver              Levenberg-Marquardt; the only door to optimistix
+  fit                 outer iterations of the fit
+  convergence         convergence error and status of a fit
+  posterior           Laplace posterior of heights and slopes
+  samples             posterior samples of the heights
+  noise_bias          bias that the noise of the data causes
+  quality             why a height is not valid
+  instrument_report   what a fit found out about the instrument
+  consistency         misfit of one surface to all images
+calibration/          background, gain, drift and noise
+  border              first calibration of a measured scan from its border and dark spots
+  noise_model         noise, spikes and scan-line offsets of measured images
+  noise               the [noise] table: adds noise to expected counts
+  response            detector lag and slow drift in scan time
+  self_calibration    calibration of rotated scans by a constant albedo
+  constant_albedo     the fit behind it
+alignment/            rotated scans onto one raster; orientation of arrays
+  align               entry: a set of scans -> one stack
+  rigid               rigid motions
+  control_points      motions from control points
+  automatic           motions by prediction and correlation
+  albedo_prior        motions of smooth samples by a constant albedo
+  views               scans as the automatic alignment reads them
+  correlate           normalised cross-correlation with missing data
+  resample            images at other positions; several scans on one raster
+  orientation         rotated, mirrored, binned and reordered images
+  arrangement         orientations and orders that a file leaves open
+scores/               errors against something known
+  settings            the [truth] table
+  metrics             scores of a reconstruction against the true surface
+  agreement           agreement of a simulation with measured micrographs
+measure/              numbers from height maps
+  facets              planar facets: angles, sides, areas
+  roughness           ISO 25178 parameters, profiles, steps
+  spectrum            power spectra of regions
+  ripple              wavelength and amplitude of a ripple
+  regions             regions given by corners
+  lines               thin lines and creases in micrographs
+  line_paths          paths of lines
+  crack_profiles      profiles across cracks
+  groove_depth        depth and width of a groove
+  cracks              list of cracks
+  walls               list of vertical edges
+  crack_text          cracks and edges as text and CSV
+figures/              the only door to matplotlib and plotly
+  panel               micrographs, heights, errors and profiles on one page
+  report              HTML report
+  interactive         interactive views
+  agreement           simulation against measurement
+  before_after        a scan before and after calibration
+  overlay             overlay of aligned scans; facet map
+  cracks              cracks and vertical edges
+  ripple              a ripple
+  spot                the beam's spot
+  sweep               scores of a study
+  pick                window for control points
+formats/              the only door to files
+  hdf5                reads and writes stacks and reconstructions (HDF5)
+  nexus               their NeXus layout
+  parts               finished units on disk
+  safe                untrusted files, atomic writes
+  matlab              imports .mat files
+  matlab_reference    the reference simulator's .mat layout
+  tables              what the .mat tables hold
+  export              writes the reference simulator's layout
+  columns             tables of columns (.csv, .npz)
+  points              control points (.csv)
+  toml                writes instrument files
+  fetch               downloads public data
+workflows/            what joins the stages
+  pipeline            simulate, calibrate, align, reconstruct, evaluate, run
+  scene_file          scene files: TOML -> Scene
+  scene_errors        validation errors as sentences
+  corrections         predicted masking and multiple scattering for the fit
+  calibrate_rotated   calibration of aligned rotated scans
+  orient              finds the orientation of a file's arrays
+  compare             simulation against experiment
+  effects             effects that a simulation may lack
+  measure             what helio measure prints
+  study               sweeps of scene values
+  checkpoint          long simulations that can be resumed
+  truth               the true surface of a scene
+  spot                the beam's spot
+  provenance          how a result was made
+  compilation_cache   keeps what JAX compiles
+  doctor              checks the installation
+commands/             the command line; no logic of its own
+  app                 shared options and messages
+  simulating          run, simulate, rays, resume, study, spot, plate
+  heights             reconstruct, evaluate, measure, report
+  measured            import, export, compare, align, pick, calibrate, orient
+  about               info, validate, schema, doctor, fetch-data, cite
+```
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Import of MATLAB files: contents, units and orientation.
+"""Import of MATLAB files: what is where, in which unit and which way round.
 
 Orientation is tested on the physics in the pictures (apex, form factors, overlay of rotated scans), so that a
 flip in the reader cannot be matched by the same flip in the test.
@@ -126,7 +126,7 @@ def make_reference_tree(**param) -> dict:
 
 
 def form_factors(instrument: Instrument, height: float) -> np.ndarray:
-    """Phi of every aperture from the spot at `height` [detector, 3], by the contour integral."""
+    """Phi of every aperture from the spot at `height` [detector, 3], by the contour integral (docs/conventions.md)."""
     x, y, z = instrument.spot_position(height)
     out = []
     for aperture in instrument.apertures():

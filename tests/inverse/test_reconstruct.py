@@ -45,7 +45,7 @@ def test_slopes_and_normals_invert_each_other():
 
 
 def test_surface_slope_law():
-    """a = p / (1 + p tan t), b = q / (1 + p tan t) for a beam along +x (DESIGN.md section 1)."""
+    """a = p / (1 + p tan t), b = q / (1 + p tan t) for a beam along +x (docs/conventions.md)."""
     p, q, t = 0.4, -0.3, np.tan(np.radians(30.0))
     a, b, _ = slopes_of_normal(np.array([-p, -q, 1.0]) / np.sqrt(1 + p * p + q * q), (t, 0.0))
     assert a == pytest.approx(p / (1 + p * t)) and b == pytest.approx(q / (1 + p * t))

@@ -1,4 +1,4 @@
-"""The reference program's counts, per order and detector, against the expected estimator (DATA.md).
+"""The reference program's counts, per order and detector, against the expected estimator.
 
 False-alarm rate: the suite's (stats.py); wrong models are rejected at p < 1e-9 with the same statistics.
 """
