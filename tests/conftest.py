@@ -7,6 +7,17 @@ from pathlib import Path
 
 import pytest
 
+FAST = {
+    "formats": ("export", "hdf5", "matlab"),
+    "inverse": ("edges", "integrate"),
+    "physics": ("formfactor", "render", "tracer"),
+    "unit": (
+        *("align", "arrays", "away_facets", "calibrate", "conventions", "edge_rule", "figures", "instrument"),
+        *("instrument_file", "language", "materials", "measure", "metrics", "placement", "project_files", "report"),
+        *("response", "sample", "scans", "scene", "settings", "units", "walls", "widening"),
+    ),
+}
+"""Modules tests/FOLDER/test_NAME.py whose tests, but for slow ones, are marked `fast`; so is test_architecture.py."""
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
 _OWN = pytest.StashKey[str]()
 
@@ -16,6 +27,15 @@ def pytest_configure(config: pytest.Config) -> None:
     if _CACHE not in os.environ:
         config.stash[_OWN] = os.environ[_CACHE] = tempfile.mkdtemp(prefix="helio-jax-tests-")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `pytest -m fast` runs: modules of every stage, about 80 s of CPU time in all."""
+    fast = {f"{folder}/test_{name}.py" for folder, names in FAST.items() for name in names}
+    for item in items:
+        place = item.path.relative_to(Path(__file__).parent).as_posix()
+        if (place in fast or place == "test_architecture.py") and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.fast)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

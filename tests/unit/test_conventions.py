@@ -320,6 +320,7 @@ def test_masks_say_what_true_means(bump):
     assert np.abs(rec.height[4, 7]) < 20.0  # on the flat
 
 
+@pytest.mark.slow
 def test_two_images_do_where_the_albedo_is_known(bump):
     """`refine`, whose albedo is smooth, takes pixels of two images: valid, and no higher than they are; none of one.
 

@@ -88,7 +88,7 @@ def test_constraints_pin_versions_of_everything():
 
 def test_dependencies_are_those_that_are_imported():
     """Catches an import that only another package's dependency provides, and a dependency that nobody imports."""
-    found = set()
+    found: set[str] = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
@@ -188,6 +188,15 @@ def test_module_map_is_complete():
     assert not (more := sorted(there - set(named))), f"missing {where}: {', '.join(more)}"
     assert not (less := sorted(set(named) - there)), f"{where}, but not in the package: {', '.join(less)}"
     assert not (twice := sorted({name for name in named if named.count(name) > 1})), f"twice {where}: {twice}"
+
+
+def test_fast_modules_exist():
+    """Catches a renamed test module that silently leaves the fast subset."""
+    from tests.conftest import FAST
+
+    for folder, names in FAST.items():
+        for name in names:
+            assert (ROOT / "tests" / folder / f"test_{name}.py").is_file(), f"{folder}/test_{name}.py"
 
 
 def test_one_version():
