@@ -2,7 +2,7 @@
 
 Phi = (1/2 pi) closed contour integral (r x dl)/|r|^2 over the rim, counter-clockwise seen from above, r from the
 point to the rim; P = n . Phi is the probability that a diffusely scattered atom enters the aperture while nothing
-hides it. Trapezoid rule, which converges geometrically for a smooth closed rim. Source: DESIGN.md section 2; Baum,
+hides it. Trapezoid rule, which converges geometrically for a smooth closed rim. Source: docs/conventions.md; Baum,
 Rushmeier, Winget, SIGGRAPH 1989 (Lambert's formula).
 """
 
@@ -13,89 +13,68 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helio_jax.instrument import Instrument
+from helio_jax.forward.optics import Optics
 
 N_RIM = 32
-"""Default rim points: relative error below 1e-9 from a distance of 1.3 semi-axes up."""
+"""Rim points: relative error below 1e-9 from a distance of 1.3 semi-axes up."""
 
 
-def rim_table(instrument: Instrument, n_points: int = N_RIM) -> np.ndarray:
-    """Return rim points and tangents of every aperture [detector, 2, n_points, 2], lab frame, um."""
-    return np.stack([a.rim(n_points) for a in instrument.apertures()])
+def _contour_integral(optics: Optics, height: jax.Array) -> jax.Array:
+    """Compute Phi [detector, 3, ...] by the sum over the rim."""
+    points, tangents = (jnp.asarray(a, height.dtype) for a in optics.rims(N_RIM))  # [rim, 3, detector]
+    spot = tuple(jnp.asarray(v, height.dtype) for v in optics.spot(height))
+    expand = (...,) + (None,) * height.ndim
+
+    @jax.checkpoint  # the transpose evaluates the terms anew: kept, they would be 32 times the result
+    def term(spot, point, tangent):
+        x, y, z = (p[expand] - s for p, s in zip(point, spot, strict=True))
+        tx, ty, tz = (t[expand] for t in tangent)
+        w = 1.0 / (x * x + y * y + z * z)
+        return (y * tz - z * ty) * w, (z * tx - x * tz) * w, (x * ty - y * tx) * w
+
+    def add(total, rim):
+        return jax.tree.map(jnp.add, total, term(spot, *rim)), None
+
+    zero = jnp.zeros((optics.n_detectors, *height.shape), height.dtype)
+    total, _ = jax.lax.scan(add, (zero, zero, zero), (points, tangents))
+    return jnp.stack(total, 1) / N_RIM
 
 
-def form_factor(rims: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> jax.Array:
-    """Return Phi of every aperture [detector, 3, ...] for points (x, y), `depth` below the plate.
+@jax.custom_jvp
+def form_factor_at(optics: Optics, height: jax.Array) -> jax.Array:
+    """Compute the vector form factor [detector, 3, ...] of the points illuminated at heights [...], um.
 
-    Valid for depth > 0 and apertures that are not cut by the point's own horizon.
-
-    Args:
-        rims: from `rim_table` [detector, 2, n, 2].
-        x, y, depth: lab position, any common shape, um.
+    Valid for points below the plate and apertures that the point's own horizon does not cut. Differentiable in every
+    leaf and in the heights, whose derivative is computed once and kept instead of the terms of the sum.
     """
-
-    def of_point(carry, rim):
-        px, py, tx, ty = rim  # each [detector]
-        expand = (...,) + (None,) * x.ndim
-        rx, ry = px[expand] - x, py[expand] - y
-        tx, ty = tx[expand], ty[expand]
-        w = 1.0 / (rx * rx + ry * ry + depth * depth)
-        fx, fy, fz = carry
-        return (fx - depth * ty * w, fy + depth * tx * w, fz + (rx * ty - ry * tx) * w), None
-
-    n, rims = rims.shape[2], rims.astype(x.dtype)
-    zero = jnp.zeros((rims.shape[0], *x.shape), x.dtype)
-    per_point = (rims[:, 0, :, 0].T, rims[:, 0, :, 1].T, rims[:, 1, :, 0].T, rims[:, 1, :, 1].T)
-    total, _ = jax.lax.scan(of_point, (zero, zero, zero), per_point)
-    return jnp.stack(total, 1) / n
+    return _contour_integral(optics, height)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def form_factor_of_height(geometry: "SpotGeometry", height: jax.Array) -> jax.Array:
-    """Return Phi [detector, 3, ...] of the surface point seen at `height`: in a raster it depends on h alone.
-
-    Differentiable in `height` (the derivative is computed once and kept, not the 32 rim terms).
-    """
-    return form_factor(jnp.asarray(geometry.rims), *geometry.position(height))
-
-
-@form_factor_of_height.defjvp
-def _form_factor_jvp(geometry, primals, tangents):
-    (height,), (dh,) = primals, tangents
-    value, slope = jax.jvp(
-        lambda h: form_factor(jnp.asarray(geometry.rims), *geometry.position(h)), (height,), (jnp.ones_like(height),)
-    )
-    return value, slope * dh
+@partial(form_factor_at.defjvp, symbolic_zeros=True)
+def _form_factor_jvp(primals, tangents):
+    (optics, height), (d_optics, d_height) = primals, tangents
+    value, slope = jax.jvp(lambda h: _contour_integral(optics, h), (height,), (jnp.ones_like(height),))
+    change = jnp.zeros_like(value) if _is_zero(d_height) else slope * d_height
+    leaves = jax.tree.leaves(d_optics, is_leaf=_is_zero)
+    if not all(map(_is_zero, leaves)):
+        d_optics = jax.tree.map(lambda o, d: jnp.zeros_like(o) if _is_zero(d) else d, optics, d_optics)
+        change = change + jax.jvp(lambda o: _contour_integral(o, height), (optics,), (d_optics,))[1]
+    return value, change
 
 
-class SpotGeometry:
-    """Where the illuminated point is in the lab frame, as a function of its height (hashable, static under jit)."""
-
-    def __init__(self, instrument: Instrument, n_rim: int = N_RIM) -> None:
-        self.instrument = instrument
-        self.rims = rim_table(instrument, n_rim)
-        self._key = (type(self).__name__, instrument.model_dump_json(), n_rim)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, SpotGeometry) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def position(self, height: Any) -> tuple[Any, Any, Any]:
-        """Return lab x, y and the depth below the plate [um]."""
-        x, y, z = self.instrument.spot_position(height)
-        return x, y, self.instrument.working_distance - z
-
-    def form_factor(self, height: np.ndarray) -> np.ndarray:
-        """Return Phi [detector, 3, ...] in float64 for NumPy heights [um]."""
-        with jax.enable_x64(True):
-            at = (jnp.asarray(x, jnp.float64) for x in self.position(np.asarray(height, np.float64)))
-            return np.asarray(_jitted(jnp.asarray(self.rims, jnp.float64), *at))
-
-    def flat_signal(self) -> np.ndarray:
-        """Return the detection probability of the flat reference plane [detector]."""
-        return self.form_factor(np.zeros(1))[:, 2, 0]
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
 
 
-_jitted = jax.jit(form_factor)
+_jitted = jax.jit(form_factor_at)
+
+
+def form_factor(optics: Optics, height: np.ndarray) -> np.ndarray:
+    """Compute the vector form factor [detector, 3, ...] of NumPy heights [...], um, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(_jitted(optics, jnp.asarray(height, jnp.float64)))
+
+
+def substrate_signal(optics: Optics) -> np.ndarray:
+    """Compute the single-scattering detection probability of the substrate, level and unmasked [detector]."""
+    return form_factor(optics, np.zeros(1))[:, 2, 0]

@@ -1,181 +1,191 @@
-"""The part of each aperture's form factor that the sample hides, differentiable in heights and slopes (JAX).
+"""The part of each aperture's form factor that the sample masks, differentiable in surface, optics and raster (JAX).
 
 In the beam frame (x + z tx, y + z ty, z), a shear that keeps lines straight, the surface is one height per raster
-position and the plate's apertures stand still: the rim, seen from a point, is at c + W (tx, ty) whatever its height,
-only the depth d = D - h below it changes. So all pixels share the same vertical slices of an aperture, and marching
-along one is shifting the raster. In a slice of azimuth e everything beyond the distance d / horizon is hidden, the
-horizon being the steepest slope up to the surface ahead or the point's own tangent plane, whichever is higher.
-Between two pixels the surface is linear, but a wall stands half-way. Nothing is taken to stand outside of the
-raster; where apertures overlap, each counts the common part.
-Source: own derivation, tests/physics/test_visibility.py; horizons of height fields: Max, Vis. Comput. 4 (1988) 109.
+position and the plate's apertures stand still: whatever the height of the point, the rim is seen at the same place,
+only the depth below it changes. So all pixels share the same vertical slices of an aperture, and marching along one is
+shifting the raster. In a slice of azimuth e everything beyond the distance depth / horizon is masked, the horizon being
+the steepest slope up to the surface ahead or the point's own tangent plane, whichever is higher. Between two pixels the
+surface is linear, but a wall stands half-way. Nothing is taken to stand outside of the raster; where apertures overlap,
+each counts the common part. Which sample is the horizon is chosen outside JAX (`horizon`) and constant under
+differentiation; the smooth parts are derived, so that the derivative is exact away from ties.
+Source: own derivation, tests/physics/test_visibility.py.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helio_jax.detector import Aperture
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.horizon import OUTSIDE, March, at_horizon, find_horizons, plan_march
+from helio_jax.forward.horizon import ACROSS, BEFORE, BESIDE, OUTSIDE, find_horizons, steps_per_um
+from helio_jax.forward.optics import Optics, Raster, cast
+from helio_jax.forward.surface import Surface
 
+N_SLICES = 12
+"""Vertical slices per aperture."""
 _TAIL = 20.0
 """Widths below the aperture within which a smoothed horizon still counts."""
+_STRAIGHT_UP = 1e-6
+"""Least near end of a slice in units of its far end: the slope of sight straight up along the beam is infinite."""
+_TIE = 1e-9
+"""Crossings that are closer than this [steps] are one."""
 
 
 class Slices(NamedTuple):
-    """Vertical slices of an aperture in the beam frame, static [slice]; lengths in um, from the point outwards.
+    """Vertical slices of the apertures in the beam frame [detector, slice]; lengths in um, from the point outwards.
 
-    `direction` [slice, 2] is the azimuth e; the aperture reaches from `near` to `far`; the integral over azimuth is
-    the sum with `weight` [rad].
+    `direction` [detector, slice, 2] is the azimuth e; the aperture reaches from `near` to `far`; the integral over
+    azimuth is the sum with `weight` [rad]; `plate` is the height above the substrate of the aperture's plane on the
+    beam axis, and `rise` its slope along the azimuth, 0 unless the plate is tilted.
     """
 
-    direction: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
-    weight: np.ndarray
+    direction: Any
+    near: Any
+    far: Any
+    weight: Any
+    plate: Any
+    rise: Any
 
 
-def slice_aperture(aperture: Aperture, pinhole: np.ndarray, n_slices: int) -> Slices:
-    """Slice an aperture by vertical planes through the pinhole, which is every point's azimuthal centre.
+def slice_apertures(optics: Optics, n_slices: int) -> Slices:
+    """Slice the apertures by vertical planes through the beam axis, which is every point's azimuthal centre.
 
     In the frame where the ellipse is a unit circle the chord at impact parameter p is 2 sqrt(1 - p^2) long, so the
-    nodes are Gauss-Chebyshev's of the second kind in p: an aperture that is hidden as a whole converges geometrically,
-    one that is cut as n_slices^-2. An aperture around the pinhole is sliced all round.
-
-    Args:
-        aperture: the ellipse on the plate, lab frame.
-        pinhole: centre (x, y) of the pinhole, lab frame [um].
-        n_slices: number of slices.
+    nodes are Gauss-Chebyshev's of the second kind in p: an aperture that is masked as a whole converges geometrically,
+    one that is cut as n_slices^-2. An aperture around the beam is sliced all round.
     """
-    cos, sin = np.cos(aperture.rotation), np.sin(aperture.rotation)
-    stretch = np.array([[cos, -sin], [sin, cos]]) * aperture.semi_axes  # unit circle -> ellipse
-    center = np.linalg.solve(stretch, np.asarray(aperture.center) - pinhole)
-    distance, azimuth = np.linalg.norm(center), np.arctan2(center[1], center[0])
-    if distance > 1.0:
+    shift = jnp.asarray(optics.beam_shift)
+
+    def of_aperture(center, axes):
+        stretch = axes[:2] + shift[:, None] * axes[2]  # unit circle -> ellipse in the beam frame
+        middle = center[:2] + shift * center[2]
+        gradient = jnp.linalg.solve(stretch.T, axes[2])  # of the aperture's plane
+        place = jnp.linalg.solve(stretch, middle)
+        square = jnp.sum(place**2)
+        is_aside = square > 1.0
+        # beside the beam
         node = np.pi * np.arange(1, n_slices + 1) / (n_slices + 1)
-        p, chord = np.cos(node), np.sin(node)
-        foot = np.sqrt(distance**2 - p**2)
-        azimuth, weight = azimuth + np.arcsin(p / distance), np.pi / (n_slices + 1) * chord / foot
-        near, far = foot - chord, foot + chord
-    else:
-        turn = 2.0 * np.pi * np.arange(n_slices) / n_slices
-        foot, p = distance * np.cos(turn), distance * np.sin(turn)
-        azimuth, weight = azimuth + turn, np.full(n_slices, 2.0 * np.pi / n_slices)
-        far = foot + np.sqrt(1.0 - p**2)
-        near = 1e-6 * far  # not 0: the slope of sight straight up along the beam is infinite
-    ray = np.stack([np.cos(azimuth), np.sin(azimuth)], -1) @ stretch.T
-    scale = np.linalg.norm(ray, axis=1)
-    return Slices(ray / scale[:, None], near * scale, far * scale, weight * np.prod(aperture.semi_axes) / scale**2)
+        p, chord = (f(node).astype(center.dtype) for f in (np.cos, np.sin))
+        safe = jnp.where(is_aside, square, 2.0)
+        distance, foot = jnp.sqrt(safe), jnp.sqrt(safe - p**2)
+        beside = (jnp.arcsin(p / distance), foot - chord, foot + chord, np.pi / (n_slices + 1) * chord / foot)
+        # around the beam
+        turn = (2.0 * np.pi * np.arange(n_slices) / n_slices).astype(center.dtype)
+        safe = jnp.where(is_aside, 0.0, jnp.where(square > 0.0, square, 0.0))
+        inner = jnp.where(safe > 0.0, jnp.sqrt(jnp.where(safe > 0.0, safe, 1.0)), 0.0)
+        far = inner * jnp.cos(turn) + jnp.sqrt(1.0 - (inner * jnp.sin(turn)) ** 2)
+        about = (turn, _STRAIGHT_UP * far, far, jnp.full(n_slices, 2.0 * np.pi / n_slices, center.dtype))
+        azimuth, near, far, weight = (jnp.where(is_aside, a, b) for a, b in zip(beside, about, strict=True))
+        azimuth = azimuth + jnp.where(square > 0.0, jnp.arctan2(place[1], jnp.where(square > 0.0, place[0], 1.0)), 0.0)
+        ray = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)], -1) @ stretch.T
+        scale = jnp.sqrt(jnp.sum(ray**2, -1))
+        direction = ray / scale[:, None]
+        weight = weight * jnp.abs(jnp.linalg.det(stretch)) / scale**2
+        plate = center[2] + optics.drop - gradient @ middle
+        return Slices(
+            direction, near * scale, far * scale, weight, jnp.broadcast_to(plate, (n_slices,)), direction @ gradient
+        )
+
+    return jax.vmap(of_aperture)(jnp.asarray(optics.center), jnp.asarray(optics.axes))
 
 
-def hidden_form_factor(
-    height: jax.Array | np.ndarray,
-    slope_x: jax.Array | np.ndarray,
-    slope_y: jax.Array | np.ndarray,
-    geometry: SpotGeometry,
-    dx: float,
-    dy: float,
-    *,
-    n_slices: int = 12,
-    width: float = 0.0,
+def masked_form_factor(
+    surface: Surface, optics: Optics, raster: Raster, *, n_slices: int = N_SLICES, width: float = 0.0
 ) -> jax.Array:
-    """Return the part of each aperture's vector form factor that is below a point's horizon [detector, 3, y, x].
+    """Compute the part of each aperture's vector form factor that lies below a point's horizon [detector, 3, y, x].
 
-    P = n . (Phi - hidden), as with `trace.masks.hidden_form_factor`; exactly 0 where the whole aperture is in view.
-    Valid for heights below the plate. Differentiable in heights (the point's and the blocking ones) and slopes; where
-    two samples are seen under the same slope, the nearer one takes the derivative.
+    P = n . (Phi - masked), as with `trace.masks.hidden_form_factor`; exactly 0 where the whole aperture is in view.
+    Valid for heights below the plate. Differentiable in heights (the point's and the masking ones), slopes, optics and
+    pitch; where two samples are seen under the same slope, the nearer one takes the derivative.
 
     Args:
-        height: beam-frame heights [y, x], um.
-        slope_x, slope_y: slopes dh/dX, dh/dY of the surface at the points, for their own horizon [y, x].
-        geometry: the instrument, static.
-        dx, dy: raster pitch, um, static.
+        surface: heights and slopes [y, x]; the slopes make the points' own horizon.
+        optics: the instrument.
+        raster: beam positions.
         n_slices: azimuth slices per aperture, static.
         width: smoothing of the mask's edge in slope of sight, static; 0 is exact.
     """
-    with jax.enable_x64(True):
-        return _hidden_form_factor(height, slope_x, slope_y, geometry, float(dx), float(dy), n_slices, float(width))
-
-
-def hidden_response(
-    height: np.ndarray,
-    slope_x: np.ndarray,
-    slope_y: np.ndarray,
-    geometry: SpotGeometry,
-    dx: float,
-    dy: float,
-    change: np.ndarray,
-) -> jax.Array:
-    """Return the derivative of `hidden_form_factor` [detector, 3, y, x] along a change of the heights [y, x]."""
-    with jax.enable_x64(True):
-        return _hidden_response(jnp.asarray(height), slope_x, slope_y, geometry, float(dx), float(dy), change)
-
-
-@partial(jax.jit, static_argnums=(3, 4, 5))
-def _hidden_response(height, slope_x, slope_y, geometry, dx, dy, change):
-    return jax.jvp(
-        lambda h: hidden_form_factor(h, slope_x, slope_y, geometry, dx, dy), (height,), (jnp.asarray(change),)
-    )[1]
-
-
-@partial(jax.jit, static_argnums=(3, 4, 5, 6, 7))
-def _hidden_form_factor(height, slope_x, slope_y, geometry, dx, dy, n_slices, width):
-    instrument, shape = geometry.instrument, height.shape
-    pinhole = instrument.pinhole_center[:2]
-    slices = _stack([slice_aperture(a, pinhole, n_slices) for a in instrument.apertures()])
-    marches = _stack([_stack([plan_march(e, shape, dx, dy) for e in row]) for row in slices.direction])
-    as_input = partial(jax.tree.map, lambda a: jnp.asarray(a, height.dtype if a.dtype.kind == "f" else a.dtype))
-    padded = jnp.pad(height, [(n, n) for n in shape], constant_values=OUTSIDE)
-    depth = instrument.sample_distance - height
-
-    def choose(bits: Any) -> np.ndarray:
-        heights = np.ascontiguousarray(bits).view(np.float64)[..., 0]
-        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), marches)
-        found = find_horizons(heights, instrument.sample_distance, slices.far.ravel(), _TAIL * width, flat, dx, dy)
-        return found.reshape(*slices.far.shape, *shape)
-
-    # as bits, for a callback's own thread would round them to float32
-    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(height).astype(jnp.float64), jnp.uint32)
-    chosen = jax.pure_callback(choose, jax.ShapeDtypeStruct((*slices.far.shape, *shape), jnp.int32), bits)
+    height, slope_x, slope_y = (jnp.asarray(f) for f in (surface.height, surface.slope_x, surface.slope_y))
+    dtype, shape = height.dtype, height.shape
+    optics, (dx, dy) = cast(optics, dtype), (jnp.asarray(d, dtype) for d in (raster.dx, raster.dy))
+    slices = slice_apertures(optics, n_slices)
+    chosen = _choose(height, slices, dx, dy, _TAIL * width)
+    padded = jnp.pad(height, [(n, n) for n in shape], mode="edge")
+    shift = optics.beam_shift
 
     @jax.checkpoint  # a gradient evaluates slices anew: kept, they would take twenty times the memory of the value
-    def of_slice(piece, march, found):
+    def of_slice(piece, found):
         tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
-        horizon = jnp.maximum(_slope_up(padded, height, march, found), tangent)
-        return _hidden_in_slice(horizon, depth, piece, instrument.beam_shift, width)
+        horizon = jnp.maximum(_slope_up(padded, height, piece.direction, dx, dy, found), tangent)
+        return _masked_in_slice(horizon, piece.plate - height, piece, shift, width)
 
     def add_slice(total, item):
         return total + of_slice(*item), None
 
     def of_aperture(items):
-        return jax.lax.scan(add_slice, jnp.zeros((3, *shape), height.dtype), items)[0]
+        return jax.lax.scan(add_slice, jnp.zeros((3, *shape), dtype), items)[0]
 
-    return jax.lax.map(of_aperture, (as_input(slices), as_input(marches), chosen))
-
-
-def _stack(records: list) -> Any:
-    """Return named tuples of arrays as one, with a new first axis."""
-    return type(records[0])(*(np.stack(column) for column in zip(*records, strict=True)))
+    return jax.lax.map(of_aperture, (slices, chosen))
 
 
-def _slope_up(padded: jax.Array, height: jax.Array, march: March, found: jax.Array) -> jax.Array:
-    """Return the slope from each point up to its horizon [y, x]."""
+def _choose(height: jax.Array, slices: Slices, dx: Any, dy: Any, tail: float) -> jax.Array:
+    """Choose the horizons of all slices on the host [detector, slice, y, x], constant under differentiation."""
+    columns = [slices.direction[..., 0], slices.direction[..., 1], slices.plate, slices.far, slices.rise]
+    table, steps = jnp.stack(columns, -1), jnp.stack([dx, dy])
+    shape = (*slices.far.shape, *height.shape)
+
+    def choose(*batch: Any) -> np.ndarray:
+        heights, tables, pitches = (_from_bits(a) for a in batch)
+        lead = heights.shape[:-2]
+        out = np.empty((*lead, *shape), np.int32)
+        for i in np.ndindex(lead):
+            pieces = tables[i].reshape(-1, tables.shape[-1])
+            out[i] = find_horizons(heights[i], pieces, tail, *map(float, pitches[i])).reshape(shape)
+        return out
+
+    operands = (_as_bits(jax.lax.stop_gradient(a)) for a in (height, table, steps))
+    return jax.pure_callback(choose, jax.ShapeDtypeStruct(shape, jnp.int32), *operands, vmap_method="broadcast_all")
+
+
+def _as_bits(array: jax.Array) -> jax.Array:
+    """Return a float64 array as pairs of integers, for a callback's own thread would round it to float32."""
+    return jax.lax.bitcast_convert_type(array, jnp.uint32) if array.dtype == np.float64 else array
+
+
+def _from_bits(array: Any) -> np.ndarray:
+    array = np.ascontiguousarray(array)
+    return array.view(np.float64)[..., 0] if array.dtype == np.uint32 else array.astype(np.float64)
+
+
+def _slope_up(padded: jax.Array, height: jax.Array, direction: Any, dx: Any, dy: Any, found: jax.Array) -> jax.Array:
+    """Compute the slope from each point up to its horizon [y, x], a crossing chosen by `find_horizons`."""
     (ny, nx), columns = height.shape, padded.shape[1]
+    rounded, place, axis, number = found & 1, (found >> 1) & 3, (found >> 3) & 1, jnp.maximum(found >> 4, 1)
+    rows, cols = steps_per_um(direction, dx, dy)
+    own, other = jnp.where(axis == 0, rows, cols), jnp.where(axis == 0, cols, rows)
+    distance = number / jnp.abs(own)
+    across = distance * other
+    low = jax.lax.stop_gradient(jnp.floor(across))
+    share = across - low
+    previous = jnp.ceil(jax.lax.stop_gradient(distance * jnp.abs(other)) - _TIE) - 1.0
+    before = jnp.maximum(jnp.maximum((number - 1) / jnp.abs(own), previous / jnp.abs(other)), 0.0)
+    across_wall = distance - jnp.abs(share - 0.5) / jnp.abs(other)
+    at = jnp.where(place == ACROSS, across_wall, distance)
+    at = jnp.where(place == BESIDE, distance - 0.5 / jnp.abs(own), at)
+    at = jnp.where(place == BEFORE, before, at)
+    along, side = number * jnp.sign(own).astype(jnp.int32), low.astype(jnp.int32)
+    row, column = jnp.where(axis == 0, along, side), jnp.where(axis == 0, side, along)
     here = (ny + jnp.arange(ny, dtype=jnp.int32))[:, None] * columns + nx + jnp.arange(nx, dtype=jnp.int32)
-    step, share, distance = at_horizon(march, found)
+    first = here + row * columns + column
+    heights = padded.ravel()
+    share = jnp.where(rounded == 1, jax.lax.stop_gradient(jnp.round(share)), share)
+    there = (1.0 - share) * heights[first] + share * heights[first + jnp.where(axis == 0, 1, columns)]
+    return jnp.where(found == 0, OUTSIDE, (there - height) / at)
 
-    def at(corner):
-        return padded.ravel()[here + (corner[:, 0] * columns + corner[:, 1])[step]]
 
-    return ((1.0 - share) * at(march.first) + share * at(march.second) - height) / distance
-
-
-def _hidden_in_slice(horizon, depth, piece: Slices, shift: tuple[float, float], width: float) -> jax.Array:
-    """Return the vector form factor of the slice's part below the horizon slope [3, y, x]."""
-    low, high = depth / piece.far, depth / piece.near
+def _masked_in_slice(horizon, depth, piece: Slices, shift: jax.Array, width: float) -> jax.Array:
+    """Compute the vector form factor of the slice's part below the horizon slope [3, y, x]."""
+    low, high = (depth / edge + piece.rise for edge in (piece.far, piece.near))
     if width:
         above_low, above_high = (width * jax.nn.softplus((horizon - edge) / width) for edge in (low, high))
         cut = low + above_low - above_high
@@ -189,7 +199,7 @@ def _hidden_in_slice(horizon, depth, piece: Slices, shift: tuple[float, float], 
 
 
 def _primitives(u, toward, across2):
-    """Return the integrals of u / q^2 and u^2 / q^2 over u, with q = (u - toward)^2 + across2.
+    """Compute the integrals of u / q^2 and u^2 / q^2 over u, with q = (u - toward)^2 + across2.
 
     A direction of the slice is d (u e - t, 1) for the distance u in units of the depth d, and t the beam shift: its
     squared length is d^2 q, and cos(theta_d) r / (pi r^3) dA = (u e - t, 1) u / (pi q^2) du dphi.

@@ -1,6 +1,6 @@
 """Multiple scattering by radiosity on the height raster, differentiable in heights and normals (JAX).
 
-By reciprocity the multiple scattering of a pixel is the light it would receive if the detectors shone on the sample:
+By reciprocity the multiple scattering of a pixel is the irradiance it would receive if the detectors emitted:
 I_i = sum_j F_ij (g_j(i) + I_j) with the form factor F_ij of point j seen from point i, the chance g_j(i) that an atom
 leaving j is detected directly while the beam is at pixel i, and the point's own multiple scattering I_j. Cosine law.
 
@@ -20,17 +20,15 @@ visibility a strip has no width, so the derivative is right all the same. Source
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helio_jax.arrays import pitch
-from helio_jax.forward.beam_frame import normal_of_slopes
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.masking import Slices, slice_aperture
+from helio_jax.forward.masking import Slices, slice_apertures
+from helio_jax.forward.optics import Optics, Raster, cast
+from helio_jax.forward.surface import normal_of_slopes
 
 MERGE = 1.4
 """Strips between two powers of this in distance are seen as one ..."""
@@ -40,6 +38,10 @@ LEVEL = 1.0
 """Height of a steep cell's levels, in pitches of the raster; a cell that is lower has none ..."""
 MAX_LEVELS = 12
 """... and none has more than this."""
+N_AZIMUTHS = 24
+"""Directions in which a receiver looks."""
+N_NODES = 8
+"""Points on an aperture that receive what a sender emits."""
 N_SLICES = 6
 """Azimuths along which each aperture is tested for being hidden."""
 TOLERANCE = 1e-7
@@ -83,14 +85,16 @@ class Plan(NamedTuple):
     Attributes:
         place: where the levels of steep cells get their heights, some to spare [level].
         cell: number of each level's cell [level].
-        visible: share of each aperture's light that the sample leaves to each sender [sender, detector].
+        visible: unmasked share of each aperture, seen from each sender [sender, detector].
         strips: what the receivers see.
+        directions: azimuths in which the receivers look [azimuth, 2].
     """
 
     place: Mix
     cell: Any
     visible: Any
     strips: Strips
+    directions: Any
 
 
 class Cells(NamedTuple):
@@ -126,93 +130,112 @@ class Crossings(NamedTuple):
     distance: np.ndarray
 
 
-class Radiosity:
-    """The multiple scattering of a surface given on a raster: call it with heights [y, x] and unit normals [y, x, 3].
+def plan_radiosity(
+    height: np.ndarray,
+    normals: np.ndarray,
+    optics: Optics,
+    raster: Raster,
+    *,
+    substrate_um: float | None = None,
+    n_azimuths: int = N_AZIMUTHS,
+) -> Plan:
+    """Find the points of a surface and the strips that each of them sees (host work: NumPy; no tracers).
 
-    The result is the detection probability of order 2 and above [detector, y, x]. `plan` and `multiple` are its two
-    steps; the second is differentiable. Valid for normals that face the beam and heights below the plate.
+    Valid for normals that face the beam and heights below the plate.
 
     Args:
-        geometry: the instrument.
-        x, y: beam positions, um, at least 2 each.
-        substrate_um: side of the flat at z = 0 about the z axis; default: half an image beyond each border.
+        height: above the substrate [y, x], um.
+        normals: unit normals [y, x, 3].
+        optics: the instrument.
+        raster: at least 2 x 2 beam positions.
+        substrate_um: side of the substrate about the z axis; default: half an image beyond each border.
         n_azimuths: directions in which a receiver looks; a multiple of 4.
     """
-
-    def __init__(
-        self,
-        geometry: SpotGeometry,
-        x: np.ndarray,
-        y: np.ndarray,
-        substrate_um: float | None = None,
-        n_azimuths: int = 24,
-    ) -> None:
-        self.geometry, self.shift = geometry, geometry.instrument.beam_shift
-        self.pitch, self.corner = (pitch(y), pitch(x)), np.array([y[0], x[0]])
-        border = max(np.abs(x).max(), np.abs(y).max())
-        self.reach = border + 0.5 * max(np.ptp(x), np.ptp(y)) if substrate_um is None else 0.5 * substrate_um
-        azimuth = 2.0 * np.pi * (np.arange(n_azimuths) + 0.5) / n_azimuths
-        self.directions = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
-
-    def __call__(self, height: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the multiple scattering [detector, y, x]."""
-        return np.asarray(self.multiple(height, normals, self.plan(height, normals)))
-
-    def multiple(self, height: Any, normals: Any, plan: Plan) -> jax.Array:
-        """Return the same for a fixed plan, differentiable."""
-        with jax.enable_x64(True):
-            tables = jax.tree.map(jnp.asarray, (self.directions, plan))
-            return _multiple(jnp.asarray(height), jnp.asarray(normals), *tables, self.geometry, self.pitch)
-
-    def plan(self, height: np.ndarray, normals: np.ndarray) -> Plan:
-        """Return the points of a surface and what each of them sees."""
-        height, instrument = np.asarray(height, np.float64), self.geometry.instrument
-        cells, place, cell = _cut(height, LEVEL * max(self.pitch))
-        with jax.enable_x64(True):
-            z, normal = _receivers(jnp.asarray(height), jnp.asarray(normals), place, cell, self.pitch, self.shift)
-        receivers = Receivers(np.append(np.arange(height.size), place.first), np.asarray(z), np.asarray(normal))
-        pinhole = instrument.pinhole_center[:2]
-        slices = [slice_aperture(aperture, pinhole, N_SLICES) for aperture in instrument.apertures()]
-        visible = np.stack([self._visible_share(height, receivers, part) for part in slices], -1)
+    height, normals = np.asarray(height, np.float64), np.asarray(normals, np.float64)
+    optics, raster = (jax.tree.map(lambda a: np.asarray(a, np.float64), tree) for tree in (optics, raster))
+    pitches, shift = (raster.dy, raster.dx), optics.beam_shift
+    border = max(np.abs(raster.x).max(), np.abs(raster.y).max())
+    reach = border + 0.5 * max(np.ptp(raster.x), np.ptp(raster.y)) if substrate_um is None else 0.5 * substrate_um
+    azimuth = 2.0 * np.pi * (np.arange(n_azimuths) + 0.5) / n_azimuths
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+    cells, place, cell = _cut(height, LEVEL * max(pitches))
+    with jax.enable_x64(True):
+        z, normal = _receivers(jnp.asarray(height), jnp.asarray(normals), place, cell, pitches, shift)
+        slices = jax.tree.map(np.asarray, _sliced(optics))
+    receivers = Receivers(np.append(np.arange(height.size), place.first), np.asarray(z), np.asarray(normal))
+    parts = [Slices(*(column[k] for column in slices)) for k in range(optics.n_detectors)]
+    visible = np.stack([_visible_share(height, receivers, part, pitches, shift) for part in parts], -1)
+    with jax.enable_x64(True):
         visible = np.asarray(_spread(visible, height.shape, 1.0))
-        rows = [self._look(height, cells, len(visible) - 1, receivers, e) for e in self.directions]
-        width = _roomy(max(len(row.receiver) for row in rows))
-        strips = jax.tree.map(lambda *row: np.stack([_filled(a, width) for a in row]), *rows)
-        is_strip = np.arange(width) < np.array([[len(row.receiver)] for row in rows])
-        strips = strips._replace(receiver=np.where(is_strip, strips.receiver, len(receivers.pixel)).astype(np.int32))
-        return Plan(place, cell, visible, strips)
+    rows = [_look(height, cells, len(visible) - 1, receivers, e, raster, shift, reach) for e in directions]
+    width = _roomy(max(len(row.receiver) for row in rows))
+    strips = jax.tree.map(lambda *row: np.stack([_filled(a, width) for a in row]), *rows)
+    is_strip = np.arange(width) < np.array([[len(row.receiver)] for row in rows])
+    strips = strips._replace(receiver=np.where(is_strip, strips.receiver, len(receivers.pixel)).astype(np.int32))
+    return Plan(place, cell, visible, strips, directions)
 
-    def _visible_share(self, height: np.ndarray, receivers: Receivers, slices: Slices) -> np.ndarray:
-        """Return which share of the light above their own horizon the sample leaves receivers; the beam is at them."""
-        depth, normal = self.geometry.instrument.sample_distance - receivers.height[:, None], receivers.normal[:, None]
-        node, weight = np.polynomial.legendre.leggauss(3)
-        visible, total = np.zeros(len(depth)), np.full(len(depth), 1e-300)
-        for e, near, far, azimuth in zip(*slices, strict=True):
-            tangent = receivers.tangent(e, self.shift)
-            horizon = _march(height, receivers, tangent, _crossings(e, height.shape, self.pitch), 0.0)[0]
-            for light, edge in ((visible, horizon), (total, tangent)):
-                length = (depth / np.maximum(edge[:, None], 1e-9)).clip(near, far) - near
-                u = near + 0.5 * (node + 1.0) * length
-                x, y = (u * e[axis] - depth * self.shift[axis] for axis in (0, 1))
-                light += azimuth * (length * weight * u * _light(normal, x, y, depth, np)).sum(-1)
-        return np.minimum(visible / total, 1.0)
 
-    def _look(self, height, cells: Cells, outside: int, receivers: Receivers, direction: np.ndarray) -> Strips:
-        """Return the strips that receivers see along an azimuth, in the order of the receivers [strip]."""
-        crossings, tangent = _crossings(direction, height.shape, self.pitch), receivers.tangent(direction, self.shift)
-        horizon, codes = _march(height, receivers, tangent, crossings, GENTLE * max(self.pitch))
-        strips = _name(height, cells, receivers, direction[::-1] / self.pitch, crossings, tangent, codes)
-        # the flat outside
-        row, column = np.divmod(receivers.pixel, height.shape[1])
-        x, y = self.corner[1] + column * self.pitch[1], self.corner[0] + row * self.pitch[0]
-        far = np.min([(self.reach * np.sign(e) - v) / e for e, v in zip(direction, (x, y), strict=True)], 0)
-        i = np.flatnonzero((horizon < 0.0) & (-receivers.height > horizon * far))
-        none = np.full(i.size, height.size)
-        middle = 2.0 / (1.0 / far[i] - horizon[i] / receivers.height[i])
-        flat = Strips(i, np.full(i.size, outside), Mix(none, none, 0.0 * middle), far[i], middle)
-        joined = jax.tree.map(lambda *parts: np.concatenate(parts), strips, flat)
-        order = np.argsort(joined.receiver, kind="stable")
-        return jax.tree.map(lambda a: a[order].astype(np.int32 if a.dtype.kind == "i" else np.float64), joined)
+@jax.jit
+def _sliced(optics: Optics) -> Slices:
+    return slice_apertures(optics, N_SLICES)
+
+
+def radiosity(height: Any, normals: Any, optics: Optics, raster: Raster, plan: Plan) -> jax.Array:
+    """Compute the multiple scattering, orders 2 and above [detector, y, x], for a fixed plan; differentiable.
+
+    Args:
+        height: above the substrate [y, x], um.
+        normals: unit normals [y, x, 3].
+        optics: the instrument.
+        raster: beam positions.
+        plan: from `plan_radiosity` on this surface, or one that differs little.
+    """
+    height = jnp.asarray(height)
+    plan, optics, steps = (cast(part, height.dtype) for part in (plan, optics, (raster.dy, raster.dx)))
+    weight, second = transfer(height, jnp.asarray(normals), optics, steps, plan)
+
+    def remainder(irradiance):
+        return irradiance - _gather(plan.strips, weight, _spread(irradiance, height.shape, 0.0), len(irradiance))
+
+    total = jax.lax.custom_linear_solve(remainder, second, _neumann, _neumann)
+    return total[: height.size].T.reshape(-1, *height.shape)
+
+
+def _visible_share(height, receivers: Receivers, slices: Slices, pitches, shift) -> np.ndarray:
+    """Compute the share of the irradiance above their own horizon that the sample leaves receivers, beam at them."""
+    normal = receivers.normal[:, None]
+    node, weight = np.polynomial.legendre.leggauss(3)
+    visible, total = np.zeros(len(receivers.height)), np.full(len(receivers.height), 1e-300)
+    for e, near, far, azimuth, plate, rise in zip(*slices, strict=True):
+        tangent = receivers.tangent(e, shift)
+        horizon = _march(height, receivers, tangent, _crossings(e, height.shape, pitches), 0.0)[0]
+        depth = plate - receivers.height[:, None]
+        for irradiance, edge in ((visible, horizon), (total, tangent)):
+            length = (depth / np.maximum(edge[:, None] - rise, 1e-9)).clip(near, far) - near
+            u = near + 0.5 * (node + 1.0) * length
+            up = depth + rise * u
+            x, y = (u * e[axis] - up * shift[axis] for axis in (0, 1))
+            irradiance += azimuth * (length * weight * u * _irradiance(normal, x, y, up, np)).sum(-1)
+    return np.minimum(visible / total, 1.0)
+
+
+def _look(height, cells: Cells, outside: int, receivers: Receivers, direction, raster: Raster, shift, reach) -> Strips:
+    """Find the strips that receivers see along an azimuth, in the order of the receivers [strip]."""
+    pitches = (raster.dy, raster.dx)
+    crossings, tangent = _crossings(direction, height.shape, pitches), receivers.tangent(direction, shift)
+    horizon, codes = _march(height, receivers, tangent, crossings, GENTLE * max(pitches))
+    strips = _name(height, cells, receivers, direction[::-1] / pitches, crossings, tangent, codes)
+    # the substrate outside
+    row, column = np.divmod(receivers.pixel, height.shape[1])
+    x, y = raster.x[0] + column * raster.dx, raster.y[0] + row * raster.dy
+    far = np.min([(reach * np.sign(e) - v) / e for e, v in zip(direction, (x, y), strict=True)], 0)
+    i = np.flatnonzero((horizon < 0.0) & (-receivers.height > horizon * far))
+    none = np.full(i.size, height.size)
+    middle = 2.0 / (1.0 / far[i] - horizon[i] / receivers.height[i])
+    flat = Strips(i, np.full(i.size, outside), Mix(none, none, 0.0 * middle), far[i], middle)
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts), strips, flat)
+    order = np.argsort(joined.receiver, kind="stable")
+    return jax.tree.map(lambda a: a[order].astype(np.int32 if a.dtype.kind == "i" else np.float64), joined)
 
 
 def _roomy(count: int) -> int:
@@ -263,7 +286,7 @@ def _spread(values, shape: tuple[int, int], outside: float):
     """Return what senders (cells: mean of corners; levels; the flat outside) have from receivers' values."""
     n, rest = shape[0] * shape[1], values.shape[1:]
     cells = 0.25 * jnp.stack(_corners(values[:n].reshape(*shape, *rest))).sum(0).reshape(-1, *rest)
-    return jnp.concatenate([cells, values[n:], jnp.full((1, *rest), outside)])
+    return jnp.concatenate([cells, values[n:], jnp.full((1, *rest), outside, values.dtype)])
 
 
 def _crossings(direction: np.ndarray, shape: tuple[int, int], pitches: tuple[float, float]) -> Crossings:
@@ -361,31 +384,38 @@ def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossin
     return jax.tree.map(lambda a: a[keep], strips)
 
 
-def _light(normal: Any, x: Any, y: Any, depth: Any, xp: Any) -> Any:
-    """Return the light max(n . r, 0) r_z / (pi |r|^4) that a point gets from those of an aperture at r."""
+def _irradiance(normal: Any, x: Any, y: Any, depth: Any, xp: Any) -> Any:
+    """Compute max(n . r, 0) r_z / (pi |r|^4), the irradiance of a point by those of an aperture at r."""
     facing = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2] * depth
     return xp.maximum(facing, 0.0) * depth / (np.pi * (x * x + y * y + depth * depth) ** 2)
 
 
-@partial(jax.jit, static_argnums=(4, 5))
-def transfer(height, normals, directions, plan: Plan, geometry: SpotGeometry, pitches):
-    """Return the form factors of strips [azimuth, strip] and the direct light that they bring [receiver, detector].
-
-    The last two arguments, instrument and pitches (y, x) of the raster, um, are static.
+def transfer(height, normals, optics: Optics, pitches, plan: Plan):
+    """Compute the form factors of strips [azimuth, strip] and the direct flux that they bring [receiver, detector].
 
     A strip from slope m0 to m1 in a slice of azimuth e and width dphi has the vector form factor
     (dphi / pi) integral of D / |D|^4 dm with D = (e - m t, m), the direction of slope m; t is the beam shift.
+
+    Args:
+        height, normals: as in `radiosity`.
+        optics: the instrument.
+        pitches: dy, dx of the raster, um.
+        plan: the strips.
     """
-    shape, apertures, shift = height.shape, geometry.instrument.apertures(), geometry.instrument.beam_shift
+    shape, shift = height.shape, optics.beam_shift
     heights = jnp.append(height, 0.0)
     z, normal = _receivers(height, normals, plan.place, plan.cell, pitches, shift)
-    sender_normal = jnp.concatenate([_cell_normals(height, pitches, shift), normal[height.size :], jnp.eye(3)[2:]])
-    position = geometry.position(_spread(z, shape, 0.0))
+    upward = jnp.eye(3, dtype=height.dtype)[2:]
+    sender_normal = jnp.concatenate([_cell_normals(height, pitches, shift), normal[height.size :], upward])
+    position = optics.spot(_spread(z, shape, 0.0))
     # points of equal weight: right for cubic functions, to 1 % where the sender's own horizon cuts the aperture
-    nodes = np.stack([a.center + np.sqrt(0.5) * (a.rim(8)[0] - a.center) for a in apertures])
-    share = plan.visible * np.array([np.pi * np.prod(a.semi_axes) / nodes.shape[1] for a in apertures])
+    angle = 2.0 * np.pi * np.arange(N_NODES) / N_NODES
+    circle = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)]).astype(height.dtype)
+    nodes = optics.center[:, None] + jnp.einsum("kin,nj->kji", optics.axes, circle)  # [detector, node, 3]
+    area = jnp.cross(optics.axes[..., 0], optics.axes[..., 1])  # its vector, along the plate's normal
+    share = plan.visible * (np.pi / N_NODES)
     steep = 1.0 + shift[0] ** 2 + shift[1] ** 2
-    across = normal[:, 2] - normal[:, :2] @ jnp.array(shift)
+    across = normal[:, 2] - normal[:, :2] @ shift
 
     def primitives(slope, toward):
         w, k2 = slope - toward, 1.0 / steep - toward**2
@@ -395,32 +425,25 @@ def transfer(height, normals, directions, plan: Plan, geometry: SpotGeometry, pi
 
     def add(total, row):
         e, strip = row
-        i, j, toward = strip.receiver, strip.sender, e @ jnp.array(shift) / steep
+        i, j, toward = strip.receiver, strip.sender, e @ shift / steep
         along = normal[:, :2] @ e
         high = primitives((strip.end.of(heights) - z[i]) / strip.distance, toward)
         tangent = primitives(-along / across, toward)
         gain, up = high - jnp.where(i == jnp.roll(i, 1), jnp.roll(high, 1, 1), tangent[:, i])
-        weight = 2.0 / len(directions) * (along[i] * gain + across[i] * up)
+        weight = 2.0 / len(plan.directions) * (along[i] * gain + across[i] * up)
         x, y = (position[axis][j] + strip.middle * e[axis] for axis in (0, 1))
-        rays = nodes[..., 0, None] - x, nodes[..., 1, None] - y
-        light = _light(sender_normal[j], rays[0], rays[1], position[2][j], jnp).sum(1).T
-        received = weight[:, None] * light * share[j]
+        ray = jnp.stack(
+            [nodes[..., 0, None] - x, nodes[..., 1, None] - y, nodes[..., 2, None] - position[2][j]]
+        )  # [3, detector, node, strip]
+        facing = jnp.maximum(jnp.einsum("iknj,ji->knj", ray, sender_normal[j]), 0.0)
+        onto = jnp.einsum("iknj,ki->knj", ray, area)
+        direct = (facing * onto / jnp.sum(ray**2, 0) ** 2 / np.pi).sum(1).T
+        received = weight[:, None] * direct * share[j]
         return total.at[i].add(received, mode="drop"), weight
 
-    start = jnp.zeros((len(z), len(apertures)))
-    second, weight = jax.lax.scan(jax.checkpoint(add), start, (directions, plan.strips))
+    start = jnp.zeros((len(z), optics.n_detectors), height.dtype)
+    second, weight = jax.lax.scan(jax.checkpoint(add), start, (plan.directions, plan.strips))
     return weight, second
-
-
-@partial(jax.jit, static_argnums=(4, 5))
-def _multiple(height, normals, directions, plan: Plan, geometry: SpotGeometry, pitches):
-    weight, second = transfer(height, normals, directions, plan, geometry, pitches)
-
-    def remainder(light):
-        return light - _gather(plan.strips, weight, _spread(light, height.shape, 0.0), len(light))
-
-    total = jax.lax.custom_linear_solve(remainder, second, _neumann, _neumann)
-    return total[: height.size].T.reshape(-1, *height.shape)
 
 
 def _neumann(remainder: Callable[[jax.Array], jax.Array], first: jax.Array) -> jax.Array:
@@ -436,11 +459,13 @@ def _neumann(remainder: Callable[[jax.Array], jax.Array], first: jax.Array) -> j
     return jax.lax.while_loop(is_open, add, (jnp.zeros_like(first), first, 0))[0]
 
 
-def _gather(strips: Strips, weight: jax.Array, light: jax.Array, n: int) -> jax.Array:
-    """Return sum_j F_ij light_j [receiver, detector], n receivers, of the senders' light [sender, detector]."""
+def _gather(strips: Strips, weight: jax.Array, emitted: jax.Array, n: int) -> jax.Array:
+    """Compute sum_j F_ij e_j [receiver, detector], n receivers, of what the senders emit, e [sender, detector]."""
 
     def add(total, row):
         receiver, sender, w = row
-        return total.at[receiver].add(w[:, None] * light[sender], mode="drop"), None
+        return total.at[receiver].add(w[:, None] * emitted[sender], mode="drop"), None
 
-    return jax.lax.scan(add, jnp.zeros((n, light.shape[1])), (strips.receiver, strips.sender, weight))[0]
+    return jax.lax.scan(add, jnp.zeros((n, emitted.shape[1]), emitted.dtype), (strips.receiver, strips.sender, weight))[
+        0
+    ]

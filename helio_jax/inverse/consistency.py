@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from helio_jax.arrays import pitch
-from helio_jax.forward.beam_frame import unit_normal
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.render import Corrections, single_scattering
+from helio_jax.forward.surface import unit_normal
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of
 from helio_jax.inverse.nearfield import limited, solve_nearfield
-from helio_jax.inverse.residuals import Prediction
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 
@@ -32,9 +32,9 @@ def degrees_of_freedom(stack: MicrographStack) -> int:
 
 def misfit(
     stack: MicrographStack,
-    geometry: SpotGeometry,
+    optics: Optics,
     settings: ReconstructSettings,
-    predict: Callable[[np.ndarray, np.ndarray], Prediction] | None = None,
+    predict: Callable[[np.ndarray, np.ndarray], Corrections] | None = None,
 ) -> float:
     """Return the chi-square per degree of freedom of the images that the integrated near-field surface predicts.
 
@@ -42,24 +42,24 @@ def misfit(
 
     Args:
         stack: images in units of the beam, or with one unknown gain common to all detectors.
-        geometry: of the stack's instrument.
+        optics: of the stack's instrument.
         settings: integrator and rounds of the near-field method.
         predict: masks and multiple scattering of a surface (heights, normals); default: there are none.
 
     Source: own derivation, tests/unit/test_orient.py.
     """
     signal, variance = signal_of(stack)
-    steps = pitch(stack.x), pitch(stack.y)
-    height = limited(solve_nearfield(signal, variance, geometry, *steps, settings, settings.rounds)[0], geometry)
-    down, along = np.gradient(height, pitch(stack.y), pitch(stack.x))
-    normal = unit_normal(along, down, stack.instrument.beam_shift)
-    phi, multiple = geometry.form_factor(height), 0.0
+    raster = Raster.of(stack)
+    height = limited(solve_nearfield(signal, variance, optics, raster, settings, settings.rounds)[0], optics)
+    down, along = np.gradient(height, raster.dy, raster.dx)
+    normal = unit_normal(along, down, optics.beam_shift)
+    phi, multiple = form_factor(optics, height), 0.0
     if predict is not None:
         found = predict(height, np.moveaxis(normal, 0, -1))
-        phi, multiple = phi - found.hidden, found.multiple
-    light = np.maximum(np.einsum("kiyx,iyx->kyx", phi, normal), 0.0) + multiple
+        phi, multiple = phi - found.masked, found.multiple
+    model = np.maximum(single_scattering(phi, normal), 0.0) + multiple
     is_used = np.isfinite(signal) & (stack.is_observed.sum(0) >= MIN_IMAGES)
     weight, data = np.where(is_used, 1.0 / variance, 0.0), np.where(is_used, signal, 0.0)
-    power = (weight * light**2).sum(0)
-    albedo = np.maximum((weight * data * light).sum(0), 0.0) / np.where(power > 0, power, 1.0)
-    return float(np.sum(weight * (data - albedo * light) ** 2)) / degrees_of_freedom(stack)
+    power = (weight * model**2).sum(0)
+    albedo = np.maximum((weight * data * model).sum(0), 0.0) / np.where(power > 0, power, 1.0)
+    return float(np.sum(weight * (data - albedo * model) ** 2)) / degrees_of_freedom(stack)

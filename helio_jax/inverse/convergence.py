@@ -27,7 +27,7 @@ def contraction_of(changes: Sequence[float]) -> float | None:
     return changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
 
 
-def left_to_go(changes: Sequence[float], ahead: float) -> float:
+def remaining_error(changes: Sequence[float], extrapolation: float) -> float:
     """Return how far the heights are from where further rounds would take them, in changes of the last one.
 
     Rounds that creep have as far to go as `aitken` says, nine changes at most. Those that swing, or tremble for their
@@ -37,13 +37,13 @@ def left_to_go(changes: Sequence[float], ahead: float) -> float:
 
     Args:
         changes: root mean square of the changes of the heights in every round.
-        ahead: from `aitken` by the last two; of no use with fewer.
+        extrapolation: from `aitken` by the last two; of no use with fewer.
     """
     known = [c for c in (contraction_of(changes), contraction_of(changes[:-1])) if c is not None]
     if not known:
         return 1.0
     contraction, most = max(known), SLOWEST / (1.0 - SLOWEST)
-    creeps = ahead - 1.0 if 0.0 < ahead < 1.0 + most else most
+    creeps = extrapolation - 1.0 if 0.0 < extrapolation < 1.0 + most else most
     swings = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
     return max(creeps, swings)
 

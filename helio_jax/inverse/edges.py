@@ -1,7 +1,7 @@
 """The edges of the raster: whether two neighbouring pixels are joined smoothly, by a kink, or parted by a jump.
 
 The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the
-mean of the two slopes (trapezoid rule; `bent` where the surface is smooth further on), but for a kink somewhere between
+mean of the two slopes (trapezoid rule; `fourth_order_slopes` where the surface is smooth further on), but for a kink somewhere between
 the two positions, which makes that rule uncertain, and for a depth jump, across which it means nothing. All of it is
 decided on the current surface and then held fixed: the weights of the next least-squares solve. Works in NumPy; what
 takes `Any` also on JAX arrays.
@@ -12,59 +12,29 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.forward.surface import along, around
+from helio_jax.robust import cauchy_weight
+
 NOISE_FLOOR = 0.2
-"""Smallest doubt of the trapezoid rule, in units of the slope noise of one pixel."""
-_NO_EDGE = 1e-3
-"""Weight that a pixel with two cut edges would still need: its one-sided slope is then about zero."""
-
-
-def geman_mcclure(misfit: np.ndarray, limit: float) -> np.ndarray:
-    """Return the square root of the robust weight, 1/2 at a misfit of `limit`.
-
-    Source: Geman and McClure, Bull. ISI 52 (1987) 5; as weights: Black and Rangarajan, IJCV 19 (1996) 57, sec. 4.
-    """
-    return 1.0 / (1.0 + (misfit / limit) ** 2)
-
-
-def along(field: Any, axis: int) -> tuple[Any, Any]:
-    """Return the values [y, x] at the two ends of every edge along `axis` (0: y, 1: x)."""
-    return (field[:, :-1], field[:, 1:]) if axis == 1 else (field[:-1], field[1:])
+"""Smallest standard deviation of the trapezoid rule, in units of the slope noise of one pixel."""
 
 
 def ranked(region: np.ndarray) -> np.ndarray:
-    """Return the regions' numbers [pixel] anew, by falling size: the largest is 0."""
+    """Renumber regions [pixel] by falling size: the largest is 0."""
     order = np.argsort(-np.bincount(region), kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(order.size)
     return rank[region]
 
 
-def around(edge: Any, axis: int) -> tuple[Any, Any]:
-    """Return for every pixel [y, x] the values of the edges before and after it along `axis`; 0 outside the raster."""
-    pad = [(0, 0), (0, 0)]
-    pad[axis] = (1, 1)
-    return along(edge.__array_namespace__().pad(edge, pad), axis)
-
-
-def to_pixels(edge: Any, axis: int) -> Any:
-    """Return for every pixel the sum over its two edges along `axis`; the adjoint of summing an edge's two ends."""
-    before, after = around(edge, axis)
-    return before + after
-
-
-def one_sided(slope: Any, intact: Any, axis: int) -> Any:
-    """Return pixel slopes [y, x]: means of the edges' slopes, weighted by how intact they are, never across a jump."""
-    return to_pixels(intact * slope, axis) / (to_pixels(intact, axis) + _NO_EDGE)
-
-
 def trapezoid_gap(height: Any, slope: Any, pitch: float, axis: int) -> Any:
-    """Return by how much every edge's slope, (height change) / pitch, exceeds the mean slope of its two ends."""
+    """Compute by how much every edge's slope, (height change) / pitch, exceeds the mean slope of its two ends."""
     before, after = along(height, axis)
     return (after - before) / pitch - 0.5 * sum(along(slope, axis))
 
 
-def bent(slope: Any, bend: Any, axis: int) -> Any:
-    """Return the slopes [y, x] whose means over the two ends of an edge are the edges' slopes on curved surfaces, too.
+def fourth_order_slopes(slope: Any, weight: Any, axis: int) -> Any:
+    """Compute slopes [y, x] whose means over the two ends of an edge are right to fourth order on curved surfaces.
 
     A twelfth of the second difference is taken away: the mean is then that of the cubic through four slopes,
     (-p0 + 13 p1 + 13 p2 - p3) / 24. The trapezoid rule alone makes a wave of k radians per pixel too low by
@@ -73,16 +43,16 @@ def bent(slope: Any, bend: Any, axis: int) -> Any:
 
     Args:
         slope: at the pixels [y, x].
-        bend: share of it that counts, from `bend_of`; 0 at the border [y, x].
+        weight: of the second-difference term, from `smoothness_weight`; 0 at the border [y, x].
         axis: 0 (y) or 1 (x).
     """
     before, after = along(slope, axis)
     to_previous, to_next = around(after - before, axis)
-    return slope - bend / 12.0 * (to_next - to_previous)
+    return slope - weight / 12.0 * (to_next - to_previous)
 
 
 def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
-    """Return by how much the slope changes in every edge beyond what it does in the edges before and after it.
+    """Compute by how much the slope changes in every edge beyond its change in the edges before and after.
 
     Zero where the surface is smoothly curved; the whole change of slope at an isolated kink.
     """
@@ -96,25 +66,25 @@ def kink_size(slope: np.ndarray, axis: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Edges:
+class AxisEdges:
     """The edges along one axis, as the next solve sees them.
 
     Attributes:
-        doubt: standard deviation of (height change / pitch) - (mean of the two slopes) on an edge without a jump.
-        intact: weight that is left to the edge, 1: joined, 0: a depth jump.
+        sigma: standard deviation of (height change / pitch) - (mean of the two slopes) on an edge without a jump.
+        joined: weight that is left to the edge, 1: joined, 0: a depth jump.
     """
 
-    doubt: np.ndarray
-    intact: np.ndarray
+    sigma: np.ndarray
+    joined: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
         """Factor that turns the misfit of an edge into standard deviations, robustly."""
-        return np.sqrt(self.intact) / self.doubt
+        return np.sqrt(self.joined) / self.sigma
 
 
-def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, noise: float, cut: float) -> Edges:
-    """Return the state of all edges along one axis.
+def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, noise: float, cut: float) -> AxisEdges:
+    """Find kinks and jumps in all edges along one axis.
 
     With a kink uniformly within the edge, slopes s1 and s2 on its two sides, the trapezoid rule's error is
     (u - 1/2)(s2 - s1), u uniform in (0, 1): a variance of (s2 - s1)^2 / 12. A smooth surface leaves a twelfth of the
@@ -132,22 +102,22 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
     """
     before, after = along(slope, axis)
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
-    doubt = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
-    misfit = trapezoid_gap(height, slope, pitch, axis) / doubt
-    return Edges(doubt, geman_mcclure(misfit, cut) ** 2)
+    sigma = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
+    misfit = trapezoid_gap(height, slope, pitch, axis) / sigma
+    return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2)
 
 
-def bend_of(intact: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
-    """Return the share of `bent` that counts in every pixel [y, x]: how smooth the surface is in both of its edges.
+def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
+    """Compute the weight of `fourth_order_slopes` in every pixel [y, x]: how smooth the surface is in both of its edges.
 
-    Beside a kink the correction errs by a 24th of it; it fades where that is more than the doubt of all edges.
+    Beside a kink the correction errs by a 24th of it; it fades where that exceeds the least sigma of the edges.
 
     Args:
-        intact: weight left of the edges.
+        joined: weight left of the edges.
         slope: slopes along `axis` [y, x].
         noise: slope noise of one pixel.
         axis: 0 (y) or 1 (x).
     """
-    smooth = intact * geman_mcclure(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
+    smooth = joined * cauchy_weight(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
     previous, following = around(smooth, axis)
     return previous * following

@@ -16,13 +16,13 @@ WEAK = 0.5
 _LISTED = 6
 _TERMS = 4
 """Weak combinations that are listed at most, and parameters that are named in each."""
-_UNTOLD = 1.0 - 1e-6
+_PRIOR_DOMINATED = 1.0 - 1e-6
 """A parameter that keeps all of its prior deviation touches no datum, and so no height."""
 
 
 def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[float, str]]:
     """Return the prior deviation and its unit of every kind of instrument parameter."""
-    sure = fit.instrument.uncertainty
+    stated = fit.instrument.uncertainty
     return {
         "log_gain": (settings.gain_std, "relative"),
         "offset": (settings.offset_std, "of the signal"),
@@ -30,9 +30,9 @@ def prior_deviations(fit: Fit, settings: RefineSettings) -> dict[str, tuple[floa
         "drift": (settings.drift_std, "of the signal"),
         "law": (settings.law_std, "of the exponent"),
         "distance": (fit.distance_std, "um"),
-        "tilt": (sure.tilt_deg, "deg"),
-        "polar": (sure.polar_deg, "deg"),
-        "azimuth": (sure.azimuth_deg, "deg"),
+        "tilt": (stated.tilt_deg, "deg"),
+        "polar": (stated.polar_deg, "deg"),
+        "azimuth": (stated.azimuth_deg, "deg"),
     }
 
 
@@ -47,7 +47,7 @@ def _plain(name: str, detectors: tuple[str, ...]) -> str:
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = _kind(name)
-    if kind in ("distance", "unseen", "law"):
+    if kind in ("distance", "occluded", "law"):
         return kind
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"
@@ -71,7 +71,7 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         return {}
     detectors = fit.instrument.detector_names
     units = prior_deviations(fit, settings)
-    flat = np.concatenate([np.ravel(fit.values[name]) for name in posterior.fields])
+    flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])
     deviation = np.sqrt(np.diag(posterior.instrument_covariance))
     values = {}
     for name, value, std in zip(posterior.names, flat, deviation, strict=True):
@@ -79,14 +79,14 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
         if prior > 0:
             numbers = (float(prior * value), float(prior * std), float(prior))
             values[_plain(name, detectors)] = [*numbers, unit]
-    told = np.flatnonzero(deviation < _UNTOLD)
-    size, vector = np.linalg.eigh(posterior.instrument_covariance[np.ix_(told, told)])
+    determined = np.flatnonzero(deviation < _PRIOR_DOMINATED)
+    size, vector = np.linalg.eigh(posterior.instrument_covariance[np.ix_(determined, determined)])
     weak = []
     for i in np.argsort(size)[::-1][:_LISTED]:
         if size[i] <= WEAK**2:
             break
         terms = np.argsort(-np.abs(vector[:, i]))[:_TERMS]
-        of = {_plain(posterior.names[told[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
+        of = {_plain(posterior.names[determined[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
         weak.append({"left": float(np.sqrt(size[i])), "of": of})
-    bent = 0.0 if posterior.bent is None else float(np.sqrt((posterior.bent**2).sum(0)).max())
-    return {"values": values, "weak": weak, "widening": posterior.widening, "bent_um": bent}
+    bent = 0.0 if posterior.common_modes is None else float(np.sqrt((posterior.common_modes**2).sum(0)).max())
+    return {"values": values, "weak": weak, "widening": posterior.inflation, "bent_um": bent}

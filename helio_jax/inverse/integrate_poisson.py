@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from helio_jax.errors import GuardError
-from helio_jax.inverse.edges import along
+from helio_jax.forward.surface import along
 
 Image = Float[np.ndarray, "y x"]
 EdgesX = Float[np.ndarray, "y x-1"]

@@ -10,14 +10,15 @@ from collections.abc import Callable
 from itertools import product
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
-from helio_jax.errors import GuardError
+from helio_jax.errors import PredictionError
+from helio_jax.forward.surface import Surface
 from helio_jax.inverse.quality import FLOATING
 from helio_jax.inverse.regions import grown
-from helio_jax.inverse.residuals import Surface
 
 _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Levels that are tried, up and down, in widths of the region."""
@@ -39,7 +40,7 @@ class Levels(NamedTuple):
     undecided: list[int]
 
 
-def _way_out(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
+def _distance_to_region_edge(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
     """Return how far it is from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
 
     A region that reaches the image's border does not end there.
@@ -86,11 +87,11 @@ def at_level(
     if beam_shift is not None:
         along, sign = math.hypot(*beam_shift), np.sign(level)
         x, y = (-sign * shift / along for shift in beam_shift)
-        height = _way_out(inside, (x, y), pitch) / along
+        height = _distance_to_region_edge(inside, (x, y), pitch) / along
         is_wall = height < abs(level)
-        values = (ground + sign * height, -sign * x / along, -sign * y / along)
-        flat = Surface(*(np.where(is_wall, wall, field) for wall, field in zip(values, flat, strict=True)))
-    return Surface(*(np.where(inside, new, field) for new, field in zip(flat, surface, strict=True)))
+        wall = Surface(ground + sign * height, -sign * x / along, -sign * y / along)
+        flat = jax.tree.map(lambda *fields: np.where(is_wall, *fields), wall, flat)
+    return jax.tree.map(lambda *fields: np.where(inside, *fields), flat, surface)
 
 
 def search_levels(
@@ -133,7 +134,7 @@ def search_levels(
             if key not in tried:
                 try:
                     tried[key] = misfit(trial)
-                except GuardError:  # no level of a wall that nothing can be predicted of
+                except PredictionError:  # no level of a wall that nothing can be predicted of
                     tried[key] = np.inf, trial
             return tried[key][0]
 

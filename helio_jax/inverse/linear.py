@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
+from helio_jax.forward.render import single_scattering
+from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from helio_jax.micrograph import MicrographStack
 
 MIN_IMAGES = 3
@@ -96,7 +97,7 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     n_rounds = _ROBUST_ROUNDS if signal.shape[0] > MIN_IMAGES else 1
     for _ in range(n_rounds):
         rho_n = _weighted_solve(phi, data, weight)
-        model = np.einsum("kiyx,yxi->kyx", phi, rho_n)
+        model = single_scattering(phi, np.moveaxis(rho_n, -1, 0))
         residuals = np.where(observed, (data - model) / sigma, 0.0)
         is_away = observed & (model < _GRAZING * np.linalg.norm(phi, axis=1) * np.linalg.norm(rho_n, axis=-1))
         is_away &= (residuals > 0.0) & ((observed & ~is_away).sum(0) >= MIN_IMAGES)
@@ -140,7 +141,7 @@ def solve_known_albedo(
         normal = np.stack(normal_of_slopes(slopes[..., 0], slopes[..., 1], shift))
         length = np.sqrt((normal**2).sum(0))
         unit = normal / length
-        model = np.einsum("kiyx,iyx->kyx", phi, unit)
+        model = single_scattering(phi, unit)
         along = np.einsum("kiyx,si->skyx", phi, tangents)
         turn = np.einsum("iyx,si->syx", unit, tangents)
         jacobian = (along - model * turn[:, None]) / length * weight

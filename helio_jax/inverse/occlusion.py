@@ -1,15 +1,14 @@
-"""Edges where the beam leaves the sample: behind a rim that falls off steeper than the beam there is a depth jump.
+"""Occlusion edges: behind a rim that falls off steeper than the beam the surface has a depth jump.
 
-A fit whose instrument is free would rather bend the instrument than tear the surface: if all edges are joined at
-first, angles and offsets make the far side of a hill come down to the ground. So while the instrument is fitted for
+A fit whose instrument is free would rather change the instrument than cut the surface: if all edges are joined at
+first, angles and offsets make the far side of a hill come down to the substrate. So while the instrument is fitted for
 the first time, such edges are cut; afterwards each is joined again if its misfit allows.
 """
 
 import numpy as np
 
-from helio_jax.inverse.edges import along
+from helio_jax.forward.surface import Surface, along
 from helio_jax.inverse.regions import WALL, wall_strength
-from helio_jax.inverse.residuals import Surface
 
 _HALF_LENGTHS = (1, 3)
 """Pixels to both sides, along the edge, over which its change is averaged."""
@@ -17,10 +16,10 @@ STEEP = 1.0
 """Fall of the beam-frame height along the beam, per raster step of the same length, from which on it may be one."""
 
 
-def shadow_edges(
+def find_occlusion_edges(
     signal: np.ndarray, variance: np.ndarray, surface: Surface, shift: tuple[float, float], axis: int
 ) -> np.ndarray:
-    """Return True for edges along an axis (0: y, 1: x) that may lie across a depth jump behind a rim.
+    """Find edges along an axis (0: y, 1: x) that may lie across a depth jump behind a rim (self-occlusion along the beam).
 
     The images change across them as across a wall, and the surface on either side falls steeply along the beam.
 

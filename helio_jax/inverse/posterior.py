@@ -24,9 +24,19 @@ import scipy.sparse as sparse
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
-from helio_jax.inverse.edges import along
-from helio_jax.inverse.residuals import SLOPE_STD, Lagged, Model, Surface, Unknowns
-from helio_jax.inverse.samples import also_off_by, on_raster
+from helio_jax.forward.surface import Surface, along
+from helio_jax.inverse.residuals import (
+    SLOPE_STD,
+    FixedTerms,
+    Parameters,
+    Unknowns,
+    border_residuals,
+    data_residuals,
+    edge_residuals,
+    edge_scale,
+    surface_of,
+)
+from helio_jax.inverse.samples import add_common_mode, on_raster
 
 MAX_PIXELS = 30_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -39,28 +49,28 @@ class Linearised:
     Attributes:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
-        far: derivative with respect to what all heights have in common [residual, common]: the levels of the plateaus
-            through what they hide, the modes through the prediction, the level that is held and, as the last, the mean
-            height through what the edges count; it adds far @ plateau.T to `surface`.
-        plateau: derivative of those with respect to the surface [3 * pixel, common].
+        common: derivative with respect to what many heights have in common [residual, common]: the common modes, the
+            held level and, as the last, the mean height through the scale of the edges; it adds common @ weights.T to
+            `surface`.
+        weights: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
         shape: of the raster (y, x).
     """
 
     surface: sparse.csr_matrix
     instrument: np.ndarray
-    far: np.ndarray
-    plateau: np.ndarray
+    common: np.ndarray
+    weights: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
-        return self.surface.T @ residuals + self.plateau @ (self.far.T @ residuals)
+        return self.surface.T @ residuals + self.weights @ (self.common.T @ residuals)
 
     def apply(self, surface: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative times changes of the surface [3 * pixel, ...]."""
-        return self.surface @ surface + self.far @ (self.plateau.T @ surface)
+        return self.surface @ surface + self.common @ (self.weights.T @ surface)
 
     def solver(self) -> Callable[[np.ndarray], np.ndarray]:
         """Return the function that solves with the information matrix of the surface, for [3 * pixel, ...].
@@ -69,11 +79,11 @@ class Linearised:
         """
         information = (self.surface.T @ self.surface).tocsc()
         factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        n = self.far.shape[1]
+        n = self.common.shape[1]
         if n == 0:
             return factor.solve
-        update = np.hstack([self.surface.T @ self.far, self.plateau])
-        middle = np.block([[np.zeros((n, n)), np.eye(n)], [np.eye(n), self.far.T @ self.far]])
+        update = np.hstack([self.surface.T @ self.common, self.weights])
+        middle = np.block([[np.zeros((n, n)), np.eye(n)], [np.eye(n), self.common.T @ self.common]])
         answer = factor.solve(update)
         small = np.linalg.inv(middle) + update.T @ answer
         return lambda right: (free := factor.solve(right)) - answer @ np.linalg.solve(small, update.T @ free)
@@ -90,8 +100,8 @@ class Posterior:
         instrument_covariance: in prior deviations [parameter, parameter].
         names: of the instrument parameters.
         stride: thinning of the raster at which it was computed (1: none).
-        widening: factor by which all deviations were enlarged, for the instrument disagrees with what it says.
-        bent: errors of all heights together that were added for the same reason, or for a fit that has not converged,
+        inflation: factor by which all standard deviations were inflated, for the instrument contradicts what is stated.
+        common_modes: fully correlated errors that were added for the same reason, or for a fit that has not converged,
             one standard deviation of each [error, y, x], um.
     """
 
@@ -101,8 +111,8 @@ class Posterior:
     instrument_covariance: np.ndarray
     names: tuple[str, ...]
     stride: int = 1
-    widening: float = 1.0
-    bent: np.ndarray | None = None
+    inflation: float = 1.0
+    common_modes: np.ndarray | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -128,52 +138,51 @@ class Posterior:
         fallen = np.tensordot(self.instrument_samples[:, tilts], planes, 1)
         return replace(self, samples=self.samples - fallen, response=response)
 
-    def widened(self, values: dict[str, np.ndarray], names: tuple[str, ...], least: float = 1.0) -> "Posterior":
-        """Return it with error bars that allow for a model that lacks something.
+    def inflated(self, parameters: Parameters, names: tuple[str, ...], min_ratio: float = 1.0) -> "Posterior":
+        """Inflate the error bars by the Birge ratio of some parameters, for the model may be incomplete.
 
-        Where the fitted `values` of the unknowns called `names` are farther from what was stated than prior and data
-        explain (`disagreement`), all deviations are multiplied by that factor f. And something else may have bent them:
+        Where the fitted parameters called `names` are farther from the stated ones than prior and data explain, all
+        standard deviations are multiplied by the ratio f. What the model lacks may also have shifted these parameters:
         then heights are wrong by what they, and all that followed them, did to the heights. The share 1 - 1 / f^2 of
-        that change's square is added to the heights' variance, one error for all of the surface. Factors below `least`
-        are taken for chance.
+        that change's square is added to the heights' variance, as a common-mode error. Ratios below `min_ratio` are
+        taken for chance.
         """
         of = [name for name in self.fields if name in names]
         if not of:
             return self
         mine = np.array([name.partition("[")[0] in of for name in self.names])
-        flat = np.concatenate([np.ravel(values[name]) for name in of])
+        flat = np.concatenate([np.ravel(getattr(parameters, name)) for name in of])
         own = self.instrument_covariance[np.ix_(mine, mine)]
-        factor = disagreement(flat, own)
-        if factor < least:
+        factor = birge_ratio(flat, own)
+        if factor < min_ratio:
             return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
-        bent = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
+        shifted = np.sqrt(1.0 - factor**-2) * np.tensordot(followed, self.response, 1)
         enlarged = replace(
             self,
             samples=factor * self.samples,
             instrument_samples=factor * self.instrument_samples,
             instrument_covariance=factor**2 * self.instrument_covariance,
-            widening=factor * self.widening,
-            bent=None if self.bent is None else factor * self.bent,
+            inflation=factor * self.inflation,
+            common_modes=None if self.common_modes is None else factor * self.common_modes,
         )
-        return enlarged.also_off_by(bent)
+        return enlarged.with_common_mode(shifted)
 
-    def also_off_by(self, error: np.ndarray) -> "Posterior":
-        """Return it with one error more, of all heights together, known up to a factor of deviation 1 [y, x], um.
-
-        The factors of several errors are drawn independently of one another.
-        """
-        n_before = 0 if self.bent is None else len(self.bent)
-        bent = error[None] if self.bent is None else np.concatenate([self.bent, error[None]])
-        return replace(self, samples=also_off_by(self.samples, error, 1 + n_before), bent=bent)
+    def with_common_mode(self, error: np.ndarray) -> "Posterior":
+        """Add a fully correlated error with a standard-normal amplitude [y, x], um, independent of the others."""
+        before = np.zeros((0, *error.shape)) if self.common_modes is None else self.common_modes
+        modes = np.concatenate([before, error[None]])
+        return replace(self, samples=add_common_mode(self.samples, error, len(modes)), common_modes=modes)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
         if stride == 1:
             return self
         full = partial(on_raster, shape=shape, stride=stride)
-        bent = None if self.bent is None else full(self.bent)
-        return replace(self, samples=full(self.samples), response=full(self.response), stride=stride, bent=bent)
+        modes = None if self.common_modes is None else full(self.common_modes)
+        return replace(
+            self, samples=full(self.samples), response=full(self.response), stride=stride, common_modes=modes
+        )
 
 
 @dataclass(frozen=True)
@@ -201,7 +210,7 @@ class ModelError:
         """Return errors of variance 1 that agree between neighbours, from white noise; its own transpose."""
         lengths = [n / self.stride for n in self.length]
         smooth = gaussian_filter(white, lengths, axes=(-2, -1))
-        return smooth / np.prod([_left_of_white(n) for n in lengths])
+        return smooth / np.prod([_averaged_std(n) for n in lengths])
 
     def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
         """Return errors of the data [detector * y * x, sample], in deviations assumed of them.
@@ -221,8 +230,8 @@ class ModelError:
         return np.einsum("pkyx,qkyx->pq", both, both)
 
 
-def _left_of_white(length: float) -> float:
-    """Return the standard deviation that a Gaussian average over `length` pixels leaves of white noise."""
+def _averaged_std(length: float) -> float:
+    """Compute the standard deviation of white noise after a Gaussian average over `length` pixels."""
     impulse = np.zeros(2 * int(4.0 * length + 1.0) + 1)
     impulse[impulse.size // 2] = 1.0
     return float(np.sqrt(np.sum(gaussian_filter(impulse, length) ** 2)))
@@ -254,94 +263,81 @@ class _Rows:
 
 
 @eqx.filter_jit
-def _derivatives(model: Model, unknowns: Unknowns, lagged: Lagged):
-    """Return how data residuals follow their pixel's surface, how they and edges follow the instrument, and the levels.
+def _derivatives(unknowns: Unknowns, fixed: FixedTerms):
+    """Compute the blocks of the Jacobian.
 
-    In this order: data by surface field, data by instrument, edges and border by instrument, data by level, edges by
-    mean height; and the factor of the edges' weights.
+    In this order: data by surface field, data, edges and border by parameter, edges by mean height; and the factor of
+    the edges' weights.
     """
-    surface = model.surface(unknowns, lagged)
+    surface, at = surface_of(unknowns, fixed), unknowns.parameters
+    names = ("height", "slope_x", "slope_y")
     one, zero = (jax.tree.map(f, surface) for f in (jnp.ones_like, jnp.zeros_like))
-    directions = [zero._replace(**{name: getattr(one, name)}) for name in surface._fields]
-
-    def derivative(function, direction):
-        return jax.jvp(function, (surface,), (direction,))[1]
-
-    def own(changed: Surface) -> jax.Array:  # while levels and modes, which are of many pixels, stay as they are
-        level, amplitude = (
-            at + jnp.einsum("ryx,yx->r", weights, changed.height - surface.height)
-            for at, weights in ((lagged.level, lagged.plateau), (lagged.amplitude, lagged.mode))
-        )
-        return model.data_residuals(changed, unknowns, lagged._replace(level=level, amplitude=amplitude))
-
-    data = [derivative(own, d) for d in directions]
-    free = {name: getattr(unknowns, name) for name in model.instrument_fields(unknowns)}
-    instrument, edges, border = (
-        jax.jacfwd(lambda v, f=f: f(surface, unknowns._replace(**v), lagged))(free)
-        for f in (model.data_residuals, model.edge_residuals, model.border_residuals)
+    directions = [Surface(**{n: getattr(one if n == name else zero, n) for n in names}) for name in names]
+    still = eqx.tree_at(lambda f: f.modes.weights, fixed, jnp.zeros_like(fixed.modes.weights))
+    still = eqx.tree_at(lambda f: f.modes.amplitude, still, jnp.zeros_like(fixed.modes.amplitude))
+    data = [jax.jvp(lambda s: data_residuals(s, at, still), (surface,), (d,))[1] for d in directions]
+    free = {name: getattr(at, name) for name in at.free()}
+    data_by, edges_by, border_by = (
+        jax.jacfwd(lambda values, f=f: f(surface, at.replaced(**values), fixed))(free)
+        for f in (data_residuals, edge_residuals, border_residuals)
     )
-
-    def followed(rise: jax.Array, grown: jax.Array) -> jax.Array:
-        raised = lagged._replace(level=lagged.level - rise, amplitude=lagged.amplitude - grown)
-        return model.data_residuals(surface, unknowns, raised)
-
-    still = jnp.zeros_like(lagged.level), jnp.zeros_like(lagged.amplitude)
-    levels = jnp.concatenate(jax.jacfwd(followed, (0, 1))(*still), -1)
-    raised = jax.jvp(lambda s: model.edge_residuals(s, unknowns, lagged), (surface,), (directions[0],))[1]
-    return data, instrument, (*edges, border), levels, raised, model.edge_scale(surface, unknowns, lagged)
+    raised = jax.jvp(lambda s: edge_residuals(s, at, fixed), (surface,), (directions[0],))[1]
+    return data, data_by, (*edges_by, border_by), raised, edge_scale(surface, at, fixed)
 
 
-def linearise(model: Model, unknowns: Unknowns, lagged: Lagged) -> Linearised:
-    """Return the Jacobian of `model.residuals` at the fit, in terms of the surface itself instead of its whitened form.
+def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
+    """Compute the Jacobian of the residuals, in terms of the surface itself instead of its whitened form.
 
     tests/gradients/test_model.py compares it with the automatic Jacobian of the residuals.
     """
-    shape = lagged.border.shape
-    pixel = np.arange(lagged.border.size).reshape(shape)
-    found = jax.tree.map(np.asarray, _derivatives(model, unknowns, lagged))
-    data, instrument, of_edges, levels, raised, scale = found
-    by_parameter = {name: instrument[name] for name in model.instrument_fields(unknowns)}
+    shape, edges = fixed.border.shape, fixed.edges
+    pixel = np.arange(fixed.border.size).reshape(shape)
+    with jax.enable_x64(True):
+        found = jax.tree.map(np.asarray, _derivatives(unknowns, fixed))
+    data, data_by, others_by, raised, scale = found
+    free = unknowns.parameters.free()
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
         rows.add(*((pixel, part, d[k]) for part, d in enumerate(data)))
     n_data = data[0].size
-    for axis, part, pitch, weight, bend in (
-        (1, 1, model.dx, lagged.edge_x, lagged.bend_x),
-        (0, 2, model.dy, lagged.edge_y, lagged.bend_y),
+    for axis, part, step, weight, smooth in (
+        (1, 1, float(fixed.dx), edges.inverse_std_x, edges.smooth_x),
+        (0, 2, float(fixed.dy), edges.inverse_std_y, edges.smooth_y),
     ):
         w = scale * np.asarray(weight)
         of_slopes = []
-        for end, share in zip(along(pixel, axis), along(np.asarray(bend) / 24.0, axis), strict=True):
-            step = pixel.shape[1] if axis == 0 else 1
-            around = (np.clip(end + way, 0, pixel.size - 1) for way in (-step, step))  # at the border, the share is 0
-            of_slopes += [(end, part, -w * (0.5 + 2.0 * share)), *((p, part, w * share) for p in around)]
+        for end, share in zip(along(pixel, axis), along(np.asarray(smooth) / 24.0, axis), strict=True):
+            stride = pixel.shape[1] if axis == 0 else 1
+            beside = (np.clip(end + way, 0, pixel.size - 1) for way in (-stride, stride))  # at the border, share is 0
+            of_slopes += [(end, part, -w * (0.5 + 2.0 * share)), *((p, part, w * share) for p in beside)]
         before, after = along(pixel, axis)
-        rows.add((after, 0, w / pitch), (before, 0, -w / pitch), *of_slopes)
-    rows.add((pixel, 0, np.asarray(lagged.border)))
+        rows.add((after, 0, w / step), (before, 0, -w / step), *of_slopes)
+    rows.add((pixel, 0, np.asarray(fixed.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
-    n_rows = rows.n_rows  # below: the held level, which is of all heights, and the priors of the instrument
-    names = [f"{n}{list(i)}" for n, block in by_parameter.items() for i in np.ndindex(block.shape[data[0].ndim :])]
+    n_rows = rows.n_rows  # below: the held level, which is of all heights, and the priors of the parameters
+    names = [f"{n}{list(i)}" for n in free for i in np.ndindex(data_by[n].shape[data[0].ndim :])]
 
-    def of_instrument(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
-        return np.concatenate([blocks[name].reshape(n, -1) for name in by_parameter], 1)
+    def by_parameter(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
+        return np.concatenate([blocks[name].reshape(n, -1) for name in free], 1)
 
-    of_x, of_y, of_border = of_edges
-    parts = (instrument, n_data), (of_x, lagged.edge_x.size), (of_y, lagged.edge_y.size), (of_border, pixel.size)
-    columns = np.concatenate([of_instrument(blocks, n) for blocks, n in parts])
+    sizes = n_data, edges.inverse_std_x.size, edges.inverse_std_y.size, pixel.size
+    columns = np.concatenate([by_parameter(b, n) for b, n in zip((data_by, *others_by), sizes, strict=True)])
     matrix = rows.stack(n_more=1 + len(names))
     by_instrument = np.zeros((n_rows + 1 + len(names), len(names)))
     by_instrument[: len(columns)] = columns
     by_instrument[-len(names) :] = np.eye(len(names))
-    weights = np.concatenate([lagged.plateau, lagged.mode])
-    n_far = len(weights) + 2
-    far, of_surface = np.zeros((len(by_instrument), n_far)), np.zeros((3 * pixel.size, n_far))
-    far[:n_data, :-2] = levels.reshape(n_data, len(weights))
+    is_used = np.any(np.asarray(fixed.modes.weights) != 0.0, axis=(1, 2))
+    weights = np.asarray(fixed.modes.weights)[is_used]
+    response = np.asarray(fixed.modes.response)[is_used] * np.asarray(fixed.inverse_sigma)
+    n_common = len(weights) + 2
+    common, of_surface = np.zeros((len(by_instrument), n_common)), np.zeros((3 * pixel.size, n_common))
+    common[:n_data, :-2] = response.reshape(len(weights), n_data).T
     of_surface[::3, :-2] = weights.reshape(len(weights), pixel.size).T
-    far[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(lagged.level_weight)
-    edges = np.concatenate([part.ravel() for part in raised])
-    far[n_data : n_data + edges.size, -1], of_surface[::3, -1] = edges, 1.0 / pixel.size
-    return Linearised(matrix, by_instrument, far, of_surface, tuple(names), shape)
+    common[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(fixed.level_weight)
+    by_height = np.concatenate([part.ravel() for part in raised])
+    common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
+    return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
 
 
 def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
@@ -379,7 +375,7 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
     return Posterior(to_height(surface), instrument.T, -to_height(answer), covariance, linear.names)
 
 
-def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:
+def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
     """Return by what factor an instrument is farther from what was stated than prior and data explain; at least 1.
 
     Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
@@ -401,7 +397,7 @@ def disagreement(values: np.ndarray, covariance: np.ndarray) -> float:
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:
     """Return the posterior covariance of the heights [y * x, y * x], um^2, dense; for rasters of up to 32 x 32."""
-    both = np.hstack([linear.surface.toarray() + linear.far @ linear.plateau.T, linear.instrument])
+    both = np.hstack([linear.surface.toarray() + linear.common @ linear.weights.T, linear.instrument])
     covariance = np.linalg.inv(both.T @ both)
     n = 3 * linear.shape[0] * linear.shape[1]
     return covariance[:n:3, :n:3]

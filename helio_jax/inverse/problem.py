@@ -1,49 +1,325 @@
-"""The state of one fit: surface, instrument, and the problem lagged there that `leastsquares` solves.
+"""The inverse problem: frozen records of data, state and corrections, and the terms that one solve holds fixed.
 
-Unknowns: height and two slopes of every pixel, gain and offset of every detector, scale of the multiple scattering, a
-smooth albedo. They are whitened so that plain conjugate gradients converge in a few steps: heights by the cosine
-transform, h = DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as deviations from the heights' one-sided
-differences.
+`FitProblem` does not change during a fit; `FitState` is all that does; `freeze` makes `FixedTerms` of both. Unknowns
+are heights and two slopes of every pixel and the `Parameters`. They are whitened so that plain conjugate gradients
+converge in a few steps: heights by the cosine transform, h = DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes
+as deviations from the heights' one-sided differences. Pure functions; nothing is changed in place.
 """
 
-import copy
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.fft import dctn
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
-from helio_jax.errors import GuardError
-from helio_jax.forward.aiming import aimed_slopes
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor_at
+from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
+from helio_jax.forward.render import Corrections, single_scattering
+from helio_jax.forward.surface import Surface, one_sided, to_pixels
 from helio_jax.instrument import Instrument
-from helio_jax.inverse.edges import Edges, bend_of, find_edges, geman_mcclure, one_sided, to_pixels
+from helio_jax.inverse.edges import AxisEdges, find_edges, smoothness_weight
 from helio_jax.inverse.linear import MIN_IMAGES
-from helio_jax.inverse.occlusion import shadow_edges
-from helio_jax.inverse.residuals import INSTRUMENT, Lagged, Model, Prediction, Surface, Unknowns
-from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.solver import Solution, solve, whitened_instrument
+from helio_jax.inverse.residuals import (
+    CommonModes,
+    Edges,
+    FixedTerms,
+    FormFactors,
+    Parameters,
+    Priors,
+    Unknowns,
+    expected_data,
+    moves_of,
+    second_order_noise_bias,
+    surface_of,
+)
+from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.solver import Solution, solve, whitened_parameters
+from helio_jax.robust import cauchy_weight
 
-LEVEL_STEP, SCALE_STEP, TILT_STEP = 0.02, 0.05, 0.03
-"""How far a relief is lowered (share of the distance), flattened (share of itself) and tilted to see what follows."""
 LEVEL_STD = 0.1
-"""How firmly a level is held [um]."""
+"""Standard deviation of a held mean height [um]."""
 _NOISY = 3.0
-"""Deviation that slopes are credited with at most, in those of a pixel with median noise."""
+"""Largest standard deviation that slopes are credited with, in that of a pixel with median noise."""
+MODE_BLOCK = 4
+"""Common modes are filled up to a multiple of this."""
 _HELD = 1e-5
-"""Least prior weight of a height, 1/um: holds a pixel that all edges part from the rest."""
+"""Least prior weight of a height, 1/um: holds a pixel that all edges separate from the others."""
 
-Predict = Callable[..., Prediction]
-"""(heights [y, x] um, unit normals [y, x, 3]) -> Prediction; the instrument is given, too, where it is unknown."""
+Predict = Callable[..., Corrections]
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown."""
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """What is constant during a fit.
+
+    Attributes:
+        signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
+        instrument: as stated.
+        raster: beam positions.
+        settings: of the fit.
+        order: in which the pixels were recorded.
+        border: prior weight of each height above the substrate [y, x], 1/um.
+        is_level_held, is_level_free: whether the mean height is held, or unknown; a flat border does neither.
+        held_level: mean height that is held, over its standard deviation.
+        region: number of the plateau of every pixel, whose masks are to follow their levels, 0: none [y, x].
+        drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
+        median_signal: of every detector, 1 without data [detector].
+        slope_noise: typical standard deviation of the slopes of one pixel.
+        stride: thinning of the raster; every datum stands for stride^2.
+    """
+
+    signal: np.ndarray
+    variance: np.ndarray
+    instrument: Instrument
+    raster: Raster
+    settings: RefineSettings
+    order: ScanOrder
+    border: np.ndarray
+    is_level_held: bool
+    is_level_free: bool
+    held_level: float
+    region: np.ndarray
+    drift_modes: np.ndarray
+    median_signal: np.ndarray
+    slope_noise: float
+    stride: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        signal: np.ndarray,
+        variance: np.ndarray,
+        instrument: Instrument,
+        raster: Raster,
+        start: Surface,
+        settings: ReconstructSettings,
+        region: np.ndarray | None = None,
+        order: ScanOrder = ScanOrder(),
+    ) -> "FitProblem":
+        """Pose the problem; `start` fixes the level that is held, where the settings ask for it."""
+        s, shape = settings.refine, signal.shape[1:]
+        is_free = settings.border == "free"
+        is_held = is_free and s.level_std_um is not None
+        modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
+        observed = [d[np.isfinite(d)] for d in signal]
+        median = np.array([np.median(d) if d.size else 1.0 for d in observed])
+        noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
+        problem = cls(
+            signal, variance, instrument, raster, s, order, _border_weight(shape, settings), is_held,
+            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median, noise,
+        )  # fmt: skip
+        return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
+
+    @property
+    def optics(self) -> Optics:
+        """The instrument's optics as stated."""
+        return Optics.of(self.instrument)
+
+    @property
+    def shift(self) -> tuple[float, float]:
+        """Beam shift."""
+        return self.instrument.beam_shift
+
+    @property
+    def is_observed(self) -> np.ndarray:
+        """Where there are data [detector, y, x]."""
+        return np.isfinite(self.signal)
+
+    @property
+    def data(self) -> np.ndarray:
+        """The signal, 0 where not observed [detector, y, x]."""
+        return np.where(self.is_observed, self.signal, 0.0)
+
+    @property
+    def has_enough_images(self) -> np.ndarray:
+        """Where enough images show the surface [y, x]."""
+        return self.is_observed.sum(0) >= MIN_IMAGES
+
+    @property
+    def level_weight(self) -> np.ndarray:
+        """Weights [y, x] of the mean height over its standard deviation, or 0 where nothing holds it."""
+        enough = self.has_enough_images
+        return self.is_level_held * enough / np.maximum(enough.sum(), 1) / LEVEL_STD
+
+    @property
+    def position(self) -> np.ndarray:
+        """Positions (x, y) about the middle of the raster [2, y, x], um."""
+        centred = Raster.regular(self.raster.shape, self.raster.dx, self.raster.dy)
+        return np.stack(np.meshgrid(centred.x, centred.y))
+
+    @property
+    def priors(self) -> Priors:
+        """Prior standard deviations of the parameters; a held level stands for the distance."""
+        s, stated, median = self.settings, self.instrument.uncertainty, self.median_signal
+        held = s.level_std_um if self.is_level_held else None
+        numbers = {
+            "gain": s.gain_std,
+            "offset": s.offset_std * median,
+            "multiple": s.multiple_error,
+            "albedo": s.albedo_std,
+            "drift": s.drift_std * median,
+            "lines": s.line_std * median,
+            "law": s.law_std,
+            "distance": held or stated.sample_distance_um,
+            "tilt": math.radians(stated.tilt_deg),
+            "aim": np.radians([stated.polar_deg, stated.azimuth_deg]),
+        }
+        return Priors(**{name: np.asarray(value, float) for name, value in numbers.items()})
+
+    def prior_means(self) -> Parameters:
+        """Make the parameters at their prior means, all 0; those that are known have no entries."""
+        s, stated = self.settings, self.instrument.uncertainty
+        k, n = self.signal.shape[0], s.albedo_modes if s.albedo_std else 0
+        lines = self.signal.shape[1 + self.order.slow_axis] if s.line_std else 0
+        is_aimed = s.geometry and (stated.polar_deg or stated.azimuth_deg)
+        shapes = {
+            "log_gain": k,
+            "offset": k,
+            "log_multiple": k,
+            "occluded": (),
+            "albedo": (n, n),
+            "drift": (k, self.drift_modes.shape[1]),
+            "lines": (k, lines),
+            "law": 1 if s.law_std else 0,
+            "distance": 1 if s.geometry and float(self.priors.distance) else 0,
+            "tilt": 2 if s.geometry and stated.tilt_deg else 0,
+            "aim": (k, 2) if is_aimed else 0,
+        }
+        return Parameters(**{name: np.zeros(shape) for name, shape in shapes.items()})
+
+    @property
+    def is_instrument_unknown(self) -> bool:
+        """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""
+        p = self.prior_means()
+        return bool(p.distance.size or p.aim.size or p.drift.shape[1])
+
+    def moves(self, parameters: Parameters) -> np.ndarray:
+        """Compute distance [um], polar angle and azimuth [rad] beyond the stated ones [move, detector]."""
+        with jax.enable_x64(True):
+            return np.asarray(moves_of(jax.tree.map(jnp.asarray, parameters), self.priors, len(self.signal)))
+
+    def fitted_instrument(self, parameters: Parameters) -> Instrument:
+        """Return the instrument with the geometry that parameters stand for."""
+        moves = self.moves(parameters)
+        return self.instrument.moved(moves[1:].T, float(moves[0, 0])) if len(moves) else self.instrument
+
+    def thinned(self, stride: int) -> "FitProblem":
+        """Keep every `stride`-th row and column, each standing for stride^2 data."""
+        thin = (slice(None, None, stride),) * 2
+        return replace(
+            self,
+            signal=self.signal[:, *thin],
+            variance=self.variance[:, *thin],
+            raster=Raster.regular(self.signal[0][thin].shape, self.raster.dx * stride, self.raster.dy * stride),
+            order=self.order.thinned(thin),
+            border=self.border[thin],
+            region=self.region[thin],
+            drift_modes=self.drift_modes[:, :, *thin],
+            stride=stride,
+        )
+
+
+@dataclass(frozen=True)
+class Held:
+    """Corrections and what follows from them, held fixed until the next outer iteration.
+
+    Attributes:
+        corrections: made for `surface`.
+        surface: heights and slopes.
+        masked: masked form factors as a linear model in the own normal [detector, 3, y, x].
+        multiple: the multiple scattering that goes with it [detector, y, x].
+        sigma: standard deviation of the data, prediction errors included, infinite where not observed [detector, y, x].
+        moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
+        moved: the moves at which they were made [move, detector].
+        responses: how they follow common changes of the heights.
+    """
+
+    corrections: Corrections
+    surface: Surface
+    masked: np.ndarray
+    multiple: np.ndarray
+    sigma: np.ndarray
+    moves: np.ndarray
+    moved: np.ndarray
+    responses: tuple[Response, ...] = ()
+
+
+@dataclass(frozen=True)
+class FitState:
+    """All that changes during a fit.
+
+    Attributes:
+        surface: heights and slopes.
+        parameters: unknowns that are not the surface.
+        residuals: (model - data) / standard deviation [detector, y, x].
+        held: corrections of this outer iteration.
+    """
+
+    surface: Surface
+    parameters: Parameters
+    residuals: np.ndarray
+    held: Held
+
+    @classmethod
+    def at(cls, problem: FitProblem, start: Surface) -> "FitState":
+        """Start at a surface, parameters at their prior means, without corrections."""
+        surface = Surface(*(np.asarray(f) for f in (start.height, start.slope_x, start.slope_y)))
+        held = _held(problem, Corrections.none(problem.signal.shape), surface, problem.prior_means())
+        return cls(surface, problem.prior_means(), np.zeros(problem.signal.shape), held)
+
+    def thinned(self, problem: FitProblem, stride: int) -> "FitState":
+        """Keep every `stride`-th row and column, for `problem`, which is thinned."""
+        thin = (slice(None, None, stride),) * 2
+        h, c = self.held, self.held.corrections
+        held = _held(
+            problem,
+            Corrections(
+                c.masked[:, :, *thin],
+                c.multiple[:, *thin],
+                None if c.occluded is None else c.occluded[:, *thin],
+                None if c.normals is None else c.normals[thin],
+            ),
+            jax.tree.map(lambda f: f[thin], h.surface),
+            self.parameters,
+        )
+        held = replace(
+            held,
+            moves=h.moves[..., *thin],
+            moved=h.moved,
+            responses=tuple(r.thinned(thin, stride) for r in h.responses),
+        )
+        lines = self.parameters.lines[:, ::stride]
+        surface = jax.tree.map(lambda f: f[thin], self.surface)
+        return FitState(surface, self.parameters.replaced(lines=lines), self.residuals[:, *thin], held)
+
+
+def _border_weight(shape: tuple[int, ...], settings: ReconstructSettings) -> np.ndarray:
+    """Compute the prior weight of each height: the border is flat, or just the mean height is held.
+
+    The outermost ring is enough to level the heights; drift needs all of the border to be distinguished from relief.
+    """
+    weight = np.full(shape, _HELD)
+    if settings.border == "flat":
+        width = settings.border_fraction if settings.refine.drift_std > 0 else 1.0 / max(shape)
+        weight[border_mask((shape[0], shape[1]), width)] = 1.0 / settings.border_std_um
+    else:
+        weight[:] = 1e-3 / settings.border_std_um / np.sqrt(weight.size)
+    return weight
 
 
 def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float) -> np.ndarray:
-    """Return the deviation of each cosine mode of the heights that a slope noise per pixel leaves, um."""
+    """Compute the standard deviation of each cosine mode of the heights that a slope noise per pixel leaves, um."""
     ky = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[0]) / shape[0]) / dy
     kx = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[1]) / shape[1]) / dx
     eigenvalue = ky[:, None] ** 2 + kx[None, :] ** 2
@@ -51,386 +327,292 @@ def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float)
     return slope_noise / np.sqrt(eigenvalue)
 
 
-def _plateau_weights(region: np.ndarray) -> np.ndarray:
-    """Return the weights [plateau, y, x] whose sum over the heights is a plateau's level above the ground, region 0."""
-    numbers = np.unique(region[region > 0])[:, None, None]
-    ground, plateau = ((region == n).astype(float) for n in (0, numbers))
-    return plateau / plateau.sum((1, 2), keepdims=True) - ground / ground.sum()
+def linearised_in_normal(corrections: Corrections, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make masks and multiple scattering a linear model of the own normal, about the corrections' or given ones.
 
-
-def _modes(surface: Surface, is_told: np.ndarray, across: np.ndarray, distance: float) -> list[Surface]:
-    """Return small changes of a relief that leave its shape: lower, flatter, tilted about y, tilted about x.
+    The slope of multiple scattering is added to the masked form factor and changes nothing at the facet's own normal:
+    it only makes the iterations converge faster beside steep walls, where slope and multiple scattering depend on one
+    another (`responses.normal_slope`).
 
     Args:
-        surface: the relief.
-        is_told: where the data tell of it [y, x].
-        across: positions (x, y) [2, y, x], um.
-        distance: of the sample from the plate, um.
+        corrections: of a surface.
+        normals: its unit normals [y, x, 3].
     """
-    none = np.zeros(is_told.shape)
-    mean = np.mean(surface.height[is_told])
-    flatter = (-SCALE_STEP * field for field in (surface.height - mean, surface.slope_x, surface.slope_y))
-    return [
-        Surface(none - LEVEL_STEP * distance, none, none),
-        Surface(*flatter),
-        Surface(TILT_STEP * across[0], none + TILT_STEP, none),
-        Surface(TILT_STEP * across[1], none, none + TILT_STEP),
-    ]
+    up = (normals if corrections.normals is None else corrections.normals)[..., 2]
+    slope = normal_slope(corrections.multiple, up)
+    masked = np.array(corrections.masked)
+    masked[:, 2] += slope
+    return masked, corrections.multiple + slope * up
 
 
-def _amplitudes(modes: list[Surface], is_told: np.ndarray) -> np.ndarray:
-    """Return the weights [mode, y, x] whose sums over changes of the heights tell how often the modes are in them."""
-    weights = np.zeros((len(modes), *is_told.shape))
-    weights[:, is_told] = np.linalg.pinv(np.stack([mode.height[is_told] for mode in modes], 1))
-    return weights
+def prediction_std(corrections: Corrections, normals: np.ndarray, settings: RefineSettings) -> np.ndarray:
+    """Estimate the standard deviation of masks and multiple scattering [detector, y, x], for unit normals [y, x, 3].
 
-
-def _border_weight(shape: tuple[int, int], settings: ReconstructSettings) -> np.ndarray:
-    """Return the prior weight of each height: the border is flat, or just the mean height is held.
-
-    The outermost ring is enough to level the heights; what drifts is told from relief by all of the border.
+    Two parts of each term: a share of its own size, and its change over half a pixel, for the surface that
+    it was made for is only known from pixel to pixel.
     """
-    weight = np.full(shape, _HELD)
-    if settings.border == "flat":
-        width = settings.border_fraction if settings.refine.drift_std > 0 else 1.0 / max(shape)
-        weight[border_mask(shape, width)] = 1.0 / settings.border_std_um
-    else:
-        weight[:] = 1e-3 / settings.border_std_um / np.sqrt(weight.size)
-    return weight
+    masked = single_scattering(corrections.masked, np.moveaxis(normals, -1, 0))
+    terms = (masked, settings.mask_error), (corrections.multiple, settings.multiple_error)
+    parts = [share * image + 1j * 0.5 * _largest_change(image) for image, share in terms]
+    return np.hypot(*map(np.abs, parts))
 
 
-@eqx.filter_jit
-def _counts(model: Model, unknowns: Unknowns, lagged: Lagged) -> jax.Array:
-    return model.counts(model.surface(unknowns, lagged), unknowns, lagged)
+def _largest_change(image: np.ndarray) -> np.ndarray:
+    """Compute the largest difference of every pixel [detector, y, x] from its neighbours in the row and the column."""
+    high, low = (f(image, size=(1, 3, 3)) for f in (maximum_filter, minimum_filter))
+    return np.maximum(high - image, image - low)
 
 
-@eqx.filter_jit
-def _noise_change(model: Model, surface: Surface, hidden, inverse_sigma, largest, moves) -> jax.Array:
-    return model.noise_change(Surface(*map(jnp.asarray, surface)), hidden, inverse_sigma, largest, moves)
+def _held(problem: FitProblem, corrections: Corrections, surface: Surface, parameters: Parameters) -> Held:
+    """Derive what a solve needs of corrections made for a surface, without responses."""
+    normals, moved = surface.normals(problem.shift), problem.moves(parameters)
+    masked, multiple = linearised_in_normal(corrections, normals)
+    variance = problem.variance + prediction_std(corrections, normals, problem.settings) ** 2
+    sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
+    moves = np.zeros((len(moved), *corrections.masked.shape))
+    return Held(corrections, surface, masked, multiple, sigma, moves, moved)
 
 
-@eqx.filter_jit
-def _aimed_slopes(geometry: SpotGeometry, height, aim):
-    return aimed_slopes(geometry, jnp.asarray(height), jnp.asarray(aim))
-
-
-class Refiner:
-    """State of one fit: the data, the current surface and instrument, and the lagged quantities."""
-
-    def __init__(
-        self,
-        signal,
-        variance,
-        geometry,
-        dx,
-        dy,
-        start: Surface,
-        settings: ReconstructSettings,
-        region=None,
-        order=ScanOrder(),
-    ) -> None:
-        s = settings.refine
-        self.signal, self.variance, self.settings, self.order = signal, variance, s, order
-        self.model = Model(geometry, dx, dy, s.albedo_std, order.slow_axis)
-        self.shift = geometry.instrument.beam_shift
-        self.observed = np.isfinite(signal)
-        self.data = np.where(self.observed, signal, 0.0)
-        self.mean_signal = np.array(
-            [np.median(d[o]) if o.any() else 1.0 for d, o in zip(signal, self.observed, strict=True)]
-        )
-        relative = np.sqrt(np.nanmedian(variance / self.mean_signal[:, None, None] ** 2))
-        self.slope_noise = float(np.clip(relative, 1e-3, 1.0))
-        shape = start.height.shape
-        self.whitening = _whitening(shape, dx, dy, self.slope_noise)
-        self.border = _border_weight(shape, settings)
-        self.is_level_held = settings.border == "free" and s.level_std_um is not None
-        self.is_level_free = settings.border == "free" and not self.is_level_held
-        self.plateau = _plateau_weights(np.zeros(shape, int) if region is None else region)
-        self.surface = Surface(*map(np.asarray, start))
-        self.level_weight = self._level_weight()
-        self.held_level = float(np.sum(self.level_weight * self.surface.height))
-        self.drift = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
-        sides = (d * (np.arange(n) - 0.5 * (n - 1)) for d, n in ((dx, shape[1]), (dy, shape[0])))
-        self.across = np.stack(np.meshgrid(*sides))
-        self.values = self._at_prior_means(geometry.instrument)
-        nothing = np.zeros(signal.shape)
-        self.adopt(Prediction(nothing, np.stack([nothing] * 3, 1)), self.surface)
-        self.level_response = np.zeros((len(self.plateau), len(signal), 3, *shape))
-        self.mode = np.zeros((0, *shape))
-        self.mode_response = np.zeros((0, *signal.shape))
-        self.torn: tuple[np.ndarray, np.ndarray] | None = None
-        self.residuals = np.zeros(signal.shape)
-        self.weight = np.ones(signal.shape)
-
-    @property
-    def is_told(self) -> np.ndarray:
-        """Where the data tell of the surface [y, x]."""
-        return self.observed.sum(0) >= MIN_IMAGES
-
-    def _level_weight(self) -> np.ndarray:
-        """Return the weights [y, x] of the mean height over its deviation, or 0 where nothing holds it."""
-        return self.is_level_held * self.is_told / np.maximum(self.is_told.sum(), 1) / LEVEL_STD
-
-    def _at_prior_means(self, instrument: Instrument) -> dict[str, np.ndarray]:
-        """Return the unknowns of the instrument, all 0; those that are known have no entries."""
-        s, sure = self.settings, instrument.uncertainty
-        k, n = self.signal.shape[0], s.albedo_modes
-        lines = self.signal.shape[1 + self.model.slow_axis] if s.line_std else 0
-        shapes = {"log_gain": k, "offset": k, "log_multiple": k, "unseen": (), "albedo": (n, n)}
-        shapes |= {"drift": (k, self.drift.shape[1]), "lines": (k, lines), "law": 1 if s.law_std else 0}
-        is_aimed = s.geometry and (sure.polar_deg or sure.azimuth_deg)
-        shapes["distance"] = 1 if s.geometry and self.distance_std else 0
-        shapes |= {"tilt": 2 if s.geometry and sure.tilt_deg else 0, "aim": (k, 2) if is_aimed else 0}
-        return {name: np.zeros(shape) for name, shape in shapes.items()}
-
-    @property
-    def distance_std(self) -> float:
-        """Prior deviation of the distance of the plate [um]: a level that is held stands for what is known of it."""
-        held = self.settings.level_std_um if self.is_level_held else None
-        return held or self.model.geometry.instrument.uncertainty.sample_distance_um
-
-    @property
-    def tilt_std(self) -> float:
-        """Prior deviation of the tilt of the reference plane, rad."""
-        return math.radians(self.model.geometry.instrument.uncertainty.tilt_deg)
-
-    @property
-    def aim_std(self) -> np.ndarray:
-        """Prior deviations of polar angle and azimuth [2], rad."""
-        sure = self.model.geometry.instrument.uncertainty
-        return np.radians([sure.polar_deg, sure.azimuth_deg])
-
-    @property
-    def moves(self) -> np.ndarray | None:
-        """Distance [um], polar angle and azimuth [rad] beyond the stated ones [move, detector], if unknown."""
-        distance, aim = self.values["distance"], self.values["aim"]
-        if not distance.size and not aim.size:
-            return None
-        k = len(self.signal)
-        moved = self.distance_std * distance.sum()
-        return np.stack([np.full(k, moved), *((self.aim_std * aim).T if aim.size else np.zeros((2, k)))])
-
-    @property
-    def instrument(self) -> Instrument:
-        """The instrument with the geometry fitted so far."""
-        stated = self.model.geometry.instrument
-        return stated if self.moves is None else stated.moved(self.moves[1:].T, float(self.moves[0, 0]))
-
-    def predict(self, predict: Predict) -> None:
-        """Predict masks and multiple scattering on the current surface, and how masks follow the plateaus' levels."""
-        self.adopt(self._predicted(predict), self.surface)
-        if self.prediction.response is not None:
-            for i, weights in enumerate(self.plateau):
-                self.level_response[i] = self.prediction.response((weights > 0).astype(float))
-
-    def _predicted(self, predict: Predict) -> Prediction:
-        """Return the prediction on the current surface, by the instrument found so far."""
-        about = () if self.moves is None else (self.instrument,)
-        return predict(self.surface.height, self.surface.normals(self.shift), *about)
-
-    def follow_modes(self, predict: Predict) -> None:
-        """Find how what is lagged follows level, scale and tilt of the relief, by predictions on changed surfaces.
-
-        With a free border these are known so little better than by the priors that rounds that hold what is scattered
-        several times would run away along them, or come to rest where the misfit is not least: relief came out 8 % too
-        flat on pyramids. What cannot be predicted on a changed surface does not follow.
-        """
-        limits = self.settings.robust_limits[-1], self.settings.jump_limits[-1]
-        is_told = self.is_told
-        modes = _modes(self.predicted_on, is_told, self.across, self.model.geometry.instrument.sample_distance)
-        self.mode, self.mode_response = _amplitudes(modes, is_told), np.zeros((len(modes), *self.signal.shape))
-        at_prediction = copy.copy(self)
-        at_prediction.surface = self.predicted_on
-        noise_change = at_prediction.lag(*limits)[1].noise_change
-        for i, change in enumerate(modes):
-            twin = copy.copy(self)
-            twin.mode_response = np.zeros_like(self.mode_response)
-            twin.surface = Surface(*(now + by for now, by in zip(self.predicted_on, change, strict=True)))
-            unknowns, held = twin.lag(*limits)
-            before = _counts(self.model, unknowns, held._replace(noise_change=noise_change))
-            try:
-                twin.adopt(twin._predicted(predict), twin.surface)
-            except GuardError:
-                continue
-            self.mode_response[i] = np.asarray(_counts(self.model, *twin.lag(*limits)) - before)
-
-    def adopt(self, prediction: Prediction, surface: Surface) -> None:
-        """Take a prediction, made on a surface, for all solves until the next one."""
-        s, normals = self.settings, surface.normals(self.shift)
-        self.prediction, self.predicted_on = prediction, surface
-        self.hidden_moves, self.predicted_moves = self._hidden_moves(prediction.hidden, surface.height)
-        self.near = prediction.about(normals)
-        doubt = prediction.doubt(normals, s.mask_error, s.multiple_error)
-        self.sigma = np.where(self.observed, np.sqrt(self.variance + doubt**2), np.inf)
-
-    def _hidden_moves(self, hidden: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the hidden form factor follows the geometry, and the moves at which it is given.
-
-        A share of the aperture that is hidden is taken to stay hidden: of a wholly hidden one nothing comes into view.
-        """
-        moves = self.moves
-        if moves is None:
-            return np.zeros((0, *hidden.shape)), np.zeros((0, len(hidden)))
+def set_corrections(problem: FitProblem, state: FitState, corrections: Corrections, surface: Surface) -> FitState:
+    """Take corrections, made on a surface, for all solves until the next ones."""
+    held = _held(problem, corrections, surface, state.parameters)
+    if len(held.moved):
+        optics, fields = problem.optics, (surface.height, surface.slope_x, surface.slope_y)
         with jax.enable_x64(True):
-            phi, slopes = map(np.asarray, _aimed_slopes(self.model.geometry, height - moves[0, 0], moves[1:].T))
-        share = np.clip(np.sum(hidden * phi, 1) / np.sum(phi**2, 1), 0.0, 1.0)
-        return share[:, None] * slopes * np.array([-1.0, 1.0, 1.0])[:, None, None, None, None], moves
+            moves = _masked_moves(Surface(*map(jnp.asarray, fields)), optics, problem.raster, held.moved)
+        held = replace(held, moves=np.asarray(moves))
+    return replace(state, held=held)
 
-    @property
-    def model_share(self) -> np.ndarray:
-        """Share of the prediction's assumed error in the assumed variance of every datum; 0 where not observed."""
-        return np.where(self.observed, np.maximum(1.0 - self.variance / self.sigma**2, 0.0), 0.0)
 
-    def edges(self, cut: float) -> tuple[Edges, Edges]:
-        """Return the edges of the current surface along x and along y."""
-        (height, slope_x, slope_y), m = self.surface, self.model
-        found = (
-            find_edges(height, slope_x, m.dx, 1, self.slope_noise, cut),
-            find_edges(height, slope_y, m.dy, 0, self.slope_noise, cut),
-        )
-        if self.torn is None:
-            return found
-        edges_x, edges_y = (Edges(e.doubt, np.where(t, 0.0, e.intact)) for e, t in zip(found, self.torn, strict=True))
-        return edges_x, edges_y
+def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
+    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
+    surface = state.surface
+    instrument = () if not len(problem.moves(state.parameters)) else (problem.fitted_instrument(state.parameters),)
+    corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
+    state = set_corrections(problem, state, corrections, surface)
+    optics = moved_optics(problem.optics, problem.moves(state.parameters))
+    responses = region_responses(surface, optics, problem.raster, problem.region)
+    if problem.is_level_free or problem.is_level_held:
+        distance = problem.instrument.sample_distance
+        responses += relief_responses(surface, optics, problem.raster, problem.has_enough_images, distance)
+    return replace(state, held=replace(state.held, responses=responses))
 
-    @property
-    def is_unknown(self) -> bool:
-        """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""
-        return self.moves is not None or self.drift.shape[1] > 0
 
-    def _mixing(self, problem: tuple[Model, Unknowns, Lagged], is_instrument_free: bool) -> jax.Array | np.ndarray:
-        """Return the instruments and levels that are fitted: as they are where they are held or little is unknown."""
-        if is_instrument_free and (self.is_unknown or self.is_level_free):
-            return whitened_instrument(*problem, np.asarray(float(self.is_level_free)))
-        model, start, _ = problem
-        n = sum(getattr(start, name).size for name in model.instrument_fields(start))
-        return np.diag([1.0] * n + [0.0])
+def moved_optics(optics: Optics, moves: Any) -> Optics:
+    """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
+    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
 
-    def tear(self) -> None:
-        """Cut all edges that may lie behind a rim, until `torn` is None again; only where the instrument is unknown."""
-        if not self.is_unknown:
-            return
-        about = self.signal, self.variance, self.surface, self.shift
-        self.torn = shadow_edges(*about, 1), shadow_edges(*about, 0)
 
-    def weigh(self, limit: float, cut: float) -> tuple[Edges, Edges]:
-        """Find robust weights and edges at the current surface, and keep them; return the edges."""
-        self.weight = geman_mcclure(self.residuals, limit)
-        edges_x, edges_y = self.edges(cut)
-        self.intact_x, self.intact_y = edges_x.intact, edges_y.intact
-        return edges_x, edges_y
+@eqx.filter_jit
+def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: jax.Array) -> jax.Array:
+    """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
 
-    def lag(self, limit: float, cut: float) -> tuple[Unknowns, Lagged]:
-        """Freeze prediction, edges and robust weights at the current surface; return it as unknowns, too."""
-        s, m, p = self.settings, self.model, self.near
-        height, slope_x, slope_y = self.surface
-        edges_x, edges_y = self.weigh(limit, cut)
-        scale_x, scale_y = (self._slope_scale(e, axis) for e, axis in ((edges_x, 1), (edges_y, 0)))
-        base_x = one_sided(np.diff(height, axis=1) / m.dx, edges_x.intact, 1)
-        base_y = one_sided(np.diff(height, axis=0) / m.dy, edges_y.intact, 0)
-        unknowns = Unknowns(
-            dctn(height, norm="ortho") / self.whitening,
-            (slope_x - base_x) / scale_x,
-            (slope_y - base_y) / scale_y,
-            *(self.values[name] for name in INSTRUMENT),
-        )
-        inverse_sigma = self.weight / self.sigma
-        largest = _NOISY * self.slope_noise * self._steepness()
-        lagged = Lagged(
-            data=self.data,
-            inverse_sigma=inverse_sigma,
-            multiple=p.multiple,
-            hidden=p.hidden,
-            unseen=np.zeros(self.data.shape) if p.unseen is None else p.unseen,
-            noise_change=_noise_change(m, self.surface, p.hidden, inverse_sigma, largest, self.moves),
-            plateau=self.plateau,
-            level=np.einsum("ryx,yx->r", self.plateau, self.predicted_on.height),
-            level_response=self.level_response,
-            hidden_moves=self.hidden_moves,
-            predicted_moves=self.predicted_moves,
-            mode=self.mode,
-            amplitude=np.einsum("ryx,yx->r", self.mode, self.predicted_on.height),
-            mode_response=self.mode_response,
-            drift=self.drift,
-            across=self.across,
-            intact_x=edges_x.intact,
-            intact_y=edges_y.intact,
-            edge_x=edges_x.weight,
-            edge_y=edges_y.weight,
-            bend_x=bend_of(edges_x.intact, slope_x, self.slope_noise, 1),
-            bend_y=bend_of(edges_y.intact, slope_y, self.slope_noise, 0),
-            border=self.border,
-            level_weight=self.level_weight,
-            held_level=self.held_level,
-            whitening=self.whitening,
-            slope_scale_x=scale_x,
-            slope_scale_y=scale_y,
-            gain_std=s.gain_std * np.ones(len(self.signal)),
-            offset_std=s.offset_std * self.mean_signal,
-            multiple_std=s.multiple_error * np.ones(len(self.signal)),
-            drift_std=s.drift_std * self.mean_signal[:, None],
-            lines_std=s.line_std * self.mean_signal,
-            law_std=s.law_std,
-            distance_std=self.distance_std,
-            tilt_std=self.tilt_std,
-            aim_std=self.aim_std,
-        )
-        return Unknowns(*map(np.asarray, unknowns)), Lagged(*map(np.asarray, lagged))
+    Each aperture depends on its own polar angle and azimuth only, so that one derivative serves all detectors.
+    """
 
-    def _slope_scale(self, edges: Edges, axis: int) -> np.ndarray:
-        """Return how far a slope may move from its one-sided difference: what edges and datum leave of it."""
-        free = self.slope_noise * self._steepness()
-        return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / free**2)
+    def masked(step):
+        return masked_form_factor(surface, moved_optics(optics, moved + step[:, None]), raster)
 
-    def _steepness(self) -> np.ndarray:
-        """Return by how much more the slopes of a facet follow its normal than those of a level one [y, x]."""
-        return 1.0 + self.surface.slope_x**2 + self.surface.slope_y**2
+    return jnp.moveaxis(jax.jacfwd(masked)(jnp.zeros(3)), -1, 0)
 
-    def step(self, limit: float, cut: float, is_instrument_free: bool) -> Solution:
-        """Solve one weighted least-squares problem from the current surface."""
-        s = self.settings
-        problem = self.model, *self.lag(limit, cut)
-        mixing = self._mixing(problem, is_instrument_free)
-        # an array: one compilation serves both cases
-        found = solve(*problem, s.lm_steps, s.cg_steps, mixing, np.asarray(float(is_instrument_free)))
-        self.surface = Surface(*map(np.asarray, found.surface))
-        self.values = {name: np.asarray(getattr(found.unknowns, name)) for name in INSTRUMENT}
-        self.residuals = (np.asarray(found.counts) - self.data) / self.sigma
+
+@eqx.filter_jit
+def _form_factors(optics: Optics, moved: jax.Array, height: jax.Array, held: tuple) -> FormFactors:
+    """Expand the visible form factors about heights [y, x] and moves [move, detector]."""
+    masked, masked_moves, masked_at = held
+
+    def derivatives(at, heights):
+        here, one = moved_optics(optics, at), jnp.ones_like(heights)
+
+        def value(h):
+            return form_factor_at(here, h)
+
+        def slope(h):
+            return jax.jvp(value, (h,), (one,))[1]
+
+        return jnp.stack([value(heights), slope(heights), jax.jvp(slope, (heights,), (one,))[1]])
+
+    def by_moves(heights):
+        if not len(moved):
+            return jnp.zeros((0, optics.n_detectors, 3, *heights.shape))
+        by = jax.jacfwd(lambda step: form_factor_at(moved_optics(optics, moved + step[:, None]), heights))(jnp.zeros(3))
+        return jnp.moveaxis(by, -1, 0)
+
+    mean = jnp.mean(height)
+    terms, level = derivatives(moved, height), derivatives(moved, mean[None])
+    direction = terms[0] / jnp.sqrt(jnp.sum(terms[0] ** 2, 1, keepdims=True))
+    masked = masked + jnp.einsum("mk,mkiyx->kiyx", moved - masked_at, masked_moves)
+    return FormFactors(
+        height,
+        terms.at[0].add(-masked),
+        direction,
+        by_moves(height) - masked_moves,
+        moved,
+        mean,
+        level[:, :, :2, 0],
+        by_moves(mean[None])[:, :, :2, 0],
+        form_factor_at(optics, jnp.zeros(1))[:, :2, 0],
+    )
+
+
+_noise_bias = eqx.filter_jit(second_order_noise_bias)
+_expected = eqx.filter_jit(
+    lambda unknowns, fixed: expected_data(surface_of(unknowns, fixed), unknowns.parameters, fixed)
+)
+
+
+def edges_of(
+    problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[AxisEdges, AxisEdges]:
+    """Find the edges of a surface along x and along y; those that are `occluded` count as depth jumps."""
+    found = (
+        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.slope_noise, cut),
+        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.slope_noise, cut),
+    )
+    if occluded is None:
         return found
+    along_x, along_y = (replace(e, joined=np.where(o, 0.0, e.joined)) for e, o in zip(found, occluded, strict=True))
+    return along_x, along_y
 
-    def simulated(self) -> "Refiner":
-        """Return a fit that starts from its own truth: this surface, the instrument at its prior means, no noise."""
-        twin = copy.copy(self)
-        twin.values = self._at_prior_means(self.model.geometry.instrument)
-        twin.data, twin.residuals = twin._expected(is_noisy=False), np.zeros(self.data.shape)
-        return twin
 
-    def move_back(self, surface: Surface, values: dict[str, np.ndarray]) -> None:
-        """Subtract a change of the surface and one of the instrument."""
-        self.surface = Surface(*(field - by for field, by in zip(self.surface, surface, strict=True)))
-        self.values = {name: value - values[name] for name, value in self.values.items()}
-        self.residuals = (self._expected(is_noisy=True) - self.data) / self.sigma
+def freeze(
+    problem: FitProblem,
+    state: FitState,
+    limit: float,
+    cut: float,
+    occluded: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[Unknowns, FixedTerms]:
+    """Fix corrections, edges and robust weights at a state; return the state as unknowns, too.
 
-    def _expected(self, is_noisy: bool) -> np.ndarray:
-        """Return the data expected at the current surface, whose slopes may be noisy ones; 0 where not observed."""
-        unknowns, lagged = self.lag(self.settings.robust_limits[-1], self.settings.jump_limits[-1])
-        if not is_noisy:
-            lagged = lagged._replace(noise_change=np.zeros(self.data.shape))
-        return np.where(self.observed, _counts(self.model, unknowns, lagged), 0.0)
+    Args:
+        problem: the data.
+        state: current surface and parameters.
+        limit: residual at which a datum's weight falls to a half [standard deviations].
+        cut: misfit at which an edge loses most of its weight [standard deviations].
+        occluded: edges to cut along x and y.
+    """
+    held, noise = state.held, problem.slope_noise
+    height, slope_x, slope_y = state.surface.height, state.surface.slope_x, state.surface.slope_y
+    dx, dy = problem.raster.dx, problem.raster.dy
+    along_x, along_y = edges_of(problem, state.surface, cut, occluded)
+    # a kink lies in one of `stride` edges of each of `stride` parallel paths of a thinned raster
+    strictness = problem.stride**1.5
+    edges = Edges(
+        along_x.joined,
+        along_y.joined,
+        along_x.weight * strictness,
+        along_y.weight * strictness,
+        smoothness_weight(along_x.joined, slope_x, noise, 1),
+        smoothness_weight(along_y.joined, slope_y, noise, 0),
+    )
+    steepness = 1.0 + slope_x**2 + slope_y**2  # of slopes against normals
+    scale_x, scale_y = (_slope_scale(e, axis, noise * steepness) for e, axis in ((along_x, 1), (along_y, 0)))
+    whitening = _whitening(problem.raster.shape, dx, dy, noise)
+    unknowns = Unknowns(
+        dctn(height, norm="ortho") / whitening,
+        (slope_x - one_sided(np.diff(height, axis=1) / dx, along_x.joined, 1)) / scale_x,
+        (slope_y - one_sided(np.diff(height, axis=0) / dy, along_y.joined, 0)) / scale_y,
+        state.parameters,
+    )
+    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma
+    priors, moved = problem.priors, problem.moves(state.parameters)
+    with jax.enable_x64(True):
+        factors = _form_factors(problem.optics, moved, height, (held.masked, held.moves, held.moved))
+        largest = _NOISY * noise * steepness
+        bias = _noise_bias(slope_x, slope_y, factors.terms[0], np.array(problem.shift), inverse_sigma, largest)
+    occluded_std = held.corrections.occluded
+    fixed = FixedTerms(
+        data=problem.data,
+        inverse_sigma=inverse_sigma * problem.stride,
+        form_factors=factors,
+        multiple=held.multiple,
+        occluded=np.zeros(problem.signal.shape) if occluded_std is None else occluded_std,
+        noise_bias=bias,
+        modes=_common_modes(held, np.exp(priors.gain * state.parameters.log_gain)),
+        drift_modes=problem.drift_modes,
+        position=problem.position,
+        edges=edges,
+        border=problem.border,
+        level_weight=problem.level_weight,
+        held_level=problem.held_level,
+        whitening=whitening,
+        slope_scale_x=scale_x,
+        slope_scale_y=scale_y,
+        priors=priors,
+        beam_shift=np.array(problem.shift),
+        dx=dx,
+        dy=dy,
+        slow_axis=problem.order.slow_axis,
+    )
+    as_array = lambda a: np.asarray(a, float)  # noqa: E731
+    return jax.tree.map(as_array, unknowns), jax.tree.map(as_array, fixed)
 
-    @property
-    def tilt(self) -> np.ndarray:
-        """Slopes (x, y) of the reference plane that have been fitted [2]."""
-        return self.tilt_std * self.values["tilt"] if self.values["tilt"].size else np.zeros(2)
 
-    @property
-    def levelled(self) -> Surface:
-        """The surface above the reference plane, which may be tilted."""
-        (height, slope_x, slope_y), tilt = self.surface, self.tilt
-        return Surface(height - np.tensordot(tilt, self.across, 1), slope_x - tilt[0], slope_y - tilt[1])
+def _common_modes(held: Held, gain: np.ndarray) -> CommonModes:
+    """Stack the responses, filled up with empty ones, so that one compilation serves different numbers of them."""
+    n, shape = len(held.responses), held.multiple.shape
+    room = MODE_BLOCK * max(1, -(-n // MODE_BLOCK))
+    weights, change = np.zeros((room, *shape[1:])), np.zeros((room, *shape))
+    for i, response in enumerate(held.responses):
+        weights[i], change[i] = response.weights, gain[:, None, None] * response.change
+    return CommonModes(weights, np.einsum("myx,yx->m", weights, held.surface.height), change)
 
-    def misfit(self, limit: float, cut: float) -> float:
-        """Return half the robust chi-square of data and edges, with the data's normalisation."""
-        weight = geman_mcclure(self.residuals, limit)
-        data = 0.5 * limit**2 * np.sum(1.0 - weight) + np.sum(np.log(self.sigma[self.observed]))
-        return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.intact)) for e in self.edges(cut)))
+
+def _slope_scale(edges: AxisEdges, axis: int, free: np.ndarray) -> np.ndarray:
+    """Compute the scale of whitened slopes: the deviation from one-sided differences that edges and data leave."""
+    return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / free**2)
+
+
+def step(
+    problem: FitProblem,
+    state: FitState,
+    limit: float,
+    cut: float,
+    is_instrument_free: bool,
+    occluded: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[FitState, Solution]:
+    """Solve one weighted least-squares problem from a state; arguments as those of `freeze`."""
+    s = problem.settings
+    start, fixed = freeze(problem, state, limit, cut, occluded)
+    free, mixing_is_whitened = np.asarray(float(is_instrument_free)), problem.is_instrument_unknown
+    with jax.enable_x64(True):
+        if is_instrument_free and (mixing_is_whitened or problem.is_level_free):
+            mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)))
+        else:  # as they are, where they are held or little is unknown
+            n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
+            mixing = np.diag([1.0] * n + [0.0])
+        # the switch is an array: one compilation serves both cases
+        found = jax.tree.map(np.asarray, solve(start, fixed, s.lm_steps, s.cg_steps, mixing, free))
+    residuals = (found.data - problem.data) / state.held.sigma
+    return replace(state, surface=found.surface, parameters=found.parameters, residuals=residuals), found
+
+
+def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndarray:
+    """Compute the data expected at a state, whose slopes may be noisy ones; 0 where not observed."""
+    unknowns, fixed = freeze(problem, state, problem.settings.robust_limits[-1], problem.settings.jump_limits[-1])
+    if not is_noisy:
+        fixed = eqx.tree_at(lambda f: f.noise_bias, fixed, np.zeros(problem.signal.shape))
+    with jax.enable_x64(True):
+        return np.where(problem.is_observed, np.asarray(_expected(unknowns, fixed)), 0.0)
+
+
+def levelled(problem: FitProblem, state: FitState) -> Surface:
+    """Return the surface above the substrate, which may be tilted."""
+    s, tilt = state.surface, problem.priors.tilt * state.parameters.tilt
+    if not tilt.size:
+        return s
+    return Surface(s.height - np.tensordot(tilt, problem.position, 1), s.slope_x - tilt[0], s.slope_y - tilt[1])
+
+
+def misfit(problem: FitProblem, state: FitState, limit: float, cut: float) -> float:
+    """Compute half the robust chi-square of data and edges, with the data's normalisation."""
+    data = 0.5 * limit**2 * np.sum(1.0 - cauchy_weight(state.residuals, limit))
+    data += np.sum(np.log(state.held.sigma[problem.is_observed]))
+    edges = edges_of(problem, state.surface, cut)
+    return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.joined)) for e in edges))
+
+
+def model_share(problem: FitProblem, state: FitState) -> np.ndarray:
+    """Compute the share of prediction errors in the variance of every datum; 0 where not observed [detector, y, x]."""
+    share = np.maximum(1.0 - problem.variance / state.held.sigma**2, 0.0)
+    return np.where(problem.is_observed, share, 0.0)

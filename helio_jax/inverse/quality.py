@@ -5,7 +5,8 @@ from scipy.ndimage import uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from helio_jax.inverse.edges import along, ranked, trapezoid_gap
+from helio_jax.forward.surface import along
+from helio_jax.inverse.edges import ranked, trapezoid_gap
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS
@@ -14,7 +15,7 @@ FACET_IMAGES = 2
 """Data that fix the two slopes of a facet of known albedo."""
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked."""
-INTACT = 0.25
+JOINED = 0.25
 """Edges with less weight than this are cut; a pixel with such an edge is at a depth jump, unless the jump is small."""
 SMALLEST_JUMP = 0.1
 """Misfit of a cut edge, in pitches, below which it is no depth jump: noise cuts one edge in some hundreds."""
@@ -51,15 +52,15 @@ def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> n
     return reason
 
 
-def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
-    """Return the number of the region of every pixel [y, x]: pixels joined by intact edges; the largest region is 0.
+def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
+    """Return the number of the region of every pixel [y, x]: pixels joined by joined edges; the largest region is 0.
 
     Args:
-        intact_x, intact_y: what is left of the edges [y, x - 1], [y - 1, x].
+        joined_x, joined_y: what is left of the edges [y, x - 1], [y - 1, x].
     """
-    shape = (intact_x.shape[0], intact_y.shape[1])
+    shape = (joined_x.shape[0], joined_y.shape[1])
     pixel = np.arange(shape[0] * shape[1]).reshape(shape)
-    is_joined = intact_y >= INTACT, intact_x >= INTACT
+    is_joined = joined_y >= JOINED, joined_x >= JOINED
     start, end = (
         np.concatenate([ends[kept] for ends, kept in zip(side, is_joined, strict=True)])
         for side in zip(along(pixel, 0), along(pixel, 1), strict=True)
@@ -68,21 +69,23 @@ def regions(intact_x: np.ndarray, intact_y: np.ndarray) -> np.ndarray:
     return ranked(connected_components(graph, directed=False)[1]).reshape(shape)
 
 
-def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: np.ndarray | None = None) -> np.ndarray:
+def floating(
+    height: np.ndarray, samples: np.ndarray, region: np.ndarray, common_modes: np.ndarray | None = None
+) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
-    So are heights that an instrument far from what was stated has bent, or that are not converged, relative to most
+    So are heights that an instrument far from what was stated has common_modes, or that are not converged, relative to most
     others, by a large share of all relief: another explanation, or more rounds, would have taken them elsewhere.
 
     Args:
         height: [y, x], um.
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
-        bent: as in `Posterior` [error, y, x], um.
+        common_modes: as in `Posterior` [error, y, x], um.
     """
     flags = np.zeros(height.shape, bool)
-    if bent is not None:
-        relative = np.sqrt(((bent - np.median(bent, (1, 2), keepdims=True)) ** 2).sum(0))
+    if common_modes is not None:
+        relative = np.sqrt(((common_modes - np.median(common_modes, (1, 2), keepdims=True)) ** 2).sum(0))
         flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
     ground = region == 0
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
@@ -93,15 +96,15 @@ def floating(height: np.ndarray, samples: np.ndarray, region: np.ndarray, bent: 
     return flags
 
 
-def depth_jumps(height: np.ndarray, slope: np.ndarray, intact: np.ndarray, pitch: float, axis: int) -> np.ndarray:
+def depth_jumps(height: np.ndarray, slope: np.ndarray, joined: np.ndarray, pitch: float, axis: int) -> np.ndarray:
     """Return True for edges along an axis (0: y, 1: x) that are cut and part heights by more than `SMALLEST_JUMP`.
 
     Args:
         height, slope: heights, um, and slopes along the axis [y, x].
-        intact: what is left of the edges.
+        joined: what is left of the edges.
         pitch: um.
     """
-    return (intact < INTACT) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
+    return (joined < JOINED) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)
 
 
 def squares(residuals: np.ndarray) -> np.ndarray:
@@ -124,7 +127,7 @@ def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
     return around > EXPLAINED * max(1.0, float(np.median(around)))
 
 
-def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+def n_informative(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
     """Return how many data tell of every pixel's facet [y, x].
 
     Args:
@@ -137,7 +140,7 @@ def telling(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
 def reasons_from_fit(
     reason: np.ndarray,
     is_explained: np.ndarray,
-    n_telling: np.ndarray,
+    n_informative: np.ndarray,
     jump_x: np.ndarray,
     jump_y: np.ndarray,
     is_floating: np.ndarray,
@@ -149,7 +152,7 @@ def reasons_from_fit(
     Args:
         reason: from `reasons_from_data` [y, x].
         is_explained: whether the model explains the pixel's data [y, x].
-        n_telling: from `telling` [y, x].
+        n_informative: from `n_informative` [y, x].
         jump_x, jump_y: from `depth_jumps` [y, x - 1], [y - 1, x].
         is_floating: from `floating` [y, x].
     """
@@ -159,6 +162,6 @@ def reasons_from_fit(
             end |= jump
     out = reason.copy()
     out[(out == 0) & (at_jump | ~is_explained)] = _JUMP
-    out[(out == 0) & (n_telling < FACET_IMAGES)] = _MASKED
+    out[(out == 0) & (n_informative < FACET_IMAGES)] = _MASKED
     out[(out == 0) & is_floating] = _FLOATING
     return out

@@ -11,7 +11,8 @@ from scipy.ndimage import binary_closing, binary_dilation, label, maximum_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-from helio_jax.inverse.edges import along, ranked
+from helio_jax.forward.surface import along
+from helio_jax.inverse.edges import ranked
 from helio_jax.inverse.quality import squares
 
 WALL = 25.0

@@ -20,14 +20,14 @@ def on_raster(fields: np.ndarray, shape: tuple[int, ...], stride: int) -> np.nda
     return fields[..., row[:, None], column]
 
 
-def also_off_by(samples: np.ndarray, error: np.ndarray, seed: int) -> np.ndarray:
-    """Return samples [sample, y, x] with one error more, of all heights together, known up to a factor of deviation 1.
+def add_common_mode(samples: np.ndarray, error: np.ndarray, seed: int) -> np.ndarray:
+    """Add a fully correlated error with a standard-normal amplitude to samples [sample, y, x].
 
     Args:
         samples: of the heights [sample, y, x], um.
         error: [y, x], um.
-        seed: of the factors; errors that are independent of one another have different ones.
+        seed: of the amplitudes; independent errors have different ones.
     """
-    how_far = np.random.default_rng(seed).standard_normal(len(samples))
-    how_far /= np.sqrt(np.mean(how_far**2))
-    return samples + how_far[:, None, None] * error
+    amplitude = np.random.default_rng(seed).standard_normal(len(samples))
+    amplitude /= np.sqrt(np.mean(amplitude**2))
+    return samples + amplitude[:, None, None] * error

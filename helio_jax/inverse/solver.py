@@ -1,136 +1,213 @@
-"""One least-squares solve of the fit by Levenberg-Marquardt; only door to optimistix and lineax."""
+"""One least-squares solve of the fit by inexact Gauss-Newton steps; the only door to optimistix."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
-from helio_jax.inverse.residuals import Lagged, Model, Surface, Unknowns
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.residuals import (
+    FixedTerms,
+    Parameters,
+    Unknowns,
+    border_residuals,
+    data_residuals,
+    expected_data,
+    residuals,
+    surface_of,
+)
 
-_FIRST_STEP_SIZE, _SHRINK = 1e3, 0.1
-"""Inverse of the first Levenberg-Marquardt damping, in whitened variables, and its factor after a rejected step."""
+CG_TOLERANCE = 1e-2
+"""Relative residual of the normal equations at which conjugate gradients stop."""
 
 
-class _TruncatedCG(lx.CG):
-    """Conjugate gradients from 0, until the norm of the residual has fallen by `rtol` or the steps are up.
+def conjugate_gradients(
+    operator: Callable[[jax.Array], jax.Array], vector: jax.Array, max_steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solve operator(x) = vector from x = 0, to `CG_TOLERANCE` or `max_steps`; return x and the relative residual.
 
-    An inexact Newton step. The operator is compiled once, where `lx.CG` has three copies of it.
+    Source: Hestenes and Stiefel, J. Res. NBS 49 (1952) 409.
+    """
+    square = jnp.vdot(vector, vector)
 
-    Source: Hestenes and Stiefel, J. Res. NBS 49 (1952) 409; Dembo, Eisenstat and Steihaug, SINUM 19 (1982) 400.
+    def is_unfinished(carry):
+        _, _, _, now, step = carry
+        return (now > CG_TOLERANCE**2 * square) & (step < max_steps)
+
+    def body(carry):
+        x, r, p, now, step = carry
+        image = operator(p)
+        size = now / jnp.vdot(p, image)
+        x, r = x + size * p, r - size * image
+        new = jnp.vdot(r, r)
+        return x, r, r + new / now * p, new, step + 1
+
+    x, _, _, now, _ = jax.lax.while_loop(is_unfinished, body, (jnp.zeros_like(vector), vector, vector, square, 0))
+    return x, jnp.sqrt(now / jnp.maximum(square, 1e-300))
+
+
+class _Direction(NamedTuple):
+    """The Gauss-Newton step from the accepted point, and the relative residual of its normal equations."""
+
+    newton: jax.Array
+    residual: jax.Array
+
+
+class InexactNewton(optx.AbstractDescent):
+    """Gauss-Newton direction by truncated conjugate gradients, whose number of steps also regularises.
+
+    Source: Dembo, Eisenstat and Steihaug, SINUM 19 (1982) 400.
     """
 
-    def compute(self, state, vector, options):
-        operator, _ = state
-        square = jnp.vdot(vector, vector)
-
-        def is_unfinished(carry):
-            _, _, _, now, step = carry
-            return (now > self.rtol**2 * square) & (step < self.max_steps)
-
-        def body(carry):
-            x, r, p, now, step = carry
-            image = operator.mv(p)
-            size = now / jnp.vdot(p, image)
-            x, r = x + size * p, r - size * image
-            new = jnp.vdot(r, r)
-            return x, r, r + new / now * p, new, step + 1
-
-        x, _, _, _, steps = jax.lax.while_loop(is_unfinished, body, (jnp.zeros_like(vector), vector, vector, square, 0))
-        return x, lx.RESULTS.successful, {"num_steps": steps, "max_steps": self.max_steps}
-
-
-class _NearlyNewton(optx.ClassicalTrustRegion):
-    """Trust region that starts with little damping: the start is good, and damping would freeze weak modes."""
+    cg_steps: int
 
     def init(self, y, f_info_struct):
-        state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.asarray(_FIRST_STEP_SIZE))
+        return _Direction(jnp.zeros_like(y), jnp.ones((), y.dtype))
+
+    def query(self, y, f_info, state):
+        along, back = f_info.jac.mv, f_info.jac.transpose().mv
+        return _Direction(*conjugate_gradients(lambda v: back(along(v)), back(f_info.residual), self.cg_steps))
+
+    def step(self, step_size, state):
+        return -step_size * state.newton, optx.RESULTS.successful
+
+
+class GaussNewton(optx.AbstractGaussNewton):
+    """optimistix's Gauss-Newton method with inexact directions and Armijo's backtracking."""
+
+    rtol: float
+    atol: float
+    norm: Callable[[Any], Any]
+    descent: InexactNewton
+    search: optx.AbstractSearch
+    verbose: Callable[..., None]
+
+    def __init__(self, cg_steps: int) -> None:
+        self.rtol, self.atol, self.norm, self.verbose = 1e-4, 1e-6, optx.max_norm, lambda **_: None
+        self.descent, self.search = InexactNewton(cg_steps), optx.BacktrackingArmijo(decrease_factor=0.25)
 
 
 class Solution(NamedTuple):
-    """One solve: unknowns, surface, expected data, and the cost of every kind of residual."""
+    """One solve.
 
-    unknowns: Unknowns
+    Attributes:
+        parameters, surface: found.
+        data: expected there [detector, y, x].
+        cost: half the sum of squares of every kind of residual.
+        is_converged: whether optimistix met its tolerances within its steps.
+        next_step_um: root mean square height change of the next Gauss-Newton step from there.
+        cg_residual: relative residual of that step's normal equations; above `CG_TOLERANCE` they are truncated.
+    """
+
+    parameters: Parameters
     surface: Surface
-    counts: jax.Array
+    data: jax.Array
     cost: dict[str, jax.Array]
+    is_converged: jax.Array
+    next_step_um: jax.Array
+    cg_residual: jax.Array
+
+    @property
+    def status(self) -> str:
+        """How the optimiser ended, in a sentence."""
+        steps = "met its tolerances" if self.is_converged else "stopped at its number of steps"
+        cg = "converged" if self.cg_residual <= CG_TOLERANCE else "truncated"
+        return (
+            f"Gauss-Newton {steps}, its next step would change the heights by {self.next_step_um:.2g} um "
+            f"(conjugate gradients {cg} at a relative residual of {self.cg_residual:.1g})"
+        )
+
+
+def free_parameters(parameters: Parameters) -> tuple[jax.Array, Callable[[jax.Array], Parameters]]:
+    """Return the unknown parameters, scan lines excepted, as one vector, and the function that puts such back."""
+    names = parameters.free()
+    flat, restore = ravel_pytree([getattr(parameters, name) for name in names])
+    return flat, lambda vector: parameters.replaced(**dict(zip(names, restore(vector), strict=True)))
 
 
 @eqx.filter_jit
-def whitened_instrument(model: Model, start: Unknowns, lagged: Lagged, is_level_free: np.ndarray) -> jax.Array:
-    """Return the matrix whose columns are instruments and levels that the data tell apart, by one standard deviation.
+def whitened_parameters(start: Unknowns, fixed: FixedTerms, is_level_free: np.ndarray) -> jax.Array:
+    """Compute the matrix whose columns are combinations of parameters and level, each one standard deviation apart.
 
     Gains, offsets, drift, angles and the level of all heights [um], the last row, have much the same effect on the
     data, and by far more than one pixel's height: as they are, conjugate gradients would take many steps for them
     alone. The level takes part 1 or 0 times; a flat border holds it.
     """
-    names = model.instrument_fields(start)
-    surface = model.surface(start, lagged)
-    flat, restore = ravel_pytree(({name: getattr(start, name) for name in names}, jnp.zeros(1)))
+    surface = surface_of(start, fixed)
+    flat, restore = free_parameters(start.parameters)
 
-    def residuals(values):
-        instrument, level = restore(values)
-        unknowns, raised = start._replace(**instrument), surface._replace(height=surface.height + is_level_free * level)
-        parts = model.data_residuals(raised, unknowns, lagged), model.border_residuals(raised, unknowns, lagged)
+    def misfit(values):
+        parameters = restore(values[:-1])
+        raised = Surface(surface.height + is_level_free * values[-1], surface.slope_x, surface.slope_y)
+        parts = data_residuals(raised, parameters, fixed), border_residuals(raised, parameters, fixed)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    jacobian = jax.jacfwd(residuals)(flat)
-    prior = jnp.ones(flat.size).at[-1].add(-is_level_free)
+    jacobian = jax.jacfwd(misfit)(jnp.append(flat, 0.0))
+    prior = jnp.ones(flat.size + 1).at[-1].add(-is_level_free)
     factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
-    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size), lower=True).T
+    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size + 1), lower=True).T
     return mixing.at[-1].multiply(is_level_free)
 
 
 @eqx.filter_jit
 def solve(
-    model: Model,
     start: Unknowns,
-    lagged: Lagged,
+    fixed: FixedTerms,
     max_steps: int,
     cg_steps: int,
     mixing: jax.Array | np.ndarray,
     is_instrument_free: np.ndarray,
 ) -> Solution:
     """Solve from `start`; the instrument, 1 or 0 times free, and the sample's albedo move along `mixing`'s columns."""
-    solver = optx.LevenbergMarquardt(
-        rtol=1e-4, atol=1e-6, linear_solver=lx.Normal(_TruncatedCG(rtol=1e-2, atol=0.0, max_steps=cg_steps))
-    )
-    solver = eqx.tree_at(
-        lambda s: s.search, solver, _NearlyNewton(low_constant=_SHRINK), is_leaf=lambda n: n is solver.search
-    )
-    names = model.instrument_fields(start)
-    flat, restore = ravel_pytree(({name: getattr(start, name) for name in names}, jnp.zeros(1)))
-    seen = jnp.sum(lagged.inverse_sigma**2, 2 - model.slow_axis) * lagged.lines_std[:, None] ** 2
+    flat, restore = free_parameters(start.parameters)
+    lines = start.parameters.lines
+    seen = jnp.sum(fixed.inverse_sigma**2, 2 - fixed.slow_axis) * fixed.priors.lines[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
-    is_free = {n: jnp.full_like(getattr(start, n), 1.0 if n == "albedo" else is_instrument_free) for n in names}
-    mixing = ravel_pytree((is_free, jnp.full(1, is_instrument_free)))[0][:, None] * mixing
+    is_free = [
+        jnp.full(getattr(start.parameters, n).size, 1.0 if n == "albedo" else is_instrument_free)
+        for n in start.parameters.free()
+    ]
+    mixing = jnp.concatenate([*is_free, jnp.full(1, is_instrument_free)])[:, None] * mixing
+    level_mode = jnp.sqrt(fixed.border.size) / fixed.whitening[0, 0]
 
     def decoded(variables: jax.Array) -> Unknowns:
-        surface, mixed, lines = split(variables)
-        instrument, level = restore(flat + mixing @ mixed)
-        unknowns = start._replace(**surface, **instrument)
-        unknowns = unknowns._replace(height=unknowns.height.at[0, 0].add(level[0] * level_mode))
-        return unknowns._replace(lines=start.lines + line_scale * lines) if start.lines.size else unknowns
+        fields, mixed, of_lines = split(variables)
+        moved = jnp.append(flat, 0.0) + mixing @ mixed
+        parameters = restore(moved[:-1])
+        if lines.size:
+            parameters = parameters.replaced(lines=lines + line_scale * of_lines)
+        height = fields[0].at[0, 0].add(moved[-1] * level_mode)
+        return Unknowns(height, *fields[1:], parameters)
 
-    level_mode = jnp.sqrt(lagged.border.size) / lagged.whitening[0, 0]
-    surface = {name: getattr(start, name) for name in Surface._fields}
-    # one vector each, for every array of a tree is compiled by itself
-    variables, split = ravel_pytree((surface, jnp.zeros_like(flat), jnp.zeros_like(start.lines)))
+    # one vector, for every array of a tree is compiled by itself
+    fields = (start.height, start.slope_x, start.slope_y)
+    variables, split = ravel_pytree((fields, jnp.zeros(flat.size + 1), jnp.zeros_like(lines)))
+
+    def misfit(v, args):
+        return ravel_pytree(residuals(decoded(v), args))[0]
+
     found = optx.least_squares(
-        lambda v, args: ravel_pytree(model.residuals(decoded(v), args))[0],
-        solver,
+        lambda v, args: ravel_pytree(residuals(decoded(v), args))[0],
+        GaussNewton(cg_steps),
         variables,
-        args=lagged,
+        args=fixed,
         max_steps=max_steps,
         throw=False,
     )
     unknowns = decoded(found.value)
-    surface = model.surface(unknowns, lagged)
-    counts = model.counts(surface, unknowns, lagged)
-    cost = {name: 0.5 * jnp.sum(r**2) for name, r in model.residuals(unknowns, lagged).items()}
-    return Solution(unknowns, surface, counts, cost)
+    surface = surface_of(unknowns, fixed)
+    next_height = split(found.state.descent_state.newton)[0][0] * fixed.whitening
+    return Solution(
+        unknowns.parameters,
+        surface,
+        expected_data(surface, unknowns.parameters, fixed),
+        {name: 0.5 * jnp.sum(r**2) for name, r in residuals(unknowns, fixed).items()},
+        found.result == optx.RESULTS.successful,
+        jnp.sqrt(jnp.mean(next_height**2)),  # the cosine transform keeps the norm
+        found.state.descent_state.residual,
+    )

@@ -18,7 +18,8 @@ from helio_jax.calibration.self_calibration import (
 )
 from helio_jax.calibration.self_calibration import apply as apply_calibration
 from helio_jax.errors import GuardError
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.optics import Optics
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.nearfield import limited
@@ -43,7 +44,7 @@ Source: graduated non-convexity, Blake and Zisserman, Visual Reconstruction (198
 
 def flat_signal(instrument: Instrument) -> np.ndarray:
     """Return the detection probability of the flat reference plane [detector]."""
-    return SpotGeometry(instrument).flat_signal()
+    return substrate_signal(Optics.of(instrument))
 
 
 def calibrate_turned(stack: MicrographStack, *, keeps_multiple: bool = True) -> MicrographStack:
@@ -101,7 +102,7 @@ def _relief_of(stack: MicrographStack) -> Relief:
     """
     settings = ReconstructSettings(method="nearfield", border="free")
     rec = reconstruct_stack(stack, settings)
-    height = limited(rec.height[nearest_known(rec.is_valid)], stack)
+    height = limited(rec.height[nearest_known(rec.is_valid)], Optics.of(stack.instrument))
     normals = np.where(rec.is_valid[..., None], rec.normals, np.array([0.0, 0.0, 1.0]))
     ground = substrate_level(height)
     above = stack.replace(instrument=stack.instrument.at_distance(stack.instrument.sample_distance - ground))

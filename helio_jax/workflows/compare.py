@@ -20,7 +20,9 @@ from helio_jax.arrays import pitch
 from helio_jax.errors import HelioError, InputFileError, SceneError
 from helio_jax.figures.agreement import save_agreement, save_effects
 from helio_jax.formats.safe import atomic_path, make_folder
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import single_scattering
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.scores.agreement import REACH, Agreement, Terms, contrast_by_cause, find_shift, normalise
 from helio_jax.workflows import pipeline
@@ -141,8 +143,8 @@ def _images(path: Path, changes: Mapping[str, Any]) -> Images:
     single, multiple = found.by_order[0] / found.n_rays, found.by_order[1:].sum(0) / found.n_rays
     truth = true_surface(scene, found.x, found.y)
     assert truth.normals is not None  # of a scene
-    phi = SpotGeometry(found.instrument).form_factor(truth.height)
-    unmasked = np.maximum(np.einsum("kiyx,yxi->kyx", phi, truth.normals), 0.0)
+    phi = form_factor(Optics.of(found.instrument), truth.height)
+    unmasked = np.maximum(single_scattering(phi, np.moveaxis(truth.normals, -1, 0)), 0.0)
     return Images(found.instrument, single, multiple, unmasked, found.variance / found.n_rays**2, truth.height)
 
 

@@ -15,13 +15,12 @@ from typing import Literal
 import numpy as np
 
 from helio_jax.arrays import pitch
-from helio_jax.errors import GuardError, SceneError
-from helio_jax.forward.beam_frame import slopes_of_normal
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.masking import hidden_form_factor, hidden_response
-from helio_jax.forward.radiosity import Radiosity
+from helio_jax.errors import GuardError, PredictionError, SceneError
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.radiosity import plan_radiosity
+from helio_jax.forward.render import Corrections, masking_corrections, radiosity_corrections, single_scattering
+from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
-from helio_jax.inverse.residuals import Prediction
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.border import extend_border, substrate_level
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
@@ -54,7 +53,7 @@ def make_predictor(
     workers: int | None = None,
     multiple: Literal["traced", "radiosity"] = "traced",
     border: Literal["flat", "free"] = "flat",
-) -> Callable[..., Prediction]:
+) -> Callable[..., Corrections]:
     """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
@@ -78,24 +77,20 @@ def make_predictor(
     half = max(np.abs(stack.x).max(), np.abs(stack.y).max())
 
     @lru_cache(maxsize=1)
-    def about_instrument(given: str) -> tuple[SpotGeometry, _Raster, Radiosity | None]:
+    def prepared(given: str) -> tuple[Optics, _Raster]:
         instrument = Instrument.model_validate_json(given).idealised()
         reach = half + _surroundings(instrument) if substrate_um is None else max(0.5 * substrate_um, 1.001 * half)
-        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat")
-        geometry = SpotGeometry(instrument)
-        return geometry, raster, Radiosity(geometry, stack.x, stack.y, 2.0 * reach) if multiple == "radiosity" else None
+        lift = LIFT_PIXELS * min(dx, dy)
+        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), lift, reach, border == "flat")
+        return Optics.of(instrument), raster
 
-    def predict(height: np.ndarray, normals: np.ndarray, instrument: Instrument = stack.instrument) -> Prediction:
-        geometry, raster, radiosity = about_instrument(instrument.model_dump_json())
-        a, b, _ = slopes_of_normal(normals, instrument.beam_shift)
-        about = (geometry, dx, dy)
-        hidden = np.asarray(hidden_form_factor(height, a, b, *about))
-
-        def response(change: np.ndarray) -> np.ndarray:
-            return np.asarray(hidden_response(height, a, b, *about, change))
-
-        if radiosity is not None:
-            return Prediction(radiosity(height, normals), hidden, response)
+    def predict(height: np.ndarray, normals: np.ndarray, instrument: Instrument = stack.instrument) -> Corrections:
+        optics, raster = prepared(instrument.model_dump_json())
+        surface = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2])
+        if multiple == "radiosity":
+            plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * raster.reach)
+            return radiosity_corrections(surface, optics, Raster.of(stack), plan)
+        masked = masking_corrections(surface, optics, Raster.of(stack)).masked
         calm, calm_normals = _without_noise(height, normals, CALM_PITCHES * min(dx, dy))
         sides = raster.sides(calm, calm_normals)
         branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
@@ -103,13 +98,14 @@ def make_predictor(
         passes = passes_for(RAYS * branches, SMOOTH_PATHS)
         traced = [smooth_along_surface(side.multiple(settings), calm_normals, passes) for side in sides]
         if len(sides) == 1:
-            return Prediction(traced[0], hidden, response, normals=calm_normals)
-        is_masked = np.any(hidden != 0.0, axis=(0, 1))
-        sheet = raster.side(calm, calm_normals, 0.0).hidden(is_masked)
-        freed = [side.hidden(is_masked) - sheet for side in sides]
-        either = [m - np.einsum("kiyx,yxi->kyx", h, normals) for m, h in zip(traced, freed, strict=True)]
-        multiple, unseen = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
-        return Prediction(multiple, hidden + np.mean(freed, axis=0), response, unseen, calm_normals)
+            return Corrections(masked, traced[0], normals=calm_normals)
+        is_masked = np.any(masked != 0.0, axis=(0, 1))
+        sheet = raster.side(calm, calm_normals, 0.0).masked(is_masked)
+        freed = [side.masked(is_masked) - sheet for side in sides]
+        normal = np.moveaxis(normals, -1, 0)
+        either = [m - single_scattering(f, normal) for m, f in zip(traced, freed, strict=True)]
+        found, occluded = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
+        return Corrections(masked + np.mean(freed, axis=0), found, occluded, calm_normals)
 
     return predict
 
@@ -154,14 +150,14 @@ class _Side:
             tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
         except GuardError as e:
             found = str(e).split(";")[0]
-            raise GuardError(
+            raise PredictionError(
                 f"the surface of the fit is too rough or steep to trace multiple scattering from ({found}): check "
                 "background and gains, or use method = 'nearfield'"
             ) from e
         return tally.probability()[0][1].reshape(-1, *r.x.shape)
 
-    def hidden(self, is_wanted: np.ndarray) -> np.ndarray:
-        """Return the hidden vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
+    def masked(self, is_wanted: np.ndarray) -> np.ndarray:
+        """Compute the masked vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
         r, p = self.raster, self.points.take(is_wanted.ravel())
         offset = np.stack(r.instrument.sample_origin(r.x[is_wanted], r.y[is_wanted])[:2], -1)
         found, _ = masks.hidden_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)

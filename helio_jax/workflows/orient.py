@@ -25,7 +25,7 @@ from helio_jax.alignment.arrangement import MAX_PERMUTED, Candidate, group_ties,
 from helio_jax.alignment.orientation import ALL_TURNS, bin_stack, turn_stack
 from helio_jax.arrays import as_json
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.optics import Optics
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.consistency import degrees_of_freedom, misfit
 from helio_jax.inverse.linear import MIN_IMAGES
@@ -253,7 +253,7 @@ class _Trial:
 
     def __init__(self, stack: MicrographStack, flat: np.ndarray | None, settings: OrientSettings) -> None:
         self.stack, self.flat, self.settings = stack, flat, settings
-        self.geometry = SpotGeometry(stack.instrument)
+        self.optics = Optics.of(stack.instrument)
 
     def _arranged(self, candidate: Candidate) -> MicrographStack:
         stack = turn_stack(self.stack, candidate.turn, candidate.order)
@@ -266,14 +266,14 @@ class _Trial:
     def quick(self, candidate: Candidate) -> float:
         """Return the cost without masks and multiple scattering."""
         how = ReconstructSettings(method="nearfield", integrator="dct_poisson", rounds=self.settings.rounds)
-        return misfit(self._arranged(candidate), self.geometry, how)
+        return misfit(self._arranged(candidate), self.optics, how)
 
     def full(self, candidate: Candidate) -> float:
         """Return the cost with depth jumps, masks and multiple scattering; infinite for an impossible surface."""
         how = ReconstructSettings(method="nearfield", integrator="weighted", rounds=self.settings.rounds)
         stack = self._arranged(candidate)
         try:
-            return misfit(stack, self.geometry, how, make_predictor(stack, self.settings.rays))
+            return misfit(stack, self.optics, how, make_predictor(stack, self.settings.rays))
         except GuardError:  # so rough or steep that nothing can be traced from it
             return math.inf
 

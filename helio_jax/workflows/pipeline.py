@@ -21,8 +21,8 @@ from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
+from helio_jax.forward.render import Corrections
 from helio_jax.inverse.methods import reconstruct_stack
-from helio_jax.inverse.residuals import Prediction
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
@@ -283,7 +283,7 @@ def reconstruct(
     chosen = settings.changed(**_with_priors(settings, one, wanted))
     refine = chosen.refine
 
-    def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Prediction]:
+    def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Corrections]:
         about = {"multiple": refine.multiple, "border": chosen.border, "workers": workers}
         return make_predictor(one, n_rays, refine.substrate_um, **about)
 

@@ -1,0 +1,123 @@
+"""The surface as the beam sees it: one height per raster position, its slopes, and its normals.
+
+A point of height h seen at beam position (X, Y) lies at (X - h tx, Y - h ty, h), with (tx, ty) = tan t (cos phi,
+sin phi). Its tangents along X and Y give the normal n ~ (-a, -b, 1 - a tx - b ty) for the slopes a = dh/dX, b =
+dh/dY: linear in the slopes, valid wherever the beam sees the surface (n . u < 0). Works on NumPy and JAX arrays.
+Source: docs/conventions.md; own derivation, tests/unit/test_conventions.py.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from helio_jax.forward.optics import Raster
+
+MIN_FACING = 0.02
+"""Smallest -n . u / cos t that a measured normal may have; below, the slope would be beyond the grazing limit."""
+LIMITER_SLOPE = 0.1
+"""Slope e below which the limiter of `surface_of_heights` takes plain central differences."""
+_NO_EDGE = 1e-3
+"""Weight that a pixel with two cut edges would still need: its one-sided slope is then about zero."""
+
+
+class Surface(eqx.Module):
+    """Heights and slopes at the beam positions.
+
+    Attributes:
+        height: above the substrate [um].
+        slope_x: dh/dX, per um of raster.
+        slope_y: dh/dY.
+    """
+
+    height: Float[Any, "y x"]
+    slope_x: Float[Any, "y x"]
+    slope_y: Float[Any, "y x"]
+
+    def normals(self, shift: Any) -> np.ndarray:
+        """Compute the unit normals [y, x, 3] as a NumPy array.
+
+        Args:
+            shift: `Optics.beam_shift`.
+        """
+        return np.moveaxis(unit_normal(np.asarray(self.slope_x), np.asarray(self.slope_y), shift), 0, -1)
+
+
+def normal_of_slopes(a: Any, b: Any, shift: Any) -> tuple[Any, Any, Any]:
+    """Compute the unnormalised normal (-a, -b, 1 - a tx - b ty) of slopes per um of raster."""
+    return -a, -b, 1.0 - a * shift[0] - b * shift[1]
+
+
+def unit_normal(a: Any, b: Any, shift: Any) -> Any:
+    """Compute the unit normals [3, ...] of slopes per um of raster [...]."""
+    xp = a.__array_namespace__()
+    n = xp.stack(normal_of_slopes(a, b, shift))
+    return n / xp.sqrt(xp.sum(n * n, axis=0))
+
+
+def slopes_of_normal(normal: np.ndarray, shift: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the beam-frame slopes (a, b) of normals [..., 3], and where they are usable.
+
+    A noisy normal may face away from the beam, which no visible surface can: there the slope is limited to
+    `MIN_FACING` and the third output is False.
+    """
+    facing = normal[..., 2] - normal[..., 0] * shift[0] - normal[..., 1] * shift[1]
+    is_facing = facing > MIN_FACING
+    c = np.maximum(facing, MIN_FACING)
+    return -normal[..., 0] / c, -normal[..., 1] / c, is_facing
+
+
+def along(field: Any, axis: int) -> tuple[Any, Any]:
+    """Return the values [y, x] at the two ends of every edge along `axis` (0: y, 1: x)."""
+    return (field[:, :-1], field[:, 1:]) if axis == 1 else (field[:-1], field[1:])
+
+
+def around(edge: Any, axis: int) -> tuple[Any, Any]:
+    """Return for every pixel [y, x] the values of the edges before and after it along `axis`; 0 outside the raster."""
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 1)
+    return along(edge.__array_namespace__().pad(edge, pad), axis)
+
+
+def to_pixels(edge: Any, axis: int) -> Any:
+    """Sum over the two edges of every pixel along `axis`; the adjoint of summing an edge's two ends."""
+    before, after = around(edge, axis)
+    return before + after
+
+
+def one_sided(slope: Any, edge_weight: Any, axis: int) -> Any:
+    """Compute pixel slopes [y, x]: means of the edges' slopes by weight (1 joined, 0 cut), never across a jump."""
+    return to_pixels(edge_weight * slope, axis) / (to_pixels(edge_weight, axis) + _NO_EDGE)
+
+
+def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | None = None) -> Surface:
+    """Estimate the slopes of heights alone; differentiable in the heights.
+
+    Smooth surfaces get central differences (second order). Beside a depth jump the slope is that of the flatter side,
+    by a smooth limiter: the one-sided differences f, b are averaged with weights b^2 + e^2, f^2 + e^2. Beside a kink
+    the slopes are wrong within one pixel: where slopes or normals are known, make the `Surface` from them instead.
+
+    Args:
+        height: above the substrate [y, x], um.
+        raster: its beam positions.
+        edges: weights of the edges along x [y, x - 1] and y [y - 1, x], 1 joined, 0 a depth jump; default: by the
+            limiter.
+
+    Source: van Albada, van Leer and Roberts, Astron. Astrophys. 108 (1982) 76, eq. 2.
+    """
+    height = jnp.asarray(height)
+    slopes = []
+    for number, (axis, step) in enumerate(((1, raster.dx), (0, raster.dy))):
+        edge = jnp.diff(height, axis=axis) / step
+        if edges is not None:
+            slopes.append(one_sided(edge, jnp.asarray(edges[number], edge.dtype), axis))
+            continue
+        before, after = around(edge, axis)
+        n = height.shape[axis]
+        at = jnp.arange(n).reshape((-1, 1) if axis == 0 else (1, -1))
+        before, after = jnp.where(at == 0, after, before), jnp.where(at == n - 1, before, after)
+        f, b = after**2 + LIMITER_SLOPE**2, before**2 + LIMITER_SLOPE**2
+        slopes.append((after * b + before * f) / (f + b))
+    return Surface(height, *slopes)
