@@ -20,7 +20,8 @@ from helio_jax.arrays import pitch
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def in_own_precision(function: Callable[P, R]) -> Callable[P, R]:

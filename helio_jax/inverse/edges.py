@@ -1,10 +1,10 @@
 """The edges of the raster: whether two neighbouring pixels are joined smoothly, by a kink, or parted by a jump.
 
-The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the
-mean of the two slopes (trapezoid rule; `fourth_order_slopes` where the surface is smooth further on), but for a kink somewhere between
-the two positions, which makes that rule uncertain, and for a depth jump, across which it means nothing. All of it is
-decided on the current surface and then held fixed: the weights of the next least-squares solve. Works in NumPy; what
-takes `Any` also on JAX arrays.
+The surface is known by heights and slopes at the beam positions. Along an edge the height should change by the mean of
+the two slopes (trapezoid rule; `fourth_order_slopes` where the surface is smooth further on). A kink between the two
+positions makes that rule uncertain, and across a depth jump it means nothing. Kinks and jumps are found on the current
+surface and then held fixed: they are the weights of the next least-squares solve. NumPy; functions that take `Any` also
+work on JAX arrays.
 """
 
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
 
 
 def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
-    """Compute the weight of `fourth_order_slopes` in every pixel [y, x]: how smooth the surface is in both of its edges.
+    """Compute the weight of `fourth_order_slopes` in every pixel [y, x]: the smoothness of both of its edges.
 
     Beside a kink the correction errs by a 24th of it; it fades where that exceeds the least sigma of the edges.
 

@@ -19,7 +19,7 @@ STEEP = 1.0
 def find_occlusion_edges(
     signal: np.ndarray, variance: np.ndarray, surface: Surface, shift: tuple[float, float], axis: int
 ) -> np.ndarray:
-    """Find edges along an axis (0: y, 1: x) that may lie across a depth jump behind a rim (self-occlusion along the beam).
+    """Find edges along an axis (0: y, 1: x) that may be occlusion edges: depth jumps behind a rim, along the beam.
 
     The images change across them as across a wall, and the surface on either side falls steeply along the beam.
 

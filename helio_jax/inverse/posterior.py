@@ -38,7 +38,7 @@ from helio_jax.inverse.residuals import (
 )
 from helio_jax.inverse.samples import add_common_mode, on_raster
 
-MAX_PIXELS = 30_000
+MAX_PIXELS = 8_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
 
 

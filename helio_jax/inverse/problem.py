@@ -404,7 +404,7 @@ def moved_optics(optics: Optics, moves: Any) -> Optics:
 
 
 @eqx.filter_jit
-def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: jax.Array) -> jax.Array:
+def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
     """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
 
     Each aperture depends on its own polar angle and azimuth only, so that one derivative serves all detectors.
@@ -417,7 +417,7 @@ def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: jax.A
 
 
 @eqx.filter_jit
-def _form_factors(optics: Optics, moved: jax.Array, height: jax.Array, held: tuple) -> FormFactors:
+def _form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormFactors:
     """Expand the visible form factors about heights [y, x] and moves [move, detector]."""
     masked, masked_moves, masked_at = held
 

@@ -117,13 +117,13 @@ def relief_responses(
     coarse, coarse_raster = jax.tree.map(lambda f: np.asarray(f)[thin], surface), raster.thinned(stride)
     plan = plan_radiosity(coarse.height, coarse.normals(np.asarray(optics.beam_shift)), optics, coarse_raster)
     out = []
-    for weight, change in zip(weights, changes, strict=True):
+    for i, change in enumerate(changes):
         with jax.enable_x64(True):
             masked = np.asarray(_masked_change(_as_jax(surface), _as_jax(change), optics, raster))
             thinned = _as_jax(jax.tree.map(lambda f: f[thin], change))
             value, slope = _multiple_change(_as_jax(coarse), thinned, optics, coarse_raster, plan)
         own = _own_normal_change(np.asarray(value), coarse, thinned, np.asarray(optics.beam_shift))
-        out.append(Response(weight, masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
+        out.append(Response(weights[i], masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
     return tuple(out)
 
 

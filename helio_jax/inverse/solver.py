@@ -176,13 +176,13 @@ def solve(
     level_mode = jnp.sqrt(fixed.border.size) / fixed.whitening[0, 0]
 
     def decoded(variables: jax.Array) -> Unknowns:
-        fields, mixed, of_lines = split(variables)
+        (height, slope_x, slope_y), mixed, of_lines = split(variables)
         moved = jnp.append(flat, 0.0) + mixing @ mixed
         parameters = restore(moved[:-1])
         if lines.size:
             parameters = parameters.replaced(lines=lines + line_scale * of_lines)
-        height = fields[0].at[0, 0].add(moved[-1] * level_mode)
-        return Unknowns(height, *fields[1:], parameters)
+        height = height.at[0, 0].add(moved[-1] * level_mode)
+        return Unknowns(height, slope_x, slope_y, parameters)
 
     # one vector, for every array of a tree is compiled by itself
     fields = (start.height, start.slope_x, start.slope_y)

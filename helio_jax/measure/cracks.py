@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from helio_jax.arrays import as_json, line_angle_deg, pitch
+from helio_jax.arrays import as_json, pitch, line_angle_deg
 from helio_jax.errors import SceneError
 from helio_jax.measure.crack_profiles import measure_line
 from helio_jax.measure.line_paths import Path, trace_lines
@@ -185,27 +185,10 @@ def _without_duplicates(cracks: list[Crack], near: float) -> list[Crack]:
     return kept
 
 
-def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, seen: dict[str, Any]) -> Crack:
-    """Return a crack from its path [pixels] and what was measured across it."""
-    points = rec.beam_positions(seen.pop("points"))
+def _crack(path: Path, found: Found, rec: Reconstruction, stack: MicrographStack, measured: dict[str, Any]) -> Crack:
+    """Make a crack from the result of `measure_line` (points in pixels)."""
+    points = rec.beam_positions(measured.pop("points"))
     direction = line_angle_deg(points[-1] - points[0])
-    unknown: dict[str, Any] = {
-        "width_um": math.nan,
-        "width_std_um": math.nan,
-        "width_range_um": (math.nan, math.nan),
-        "missing_um": {},
-        "missing_std_um": {},
-        "change": {},
-        "change_std": {},
-        "kink_deg": math.nan,
-        "kink_std_deg": math.nan,
-        "dark_in": (),
-        "bright_in": (),
-        "depth_um": math.nan,
-        "depth_std_um": math.nan,
-        "depth_at_least_um": 0.0,
-    }
-    score = path.score
     return Crack(
         number=0,
         start=(float(points[0, 0]), float(points[0, 1])),
