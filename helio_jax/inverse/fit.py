@@ -93,18 +93,16 @@ class Fit:
         return (total / np.maximum(np.sum(self.weight**2, axis=(1, 2)), 1e-300)).tolist()
 
 
-def _posterior(problem: FitProblem, state: FitState) -> Posterior | None:
-    """Compute the posterior at the fit, on a thinned raster where the full one is too large."""
+def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Posterior:
+    """Compute the posterior at a state, on a thinned raster where the full one is too large."""
     s, shape = problem.settings, problem.signal.shape[1:]
-    if s.samples == 0:
-        return None
     stride = thinning(shape, MAX_PIXELS)
     length = s.error_reach * float(np.ptp(state.surface.height))
     part = problem.thinned(stride) if stride > 1 else problem
     there = state.thinned(part, stride) if stride > 1 else state
     unknowns, fixed = freeze(part, there, s.robust_limits[-1], s.jump_limits[-1])
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
-    found = sample_posterior(linearise(unknowns, fixed), s.samples, error=error)
+    found = sample_posterior(linearise(unknowns, fixed), n_samples, error=error)
     planes = part.priors.tilt * part.position
     found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
@@ -179,9 +177,11 @@ def fit_heights(
             state = subtract_bias(problem, state, *noise_bias(problem, state, s.bias_pairs))
         except KeyboardInterrupt:
             is_interrupted = True
-    posterior = None if is_interrupted else _posterior(problem, state)
-    if posterior is not None:
-        posterior = posterior.with_common_mode(remaining_error(changes, extrapolation) * last_change)
+    posterior = None
+    if s.samples and not is_interrupted:
+        posterior = posterior_at(problem, state, s.samples).with_common_mode(
+            remaining_error(changes, extrapolation) * last_change
+        )
     return _finish(problem, state, changes, is_interrupted, posterior, found.status)
 
 

@@ -25,7 +25,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface, one_sided, to_pixels
-from helio_jax.instrument import Instrument
+from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.edges import AxisEdges, find_edges, smoothness_weight
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.residuals import (
@@ -65,7 +65,8 @@ class FitProblem:
 
     Attributes:
         signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
-        instrument: as stated.
+        optics: as stated.
+        uncertainty: prior standard deviations of the geometry.
         raster: beam positions.
         settings: of the fit.
         order: in which the pixels were recorded.
@@ -76,12 +77,14 @@ class FitProblem:
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
         median_signal: of every detector, 1 without data [detector].
         slope_noise: typical standard deviation of the slopes of one pixel.
+        instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
 
     signal: np.ndarray
     variance: np.ndarray
-    instrument: Instrument
+    optics: Optics
+    uncertainty: Uncertainty
     raster: Raster
     settings: RefineSettings
     order: ScanOrder
@@ -93,6 +96,7 @@ class FitProblem:
     drift_modes: np.ndarray
     median_signal: np.ndarray
     slope_noise: float
+    instrument: Instrument | None = None
     stride: int = 1
 
     @classmethod
@@ -100,14 +104,20 @@ class FitProblem:
         cls,
         signal: np.ndarray,
         variance: np.ndarray,
-        instrument: Instrument,
+        instrument: Instrument | Optics,
         raster: Raster,
         start: Surface,
         settings: ReconstructSettings,
         region: np.ndarray | None = None,
         order: ScanOrder = ScanOrder(),
+        uncertainty: Uncertainty | None = None,
     ) -> "FitProblem":
-        """Pose the problem; `start` fixes the level that is held, where the settings ask for it."""
+        """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
+
+        `uncertainty` replaces the instrument's; optics alone are known exactly by default.
+        """
+        given, optics = (None, instrument) if isinstance(instrument, Optics) else (instrument, Optics.of(instrument))
+        stated = uncertainty or (Uncertainty() if given is None else given.uncertainty)
         s, shape = settings.refine, signal.shape[1:]
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
@@ -116,20 +126,15 @@ class FitProblem:
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
-            signal, variance, instrument, raster, s, order, _border_weight(shape, settings), is_held,
-            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median, noise,
+            signal, variance, optics, stated, raster, s, order, _border_weight(shape, settings), is_held,
+            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median, noise, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
     @property
-    def optics(self) -> Optics:
-        """The instrument's optics as stated."""
-        return Optics.of(self.instrument)
-
-    @property
-    def shift(self) -> tuple[float, float]:
-        """Beam shift."""
-        return self.instrument.beam_shift
+    def shift(self) -> np.ndarray:
+        """Beam shift [2]."""
+        return np.asarray(self.optics.beam_shift)
 
     @property
     def is_observed(self) -> np.ndarray:
@@ -161,7 +166,7 @@ class FitProblem:
     @property
     def priors(self) -> Priors:
         """Prior standard deviations of the parameters; a held level stands for the distance."""
-        s, stated, median = self.settings, self.instrument.uncertainty, self.median_signal
+        s, stated, median = self.settings, self.uncertainty, self.median_signal
         held = s.level_std_um if self.is_level_held else None
         numbers = {
             "gain": s.gain_std,
@@ -179,7 +184,7 @@ class FitProblem:
 
     def prior_means(self) -> Parameters:
         """Make the parameters at their prior means, all 0; those that are known have no entries."""
-        s, stated = self.settings, self.instrument.uncertainty
+        s, stated = self.settings, self.uncertainty
         k, n = self.signal.shape[0], s.albedo_modes if s.albedo_std else 0
         lines = self.signal.shape[1 + self.order.slow_axis] if s.line_std else 0
         is_aimed = s.geometry and (stated.polar_deg or stated.azimuth_deg)
@@ -211,6 +216,7 @@ class FitProblem:
 
     def fitted_instrument(self, parameters: Parameters) -> Instrument:
         """Return the instrument with the geometry that parameters stand for."""
+        assert self.instrument is not None  # of a measurement
         moves = self.moves(parameters)
         return self.instrument.moved(moves[1:].T, float(moves[0, 0])) if len(moves) else self.instrument
 
@@ -386,15 +392,20 @@ def set_corrections(problem: FitProblem, state: FitState, corrections: Correctio
 
 def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
     """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
-    surface = state.surface
-    instrument = () if not len(problem.moves(state.parameters)) else (problem.fitted_instrument(state.parameters),)
+    surface, is_known = state.surface, not len(problem.moves(state.parameters))
+    instrument = () if is_known else (problem.fitted_instrument(state.parameters),)
     corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
-    state = set_corrections(problem, state, corrections, surface)
+    return with_responses(problem, set_corrections(problem, state, corrections, surface))
+
+
+def with_responses(problem: FitProblem, state: FitState) -> FitState:
+    """Compute how the corrections follow the levels of plateaus and, with a free border, changes of all heights."""
+    surface, raster = state.held.surface, problem.raster
     optics = moved_optics(problem.optics, problem.moves(state.parameters))
-    responses = region_responses(surface, optics, problem.raster, problem.region)
+    responses = region_responses(surface, optics, raster, problem.region)
     if problem.is_level_free or problem.is_level_held:
-        distance = problem.instrument.sample_distance
-        responses += relief_responses(surface, optics, problem.raster, problem.has_enough_images, distance)
+        distance = float(problem.optics.sample_distance)
+        responses += relief_responses(surface, optics, raster, problem.has_enough_images, distance)
     return replace(state, held=replace(state.held, responses=responses))
 
 
@@ -519,7 +530,7 @@ def freeze(
     with jax.enable_x64(True):
         factors = _form_factors(problem.optics, moved, height, (held.masked, held.moves, held.moved))
         largest = _NOISY * noise * steepness
-        bias = _noise_bias(slope_x, slope_y, factors.terms[0], np.array(problem.shift), inverse_sigma, largest)
+        bias = _noise_bias(slope_x, slope_y, factors.terms[0], problem.shift, inverse_sigma, largest)
     occluded_std = held.corrections.occluded
     fixed = FixedTerms(
         data=problem.data,
@@ -539,7 +550,7 @@ def freeze(
         slope_scale_x=scale_x,
         slope_scale_y=scale_y,
         priors=priors,
-        beam_shift=np.array(problem.shift),
+        beam_shift=problem.shift,
         dx=dx,
         dy=dy,
         slow_axis=problem.order.slow_axis,
