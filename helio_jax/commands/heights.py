@@ -171,12 +171,12 @@ def _print_instrument(found: dict[str, Any]) -> None:
     for name, (value, std, prior, unit) in found.get("values", {}).items():
         if unit in ("um", "deg"):
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} from the stated value (prior {prior:g})")
-    if found.get("widening", 1.0) > 1.0:
+    if found.get("inflation", 1.0) > 1.0:
         print(
             "  the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars "
-            f"are inflated by {found['widening']:.1f} (plus up to {found.get('bent_um', 0.0):.0f} um for the resulting "
+            f"are inflated by {found['inflation']:.1f} (plus up to {found.get('common_mode_um', 0.0):.0f} um for the resulting "
             "height error)"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())
-        print(f"  weakly determined, posterior / prior standard deviation {weak['left']:.0%}: {terms}")
+        print(f"  weakly determined, posterior / prior standard deviation {weak['share']:.0%}: {terms}")
