@@ -25,12 +25,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, update, write  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.parts import Parts  # noqa: E402
 from helio_jax.trace.job import Job  # noqa: E402
 from helio_jax.trace.run import n_cpus  # noqa: E402
-from helio_jax.trace.scan import Crew  # noqa: E402
-from helio_jax.workflows.checkpoint import Keeper  # noqa: E402
+from helio_jax.trace.scan import Executor  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
+from helio_jax.workflows.checkpoint import CheckpointedRun  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 
 MIB = 1024**2
@@ -61,12 +61,12 @@ def trace_child(pixels: int, points: int, rays: int, folder: str) -> None:
     """Trace and write one raster; print sizes in MiB. Runs in a process of its own."""
     scene = rough_scene(pixels, points, rays, Path(folder))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    keeper = Keeper(Parts(Path(folder) / f"out_{pixels}.h5"), {}, Crew())
+    checkpointed_run = CheckpointedRun(Parts(Path(folder) / f"out_{pixels}.h5"), {}, Executor())
     start = time.perf_counter()
-    stack = keeper.trace(scene, scene.trace)
+    stack = checkpointed_run.trace(scene, scene.trace)
     assert stack is not None
     traced = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    keeper.parts.finish(lambda path: pipeline.write(stack, path))
+    checkpointed_run.parts.finish(lambda path: pipeline.write(stack, path))
     seconds = time.perf_counter() - start
     written = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     arrays = sum(getattr(stack, name).nbytes for name in ARRAYS) / MIB
@@ -118,14 +118,14 @@ def cost_rows(scene: SceneFile, repeats: int) -> list[Row]:
     plain, kept = [], []
     with tempfile.TemporaryDirectory(prefix="helio-scale-") as folder:
         for _ in range(repeats):
-            keeper = Keeper(Parts(Path(folder) / "out.h5"), {}, Crew(1))
+            checkpointed_run = CheckpointedRun(Parts(Path(folder) / "out.h5"), {}, Executor(1))
             start = time.perf_counter()
             pipeline.simulate(scene, workers=1)
             between = time.perf_counter()
-            keeper.trace(scene, scene.trace)
+            checkpointed_run.trace(scene, scene.trace)
             plain.append(between - start)
             kept.append(time.perf_counter() - between)
-            keeper.parts.remove()
+            checkpointed_run.parts.remove()
     text = f"{min(kept) / min(plain):.3f} ({min(kept):.2f} over {min(plain):.2f} s), {n_units} units"
     return [
         row("cost", "keeping finished units: time with over without", text, "<= 1.03", None, plain=plain, kept=kept)

@@ -13,7 +13,7 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.trace import run, units
 from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
-from helio_jax.trace.scan import Crew
+from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 
@@ -47,7 +47,7 @@ def run_logged(output: str, log: str, workers: int) -> None:
         return traced(experiment, job, start, stop)
 
     units._trace = logged
-    options = pipeline.SimulateOptions(crew=Crew(workers))
+    options = pipeline.SimulateOptions(executor=Executor(workers))
     pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
 
 

@@ -53,12 +53,12 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
-    from helio_jax.workflows.pipeline import Crew
+    from helio_jax.workflows.pipeline import Executor
     from helio_jax.workflows.pipeline import run as run_scene
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
-    crew = Crew(workers, processes, scheduler)
-    result = run_scene(scene, output, overrides=overrides, stage=Bar, crew=crew, restart=restart, say=say)
+    executor = Executor(workers, processes, scheduler)
+    result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
         return
@@ -86,11 +86,11 @@ def simulate(
     restart: Restart = False,
 ) -> None:
     """Trace the micrographs of a scene and write them to an HDF5 file; if interrupted, give it again to go on."""
-    from helio_jax.workflows.pipeline import Crew, SimulateOptions, simulate_file
+    from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
     with Bar("tracing") as bar:
-        options = SimulateOptions(noise, Crew(workers, processes, scheduler), shard, restart, bar, say)
+        options = SimulateOptions(noise, Executor(workers, processes, scheduler), shard, restart, bar, say)
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is not None:
         for one in stack.stacks:
@@ -165,10 +165,10 @@ def study(
     scheduler: Scheduler = None,
 ) -> None:
     """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
-    from helio_jax.workflows.pipeline import Crew, SimulateOptions
+    from helio_jax.workflows.pipeline import Executor, SimulateOptions
     from helio_jax.workflows.study import run_study
 
-    options = SimulateOptions(crew=Crew(workers, processes, scheduler), shard=shard, say=say)
+    options = SimulateOptions(executor=Executor(workers, processes, scheduler), shard=shard, say=say)
     print(run_study(file, output, resume=go_on, options=options))
 
 

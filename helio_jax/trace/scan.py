@@ -1,6 +1,6 @@
-"""Trace a whole scan: run its units on threads, processes or a cluster, and put their patches together.
+"""Trace a whole scan: run its units on threads, processes or a cluster, and put their results together.
 
-`Crew` says who runs the units; all run the same code, so the counts do not depend on it. Nothing is stored here:
+`Executor` says who runs the units; all run the same code, so the counts do not depend on it. Nothing is stored here:
 `checkpoint` keeps finished units on disk.
 """
 
@@ -9,7 +9,8 @@ import os
 import signal
 import threading
 from collections.abc import Generator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, wait
+from concurrent import futures
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,7 +30,7 @@ from helio_jax.trace.job import Job, Unit
 from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES, Estimate
-from helio_jax.trace.units import Patch, experiment_of, join_pieces, tasks, trace_unit
+from helio_jax.trace.units import UnitResult, experiment_of, join_pieces, tasks, trace_unit
 
 MAX_DEATHS = 3
 """Times that worker processes may die without any unit finished in between."""
@@ -37,12 +38,12 @@ MAX_SENT = 1024
 """Units sent to a cluster at a time."""
 CONNECT_SECONDS = 10
 """How long a scheduler may take to answer [s]."""
-Results = Generator[tuple[Unit, Patch], None, None]
-"""Units with their patches, as they finish; close it to stop the work."""
+Results = Generator[tuple[Unit, UnitResult], None, None]
+"""Units with their results, as they finish; close it to stop the work."""
 
 
 @dataclass(frozen=True)
-class Crew:
+class Executor:
     """Who runs the units of a job: threads of this process unless told otherwise.
 
     Attributes:
@@ -57,7 +58,7 @@ class Crew:
     scheduler: str | None = None
 
     def run(self, job: Job, units: list[Unit], body: Body, progress: Progress | None = None) -> Results:
-        """Yield every unit with its patch as it finishes.
+        """Yield every unit with its result as it finishes.
 
         Raises:
             StoppedRun: workers died or were lost again and again.
@@ -77,11 +78,11 @@ def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | 
     """Report every finished unit."""
     done = n_pixels - n_todo
     with closing(results):
-        for unit, patch in results:
+        for unit, unit_result in results:
             done += unit.stop - unit.start
             if progress:
                 progress(done, n_pixels)
-            yield unit, patch
+            yield unit, unit_result
 
 
 def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None) -> Results:
@@ -115,10 +116,10 @@ def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
         pool = ProcessPoolExecutor(min(workers, n_before), get_context("spawn"), _begin_worker)
         try:
             with pool, closing(_submit(pool, workers + 1, job, list(left.values()))) as results:
-                for unit, patch in results:
+                for unit, unit_result in results:
                     del left[unit.number]
-                    yield unit, patch
-        except BrokenExecutor:
+                    yield unit, unit_result
+        except futures.BrokenExecutor:
             n_deaths = n_deaths + 1 if len(left) == n_before else 1
             if n_deaths == MAX_DEATHS:
                 raise StoppedRun(
@@ -156,22 +157,22 @@ def _on_cluster(address: str, job: Job, units: list[Unit]) -> Results:
         try:
             with closing(_submit(client.get_executor(), MAX_SENT, job, units)) as results:
                 yield from results
-        except (KilledWorker, CancelledError, OSError) as e:
+        except (KilledWorker, futures.CancelledError, OSError) as e:
             raise StoppedRun(
                 f"the cluster lost the work ({type(e).__name__}: {e}): look at its workers' logs"
             ) from None
 
 
-def _submit(executor: Executor, n_ahead: int, job: Job, units: list[Unit]) -> Results:
-    """Yield units with their patches as an executor finishes them; at most `n_ahead` are with it."""
+def _submit(pool: futures.Executor, n_ahead: int, job: Job, units: list[Unit]) -> Results:
+    """Yield units with their results as a pool finishes them; at most `n_ahead` are submitted at a time."""
     todo, waiting = iter(units), {}
     try:
         while True:
             for unit in islice(todo, n_ahead - len(waiting)):
-                waiting[executor.submit(trace_unit, job, unit)] = unit
+                waiting[pool.submit(trace_unit, job, unit)] = unit
             if not waiting:
                 return
-            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            done, _ = futures.wait(waiting, return_when=futures.FIRST_COMPLETED)
             for future in sorted(done, key=lambda f: f.exception() is not None):  # keep what was finished
                 yield waiting[future], future.result()
                 del waiting[future]
@@ -180,8 +181,8 @@ def _submit(executor: Executor, n_ahead: int, job: Job, units: list[Unit]) -> Re
             future.cancel()
 
 
-class Canvas:
-    """The micrographs of a job, filled patch by patch."""
+class ScanResult:
+    """The micrographs of a job, filled unit by unit."""
 
     def __init__(self, job: Job) -> None:
         n, n_detectors = job.n_pixels, len(job.scene.detector)
@@ -201,8 +202,8 @@ class Canvas:
             job.n_pixels * math.prod(paths_of(effusive_settings(job.settings, effusive))) if effusive else 0
         )
 
-    def put(self, unit: Unit, patch: Patch) -> None:
-        """Put the patch of a unit where it belongs.
+    def put(self, unit: Unit, unit_result: UnitResult) -> None:
+        """Store the result of a unit at the pixels of the unit.
 
         Raises:
             GuardError: more rays were lost so far than the whole scan may lose.
@@ -210,15 +211,15 @@ class Canvas:
         part = slice(unit.start, unit.stop)
         for name in ("by_order", "total", "variance", "plate", "effuse", "masked", "shadowed"):
             if getattr(self, name).size:
-                getattr(self, name)[..., part] = getattr(patch, name)
-        self.fates += patch.fates
-        self.effuse_fates += patch.effuse_fates
-        self.cpus.add(patch.cpu)
+                getattr(self, name)[..., part] = getattr(unit_result, name)
+        self.fates += unit_result.fates
+        self.effuse_fates += unit_result.effuse_fates
+        self.cpus.add(unit_result.cpu)
         self.missing.remove(unit.number)
         check_rays(self.fates, 0, max(self.n_launched, int(self.fates.sum())))
         check_rays(self.effuse_fates, 0, self.n_effused)
 
-    def stack(self) -> Micrographs:
+    def micrographs(self) -> Micrographs:
         """Return the micrographs, a set of stacks where there are several views. All units must have been put.
 
         The estimate of a nearly dark pixel may fall below zero by its own error; it is then set to 0, and the number
@@ -313,8 +314,8 @@ def trace_scene(
     """
     body = scene.build_body() if body is None else body
     job = Job.of(scene, settings, body)
-    canvas = Canvas(job)
-    with closing(Crew(settings.workers).run(job, job.units(), body, progress)) as results:
-        for unit, patch in results:
-            canvas.put(unit, patch)
-    return canvas.stack()
+    scan_result = ScanResult(job)
+    with closing(Executor(settings.workers).run(job, job.units(), body, progress)) as results:
+        for unit, unit_result in results:
+            scan_result.put(unit, unit_result)
+    return scan_result.micrographs()

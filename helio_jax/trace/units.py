@@ -1,8 +1,8 @@
 """Units of work: runs of neighbouring pixels, each traced for itself.
 
-A unit takes a `Job` and the range of its pixels. It gives a `Patch`: counts by order, totals with their variance, maps
-of cause, and what became of the rays. It is a pure function of both: threads, processes, other machines and later runs
-give the same bits on CPUs of one instruction set, which every patch names. Who runs units: `scan`.
+`trace_unit` computes a `UnitResult` from a `Job` and a range of pixels. It is a pure function of both: threads,
+processes, other machines and later runs give the same bits on CPUs of one instruction set, which every result names.
+`scan` runs the units.
 """
 
 import functools
@@ -27,7 +27,7 @@ from helio_jax.trace.transport import trace_block
 
 
 @dataclass(frozen=True)
-class Patch:
+class UnitResult:
     """What a unit gives; whole numbers for `analog`, else per beam ray.
 
     Attributes:
@@ -58,7 +58,7 @@ class Patch:
         return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], job: Job, unit: Unit) -> "Patch":
+    def from_arrays(cls, arrays: dict[str, np.ndarray], job: Job, unit: Unit) -> "UnitResult":
         """Undo `arrays`.
 
         Raises:
@@ -116,7 +116,7 @@ class _Effuse:
     estimate: Estimate
 
 
-def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
+def join_pieces(experiment: Experiment, pieces: list[Any]) -> UnitResult:
     """Put the results of a unit's `tasks` together, which must be in their order.
 
     Raises:
@@ -133,12 +133,12 @@ def join_pieces(experiment: Experiment, pieces: list[Any]) -> Patch:
     counted = effuse.total_mean if experiment.is_expected else effuse.hits.sum(0).astype(float)
     rest = plate[:, kept], counted, effuse_fates, fates, masked, shadowed, instruction_set()
     if experiment.is_expected:
-        return Patch(e.mean, e.total_mean, e.total_variance, *rest)
+        return UnitResult(e.mean, e.total_mean, e.total_variance, *rest)
     hits = e.hits.astype(float)
-    return Patch(hits, hits.sum(0), hits.sum(0), *rest)
+    return UnitResult(hits, hits.sum(0), hits.sum(0), *rest)
 
 
-def trace_unit(job: Job, unit: Unit) -> Patch:
+def trace_unit(job: Job, unit: Unit) -> UnitResult:
     """Trace a unit from its description alone; the surface is built once per process.
 
     Raises:

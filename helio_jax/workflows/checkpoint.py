@@ -23,11 +23,11 @@ from helio_jax.micrograph import Micrographs
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.job import Job, Unit, differences
 from helio_jax.trace.run import Progress
-from helio_jax.trace.scan import Canvas, Crew
+from helio_jax.trace.scan import Executor, ScanResult
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.units import Patch
+from helio_jax.trace.units import UnitResult
 
-FORMAT = 1
+FORMAT = 2
 """Version of the manifest."""
 
 
@@ -53,13 +53,13 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Keeper:
+class CheckpointedRun:
     """Traces a scene into a file's parts.
 
     Attributes:
         parts: where finished units are kept.
         command: what `helio resume` needs to start this again (JSON-compatible).
-        crew: who runs the units.
+        executor: who runs the units.
         shard: run this share only; None: all units.
         restart: discard what an earlier run left.
         say: called with messages.
@@ -67,7 +67,7 @@ class Keeper:
 
     parts: Parts
     command: dict[str, Any]
-    crew: Crew
+    executor: Executor
     shard: Shard | None = None
     restart: bool = False
     say: Callable[[str], None] = lambda text: None
@@ -82,17 +82,17 @@ class Keeper:
         """
         body = scene.build_body()
         job = Job.of(scene, settings, body)
-        units, canvas = job.units(), Canvas(job)
+        units, scan_result = job.units(), ScanResult(job)
         self._begin(job, len(units))
         try:
             with _sigterm_raises():
-                todo = list(self._not_loaded(job, self._share(units), canvas))
-                with closing(self.crew.run(job, todo, body, progress)) as results:
-                    for unit, patch in results:
+                todo = list(self._not_loaded(job, self._share(units), scan_result))
+                with closing(self.executor.run(job, todo, body, progress)) as results:
+                    for unit, unit_result in results:
                         if self.parts.exist:
-                            self.parts.save(unit.number, patch.arrays() | {"job": _label(job, unit)})
-                        canvas.put(unit, patch)
-                return self._complete(job, units, canvas)
+                            self.parts.save(unit.number, unit_result.arrays() | {"job": _label(job, unit)})
+                        scan_result.put(unit, unit_result)
+                return self._complete(job, units, scan_result)
         except (KeyboardInterrupt, StoppedRun) as e:
             raise self._stopped(e, units) from None
         except GuardError:
@@ -129,12 +129,12 @@ class Keeper:
     def _share(self, units: list[Unit]) -> list[Unit]:
         return units if self.shard is None else units[self.shard.number - 1 :: self.shard.of]
 
-    def _not_loaded(self, job: Job, units: list[Unit], canvas: Canvas) -> Iterator[Unit]:
-        """Put what is kept on the canvas; yield the units that are missing or damaged."""
+    def _not_loaded(self, job: Job, units: list[Unit], scan_result: ScanResult) -> Iterator[Unit]:
+        """Load stored results into `scan_result`; yield the units that are missing or damaged."""
         n_loaded = 0
         for unit in units:
             try:
-                canvas.put(unit, self._load(job, unit))
+                scan_result.put(unit, self._load(job, unit))
                 n_loaded += 1
             except InputFileError as e:
                 if self.parts.has(unit.number):
@@ -143,17 +143,17 @@ class Keeper:
         if n_loaded:
             self.say(f"going on: {n_loaded} of {len(units)} units were finished")
 
-    def _load(self, job: Job, unit: Unit) -> Patch:
-        """Return the kept patch of a unit."""
+    def _load(self, job: Job, unit: Unit) -> UnitResult:
+        """Load the stored result of a unit."""
         arrays = self.parts.load(unit.number)
         try:
             if str(arrays.pop("job", None)) != str(_label(job, unit)):
                 raise ValueError("it belongs to another run")
-            return Patch.from_arrays(arrays, job, unit)
+            return UnitResult.from_arrays(arrays, job, unit)
         except ValueError as e:
             raise InputFileError(f"{self.parts.path(unit.number)} is damaged ({e})") from None
 
-    def _complete(self, job: Job, units: list[Unit], canvas: Canvas) -> Micrographs | None:
+    def _complete(self, job: Job, units: list[Unit], scan_result: ScanResult) -> Micrographs | None:
         """Return the micrographs, once, when all shards are finished."""
         if self.shard is not None:
             n_there = sum(self.parts.has(unit.number) for unit in units)
@@ -165,9 +165,9 @@ class Keeper:
                 self.say(f"{mine}, as are all others; another process is writing {self.parts.output}")
                 return None
             for unit in units:
-                if unit.number in canvas.missing:
-                    canvas.put(unit, self._load(job, unit))
-        return canvas.stack()
+                if unit.number in scan_result.missing:
+                    scan_result.put(unit, self._load(job, unit))
+        return scan_result.micrographs()
 
     def _stopped(self, e: BaseException, units: list[Unit]) -> Exception:
         """Return the error that says what is kept and how to go on."""

@@ -27,15 +27,15 @@ from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, evaluate_height
-from helio_jax.trace.scan import Crew, trace_scene
+from helio_jax.trace.scan import Executor, trace_scene
 from helio_jax.workflows.calibrate_rotated import calibrate_turned, flat_signal
-from helio_jax.workflows.checkpoint import Keeper, Shard, is_finished
+from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
 from helio_jax.workflows.truth import true_height
 
-DEFAULT_CREW = Crew()
+DEFAULT_EXECUTOR = Executor()
 """Threads of this process, one per CPU."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
@@ -76,7 +76,7 @@ class SimulateOptions:
 
     Attributes:
         noise: add the scene's counting noise and background, if its table [noise] is enabled.
-        crew: who runs the units of work.
+        executor: who runs the units of work.
         shard: "i/N": run the i-th of N shares only; who finishes last writes the file.
         restart: discard what an unfinished run left.
         progress: called with (pixels done, pixels in all).
@@ -84,7 +84,7 @@ class SimulateOptions:
     """
 
     noise: bool = False
-    crew: Crew = DEFAULT_CREW
+    executor: Executor = DEFAULT_EXECUTOR
     shard: str | None = None
     restart: bool = False
     progress: Callable[[int, int], None] | None = None
@@ -128,10 +128,10 @@ def simulate_file(
         "scene": str(Path(scene_path).resolve()),
         "overrides": overrides,
         "noise": o.noise,
-        "crew": asdict(o.crew),
+        "executor": asdict(o.executor),
     }
-    keeper = Keeper(parts, command, o.crew, shard, o.restart, o.say)
-    stack = keeper.trace(scene, scene.trace, o.progress)
+    checkpointed_run = CheckpointedRun(parts, command, o.executor, shard, o.restart, o.say)
+    stack = checkpointed_run.trace(scene, scene.trace, o.progress)
     if stack is None:
         return None
     stack = with_provenance(record(scene, stack) if o.noise else stack, scene, scene_path)
@@ -156,16 +156,18 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
         raise ResumeError(f"there is no unfinished run of {output}: {parts.folder} does not exist; start it anew")
     try:
         c = parts.manifest()["command"]
-        scene, crew = Path(c["scene"]), Crew(**c["crew"])
+        scene, executor = Path(c["scene"]), Executor(**c["executor"])
         is_run, overrides, noise = c["verb"] == "run", dict(c["overrides"]), bool(c["noise"])
     except (KeyError, TypeError, ValueError) as e:
         raise ResumeError(f"{parts.folder}/manifest.json is damaged ({e!r}): remove the folder, start anew") from None
     if not scene.is_file():
         raise ResumeError(f"the scene {scene} of {parts.folder} is gone: put it back, or remove the folder")
     if is_run:
-        return list(run(scene, output.parent, overrides=overrides, stage=stage, crew=crew, say=say).files.values())
+        return list(
+            run(scene, output.parent, overrides=overrides, stage=stage, executor=executor, say=say).files.values()
+        )
     with stage("tracing") as progress:
-        options = SimulateOptions(noise=noise, crew=crew, progress=progress, say=say)
+        options = SimulateOptions(noise=noise, executor=executor, progress=progress, say=say)
         simulate_file(scene, output, overrides=overrides, options=options)
     return [output]
 
@@ -344,7 +346,7 @@ def run(
     *,
     overrides: dict[str, Any] | None = None,
     stage: Stage = _silent,
-    crew: Crew = DEFAULT_CREW,
+    executor: Executor = DEFAULT_EXECUTOR,
     restart: bool = False,
     report: bool = True,
     say: Callable[[str], None] = lambda text: None,
@@ -358,7 +360,7 @@ def run(
         folder: where the files go; default helio-out/NAME.
         overrides: settings that win over the scene, dotted keys.
         stage: called with the name of each stage; a context manager that yields its progress callback.
-        crew: who traces.
+        executor: who traces.
         restart: discard what an unfinished run left in the folder.
         report: write the HTML report and the PNG panel, too.
         say: called with messages.
@@ -380,11 +382,11 @@ def run(
     files = {label: out / name for label, name in names.items()}
     make_folder(out)
     with stage("simulating micrographs") as progress:
-        options = SimulateOptions(noise=True, crew=crew, restart=restart, progress=progress, say=say)
+        options = SimulateOptions(noise=True, executor=executor, restart=restart, progress=progress, say=say)
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
     assert isinstance(stack, MicrographStack)  # no shards here, and one view
     with stage("reconstructing heights") as progress:
-        rec = reconstruct(stack, settings=scene.reconstruct, report=progress, workers=crew.workers)
+        rec = reconstruct(stack, settings=scene.reconstruct, report=progress, workers=executor.workers)
     write(rec, files["height map"])
     with stage("scoring and reporting"):
         truth = true_height(scene, rec)

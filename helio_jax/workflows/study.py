@@ -283,7 +283,7 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
     row: dict[str, Any] = {"point": point.number, **point.values, "status": "done", "problem": ""}
     try:
         if study.reconstruct:
-            result = pipeline.run(scene, point.folder, crew=options.crew, say=options.say, report=study.report)
+            result = pipeline.run(scene, point.folder, executor=options.executor, say=options.say, report=study.report)
             row |= {"method": result.method, **result.scores.as_dict()}
         else:
             stack = pipeline.simulate_file(scene, point.folder / "micrographs.h5", options=options)

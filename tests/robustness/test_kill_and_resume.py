@@ -14,7 +14,7 @@ from scale import N_UNITS, SCENE, SMALL, assert_same_bits, run_logged
 import helio_jax as hx
 from helio_jax.errors import InputFileError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.formats.parts import Parts
-from helio_jax.trace.scan import Crew
+from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
 
 KILLS = 20
@@ -25,7 +25,7 @@ UNIT_PIXELS = 360 // N_UNITS
 def whole(tmp_path_factory):
     """The scene simulated in one go, and how long tracing takes [s]."""
     output = tmp_path_factory.mktemp("whole") / "out.h5"
-    options = pipeline.SimulateOptions(crew=Crew(1))
+    options = pipeline.SimulateOptions(executor=Executor(1))
     pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)  # compiles
     start = time.perf_counter()
     pipeline.simulate(hx.load_scene(SCENE, SMALL), workers=1)
@@ -49,7 +49,7 @@ def stop_after(output, n_units: int, overrides=SMALL, error: type[BaseException]
         if sum(parts.has(i) for i in range(N_UNITS)) >= n_units:
             raise error
 
-    options = pipeline.SimulateOptions(crew=Crew(1), progress=progress)
+    options = pipeline.SimulateOptions(executor=Executor(1), progress=progress)
     with pytest.raises(InterruptedRun, match=r"helio resume .*out\.h5"):
         pipeline.simulate_file(SCENE, output, overrides=overrides, options=options)
     assert not output.exists()
@@ -210,7 +210,7 @@ def test_shards_make_the_same_file(whole, tmp_path):
     """Three shards in any order, one of them twice: the last one writes. Catches units that two or no shards take."""
     output, said = tmp_path / "out.h5", []
     for shard in ("3/3", "1/3", "1/3", "2/3"):
-        options = pipeline.SimulateOptions(crew=Crew(1), shard=shard, say=said.append)
+        options = pipeline.SimulateOptions(executor=Executor(1), shard=shard, say=said.append)
         assert not output.exists()
         pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert_same_bits(hx.read(output), whole[0])
@@ -233,7 +233,7 @@ def test_killed_process_is_replaced(whole, tmp_path):
             victims.append(workers[0].pid)
             workers[0].kill()
 
-    options = pipeline.SimulateOptions(crew=Crew(2, processes=True), progress=progress)
+    options = pipeline.SimulateOptions(executor=Executor(2, processes=True), progress=progress)
     pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert victims
     assert_same_bits(hx.read(output), whole[0])
@@ -245,7 +245,7 @@ def test_processes_that_always_die_stop_the_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(scan, "_begin_worker", os._exit)
     monkeypatch.setattr(scan.ProcessPoolExecutor, "__init__", _with_arguments(scan.ProcessPoolExecutor.__init__))
-    options = pipeline.SimulateOptions(crew=Crew(1, processes=True))
+    options = pipeline.SimulateOptions(executor=Executor(1, processes=True))
     with pytest.raises(StoppedRun, match="died 3 times") as caught:
         pipeline.simulate_file(SCENE, tmp_path / "out.h5", overrides=SMALL, options=options)
     assert caught.value.exit_code == 75 and list(tmp_path.iterdir()) == []
@@ -272,7 +272,7 @@ def test_dask_cluster_with_a_killed_worker(whole, tmp_path):
                 victims.append(next(iter(cluster.workers.values())).pid)
                 os.kill(victims[0], signal.SIGKILL)
 
-        options = pipeline.SimulateOptions(crew=Crew(scheduler=cluster.scheduler_address), progress=progress)
+        options = pipeline.SimulateOptions(executor=Executor(scheduler=cluster.scheduler_address), progress=progress)
         pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert victims
     assert_same_bits(hx.read(output), whole[0])
@@ -287,7 +287,7 @@ def test_sigterm_keeps_what_is_finished(tmp_path):
         if n_kept(parts) == 3:
             signal.raise_signal(signal.SIGTERM)
 
-    options = pipeline.SimulateOptions(crew=Crew(1), progress=progress)
+    options = pipeline.SimulateOptions(executor=Executor(1), progress=progress)
     with pytest.raises(StoppedRun, match="stopped by SIGTERM; 3 of 12 units are kept") as caught:
         pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert caught.value.exit_code == 75 and n_kept(parts) == 3
@@ -303,8 +303,8 @@ def test_wrong_shard_and_scheduler(tmp_path, monkeypatch):
     cases = (
         (pipeline.SimulateOptions(shard="3/2"), "i from 1 to N"),
         (pipeline.SimulateOptions(shard="1/2", restart=True), "other shards"),
-        (pipeline.SimulateOptions(crew=Crew(scheduler="tcp://127.0.0.1:9")), "dask scheduler"),
-        (pipeline.SimulateOptions(crew=Crew(scheduler="nonsense://x")), "dask scheduler"),
+        (pipeline.SimulateOptions(executor=Executor(scheduler="tcp://127.0.0.1:9")), "dask scheduler"),
+        (pipeline.SimulateOptions(executor=Executor(scheduler="nonsense://x")), "dask scheduler"),
     )
     for options, words in cases:
         with pytest.raises(SceneError, match=words) as caught:
@@ -331,7 +331,7 @@ def test_interrupted_run_goes_on_in_its_folder(tmp_path):
                 raise KeyboardInterrupt
 
     with pytest.raises(InterruptedRun, match="helio resume"):
-        pipeline.run(SCENE, folder, overrides=overrides, stage=Stage, crew=Crew(1), report=False)
+        pipeline.run(SCENE, folder, overrides=overrides, stage=Stage, executor=Executor(1), report=False)
     said: list[str] = []
     pipeline.resume(folder, say=said.append)
     assert said == [f"going on: 5 of {N_UNITS} units were finished"]
@@ -339,3 +339,13 @@ def test_interrupted_run_goes_on_in_its_folder(tmp_path):
     stack, scene = hx.read(folder / "micrographs.h5"), hx.load_scene(SCENE, overrides)
     assert np.array_equal(stack.counts, pipeline.record(scene, pipeline.simulate(scene)).counts)
     assert hx.read(folder / "height.h5").method == "nearfield"
+
+
+def test_manifest_of_an_older_version_is_refused(half):
+    """A manifest without the keys of this version gives ResumeError and keeps the units. Catches a bare KeyError."""
+    manifest = half.manifest()
+    manifest["command"]["crew"] = manifest["command"].pop("executor")
+    half.begin(manifest)
+    with pytest.raises(ResumeError, match=r"manifest\.json is damaged .*executor"):
+        pipeline.resume(half.output)
+    assert n_kept(half) == N_UNITS // 2

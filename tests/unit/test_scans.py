@@ -12,7 +12,7 @@ from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.trace.direct import form_factors
 from helio_jax.trace.job import Job
 from helio_jax.trace.units import trace_unit
-from helio_jax.workflows.pipeline import Crew, SimulateOptions, reconstruct, run, simulate, simulate_file
+from helio_jax.workflows.pipeline import Executor, SimulateOptions, reconstruct, run, simulate, simulate_file
 from helio_jax.workflows.scene_file import load_scene
 
 SCENE = """
@@ -167,12 +167,12 @@ def test_views_in_units_shards_and_files(tmp_path):
     job = Job.of(scene, scene.trace, scene.build_body())
     cut = job.units()
     assert [(u.start, u.stop) for u in cut[:4]] == [(0, 7), (7, 14), (14, 15), (15, 22)] and len(cut) == 12
-    patch = trace_unit(job, cut[10])
+    unit_result = trace_unit(job, cut[10])
     counts = whole.stacks[3].counts.reshape(2, -1)[:, 7:14]
-    assert np.array_equal(np.maximum(patch.total, 0.0) * scene.scan.atoms_per_pixel, counts)
+    assert np.array_equal(np.maximum(unit_result.total, 0.0) * scene.scan.atoms_per_pixel, counts)
     overrides = {"trace.paths_per_unit": 16 * 8 * 7}
     for shard in ("2/2", "1/2"):
-        options = SimulateOptions(shard=shard, crew=Crew(1))
+        options = SimulateOptions(shard=shard, executor=Executor(1))
         simulate_file(tmp_path / "scene.toml", tmp_path / "set.h5", overrides=overrides, options=options)
     back = read(tmp_path / "set.h5")
     assert isinstance(back, MicrographSet)

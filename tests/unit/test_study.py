@@ -11,7 +11,7 @@ import pytest
 import helio_jax as hx
 from helio_jax.errors import GuardError, InterruptedRun, ResumeError, SceneError
 from helio_jax.formats.toml import to_toml
-from helio_jax.trace.scan import Crew
+from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene, resolved
 from helio_jax.workflows.study import load_study, resume_study, run_study
@@ -25,7 +25,7 @@ SMALL = """
 "scan.ny" = 12
 scan.pixel_size_um = 300.0
 """
-QUIET = pipeline.SimulateOptions(crew=Crew(1))
+QUIET = pipeline.SimulateOptions(executor=Executor(1))
 
 
 def write(folder: Path, text: str) -> Path:
@@ -141,7 +141,7 @@ def test_shards_of_a_study(tmp_path):
     path, out = grid(tmp_path), tmp_path / "out"
     for shard, n in (("2/2", 2), ("1/2", 4)):
         said = []
-        run_study(path, out, options=pipeline.SimulateOptions(crew=Crew(1), shard=shard, say=said.append))
+        run_study(path, out, options=pipeline.SimulateOptions(executor=Executor(1), shard=shard, say=said.append))
         assert len(said) == 2
         assert sum(row["status"] == "done" for row in json.loads((out / "index.json").read_text())) == n
 

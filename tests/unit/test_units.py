@@ -14,8 +14,8 @@ from helio_jax.trace import job as job_module
 from helio_jax.trace import run, units
 from helio_jax.trace.job import Job, differences
 from helio_jax.trace.run import make_experiment, trace_pixels
-from helio_jax.trace.scan import Canvas, trace_scene
-from helio_jax.trace.units import Patch, trace_unit
+from helio_jax.trace.scan import ScanResult, trace_scene
+from helio_jax.trace.units import UnitResult, trace_unit
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 
@@ -43,7 +43,7 @@ def test_units_cover_the_scan_once():
 def test_size_of_units_and_blocks_does_not_matter(estimator, monkeypatch):
     """One unit, 52 units and 8 units of small blocks give the bits that `trace_pixels` gives of the whole raster.
 
-    Catches random numbers or positions counted from the start of a unit, and patches that are put elsewhere.
+    Catches random numbers or positions counted from the start of a unit, and results stored at the wrong pixels.
     """
     jobs = [make_job(trace__paths_per_unit=n, trace__estimator=estimator) for n in (10**9, 16 * 8 * 7, 6400)]
     stacks = [trace_scene(j.scene, j.settings) for j in jobs[:2]]
@@ -64,22 +64,22 @@ def test_size_of_units_and_blocks_does_not_matter(estimator, monkeypatch):
 
 
 def test_unit_is_a_pure_function_that_travels():
-    """A copy of a job gives the same patch from scratch, stored and read back too. Catches state left behind."""
+    """A copy of a job gives the same result from scratch, stored and read back too. Catches state left behind."""
     job = make_job()
     unit = job.units()[3]
-    patch = trace_unit(job, unit)
+    unit_result = trace_unit(job, unit)
     sent = copy.deepcopy(job)
     units._prepared.cache_clear()
     assert sent == job and hash(sent) == hash(job)
-    again = Patch.from_arrays(trace_unit(sent, unit).arrays(), sent, unit)
-    for name, value in patch.arrays().items():
+    again = UnitResult.from_arrays(trace_unit(sent, unit).arrays(), sent, unit)
+    for name, value in unit_result.arrays().items():
         assert np.array_equal(value, getattr(again, name)), name
-    assert patch.fates.sum() == 50 * 16 * 8
+    assert unit_result.fates.sum() == 50 * 16 * 8
 
 
 @pytest.mark.parametrize("change", ["missing", "shape", "nan", "text"])
-def test_wrong_patches_are_refused(change):
-    """What is stored must be what this unit gives. Catches a part of an older format that is put on the canvas."""
+def test_wrong_unit_results_are_refused(change):
+    """What is stored must be what this unit gives. Catches a part of an older format that is accepted."""
     job = make_job()
     arrays = trace_unit(job, job.units()[0]).arrays()
     changed = {
@@ -89,7 +89,7 @@ def test_wrong_patches_are_refused(change):
         "text": arrays | {"fates": np.array(["1", "2", "3", "4"])},
     }[change]
     with pytest.raises(ValueError, match="must"):
-        Patch.from_arrays(changed, job, job.units()[0])
+        UnitResult.from_arrays(changed, job, job.units()[0])
 
 
 def test_key_covers_what_the_result_depends_on(monkeypatch):
@@ -149,27 +149,27 @@ def test_memory_grows_with_the_block_not_the_raster(monkeypatch):
     assert (beyond[1] - beyond[0]) / (120**2 - 40**2) < 100
 
 
-def test_canvas_must_be_full():
+def test_scan_result_must_be_complete():
     """Micrographs with holes are never handed out. Catches a merge of too few parts."""
     job = make_job()
-    canvas = Canvas(job)
-    canvas.put(job.units()[0], trace_unit(job, job.units()[0]))
+    scan_result = ScanResult(job)
+    scan_result.put(job.units()[0], trace_unit(job, job.units()[0]))
     with pytest.raises(ValueError, match=r"units \[1, 2, 3, 4, 5, 6, 7\] are missing"):
-        canvas.stack()
+        scan_result.micrographs()
 
 
 def test_mixed_cpus_are_noted():
     """Parts from CPUs of two kinds: both are named, with a note. Catches a merge that hides it."""
     from dataclasses import replace
 
-    job, canvases = make_job(), []
+    job, provenances = make_job(), []
     for kinds in (["a"] * 8, ["a"] * 7 + ["b"]):
-        canvas = Canvas(job)
+        scan_result = ScanResult(job)
         for unit, kind in zip(job.units(), kinds, strict=True):
-            canvas.put(unit, replace(trace_unit(job, unit), cpu=kind))
-        canvases.append(canvas.stack().provenance)
-    assert canvases[0]["cpu"] == ["a"] and "note" not in canvases[0]
-    assert canvases[1]["cpu"] == ["a", "b"] and "several kinds" in canvases[1]["note"]
+            scan_result.put(unit, replace(trace_unit(job, unit), cpu=kind))
+        provenances.append(scan_result.micrographs().provenance)
+    assert provenances[0]["cpu"] == ["a"] and "note" not in provenances[0]
+    assert provenances[1]["cpu"] == ["a", "b"] and "several kinds" in provenances[1]["note"]
 
 
 def test_killed_while_cleaning_up(tmp_path, monkeypatch):
