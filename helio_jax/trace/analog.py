@@ -1,8 +1,8 @@
-"""The tracer's inner loop: one kernel per flight for atoms that all leave by the cosine law.
+"""Fused kernel of the tracer for samples whose materials all scatter by the cosine law.
 
-Between two Embree calls every atom is landed, tallied, re-emitted and written as the next ray in one pass over memory,
-in place: rays that end make room for those that go on. It gives the same bits as the general loop (transport), which
-does the same in separate steps for other laws, for scattering plates and where Embree is not installed.
+Between two Embree calls each atom is tallied or re-emitted and written as the next ray in one loop over memory, in
+place. The result equals that of the general loop (`transport`) bit for bit; `transport` handles other laws, scattering
+plates and installations without Embree in separate steps.
 """
 
 import numpy as np
@@ -17,14 +17,14 @@ from helio_jax.trace.source import bounce_number, first_bounce_shift, shifted
 from helio_jax.trace.tally import DETECTED, ESCAPED, LOST, STOPPED, Tally
 
 _CHUNK = 128
-"""Hits that are looked up together, so that the processor waits for several triangles at a time."""
+"""Hits resolved together, so that the processor loads several triangles at a time."""
 
 
 @kernel
-def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, shapes):
-    """Return what becomes of atom `i` after a flight (`tally.FATES`, or -1: it scatters), and its detector or -1.
+def flight_outcome(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z, shapes):
+    """Return the fate of atom `i` after a flight (`tally.FATES`, or -1: it scatters) and its detector, or -1.
 
-    `x`, `y` is the plate's origin in the sample frame for this pixel; atoms straight from the source hit no detector.
+    `x`, `y` is the plate's origin in the sample frame for this pixel. Atoms directly from the source hit no detector.
     """
     if surface != MISS:
         if is_back:
@@ -38,8 +38,8 @@ def land(event, is_last, origins, directions, i, surface, is_back, x, y, plate_z
 
 
 @kernel
-def _send(point, normal, surface, i, a, b, restart, origin, direction, skip, m):
-    """Write the atom that leaves point `i` by the cosine law into row `m`."""
+def _emit(point, normal, surface, i, a, b, restart, origin, direction, skip, m):
+    """Draw the atom that leaves point `i` by the cosine law; write it to row `m`."""
     direction[m, 0], direction[m, 1], direction[m, 2] = cosine_direction(normal[i, 0], normal[i, 1], normal[i, 2], a, b)
     skip[m] = -1 if surface[i] >= 0 else -2 - surface[i]
     lift = restart if surface[i] >= 0 else 0.0
@@ -48,37 +48,37 @@ def _send(point, normal, surface, i, a, b, restart, origin, direction, skip, m):
 
 
 @kernel
-def _leave(event, point, normal, surface, restart, pixel, path, ids, seed, n_branches, bounces, per_replicate):
-    """Return the atoms that leave where others came: origin, direction, pixel, path and sphere to skip [n]."""
+def _emit_all(event, point, normal, surface, restart, pixel, path, ids, seed, n_branches, bounces, per_replicate):
+    """Return the atoms re-emitted at the points: origin, direction, pixel, path and sphere to skip [n]."""
     n = pixel.size * n_branches
     origin, direction = np.empty((n, 3)), np.empty((n, 3))
     of_pixel, of_path, skip = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n, np.int32)
     m, a, b = 0, 0.0, 0.0
-    is_even = event == 0 and per_replicate > 0
+    is_stratified = event == 0 and per_replicate > 0
     for i in range(pixel.size):
-        if is_even:
+        if is_stratified:
             shift_a, shift_b = first_bounce_shift(seed, ids[pixel[i]], path[i] * n_branches // per_replicate)
         for branch in range(n_branches):
             of_pixel[m], of_path[m] = pixel[i], path[i] * n_branches + branch
-            if is_even:
+            if is_stratified:
                 a, b = shifted(shift_a, shift_b, bounces, of_path[m] % per_replicate)
             else:
                 a, b, _, _ = bounce_number(seed, ids[pixel[i]], of_path[m], event)
-            _send(point, normal, surface, i, a, b, restart, origin, direction, skip, m)
+            _emit(point, normal, surface, i, a, b, restart, origin, direction, skip, m)
             m += 1
     return origin, direction, of_pixel, of_path, skip
 
 
 @kernel
-def _fly_on(
+def _advance(
     event, is_last, face, u, v, origin, direction, pixel, path, skip, o32, d32, facets, spheres, restart, middle,
     inverse_size, offset, plate_z, shapes, ids, seed, fates, hits, points, normals, surfaces,
     targets,
 ):  # fmt: skip
-    """Land all atoms in flight, tally those that end, send the others on in place; return how many go on.
+    """Tally the atoms that end, re-emit the others in place; return the number re-emitted.
 
-    Where `points`, `normals` and `surfaces` of the scattering and the two numbers of the path's next aperture point
-    (`targets`) are as long as the flights, they are written, too.
+    `points`, `normals`, `surfaces` of the scattering points and `targets`, the two random numbers of each path's next
+    aperture point, are written too unless they have length 0.
     """
     point, normal = np.empty((_CHUNK, 3)), np.empty((_CHUNK, 3))
     surface, is_back = np.empty(_CHUNK, np.int64), np.empty(_CHUNK, np.bool_)
@@ -92,7 +92,7 @@ def _fly_on(
             )
         for i in range(start, stop):
             j, p = i - start, pixel[i]
-            fate, k = land(
+            fate, k = flight_outcome(
                 event, is_last, origin, direction, i, surface[j], is_back[j], offset[p, 0], offset[p, 1], plate_z,
                 shapes,
             )  # fmt: skip
@@ -108,7 +108,7 @@ def _fly_on(
                     points[m, c], normals[m, c] = point[j, c], normal[j, c]
             a, b, _, _ = bounce_number(seed, ids[p], path[i], event)
             pixel[m], path[m] = p, path[i]
-            _send(point, normal, surface, j, a, b, restart, origin, direction, skip, m)
+            _emit(point, normal, surface, j, a, b, restart, origin, direction, skip, m)
             for c in range(3):
                 o32[m, c] = np.float32((origin[m, c] - middle[c]) * inverse_size)
                 d32[m, c] = np.float32(direction[m, c])
@@ -116,25 +116,25 @@ def _fly_on(
     return m
 
 
-def fly_to_the_end(
+def trace_fused(
     e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, offset: np.ndarray, tally: Tally
 ) -> None:
-    """Scatter atoms and follow them until all have ended: what follows where `Experiment.is_plain`.
+    """Scatter atoms and trace them until all have ended. Valid where `Experiment.can_fuse(event)`.
 
     Args:
         e: sample, instrument and settings.
-        event: how many events went before this scattering.
+        event: number of events before this scattering.
         ids: number of each pixel in the scan, key of the random numbers [pixels].
-        hits: where they scatter [n]; after the beam's first hit as many leave each point as there are branches.
-        paths: the atoms that come [n].
-        offset: the plate's origin in the sample frame for every pixel [pixels, 2], um.
-        tally: of these pixels; what becomes of the atoms is added.
+        hits: scattering points [n]; `n_branches` atoms leave each point of the beam's first hit.
+        paths: incoming atoms [n].
+        offset: the plate's origin in the sample frame for each pixel [pixels, 2] [um].
+        tally: counts of these pixels, updated in place.
 
     Raises:
         GuardError: a ray is not finite or has no unit direction.
     """
     s, sample = e.sampling, e.intersector
-    origin, direction, pixel, path, skip = _leave(
+    origin, direction, pixel, path, skip = _emit_all(
         event, hits.point, hits.normal, hits.surface, sample.restart, paths.pixel, paths.path, ids, s.seed,
         s.n_branches if event == 0 else 1, s.bounces, s.per_replicate,
     )  # fmt: skip
@@ -143,10 +143,10 @@ def fly_to_the_end(
     kept = n if e.is_expected else 0
     points, normals, targets = np.empty((kept, 3)), np.empty((kept, 3)), np.empty((kept, 2))
     surfaces = np.empty(kept, np.int32)
-    for now in range(event + 1, e.max_events + 1):
+    for flight in range(event + 1, e.max_events + 1):
         face, u, v = sample.shoot(o32[:n], d32[:n])
-        n = _fly_on(
-            now, now >= e.max_events, face, u, v, origin, direction, pixel, path, skip, o32, d32, sample.facets,
+        n = _advance(
+            flight, flight >= e.max_events, face, u, v, origin, direction, pixel, path, skip, o32, d32, sample.facets,
             sample.spheres, sample.restart, sample.center, 1.0 / sample.half_size, offset,
             e.instrument.sample_distance, e.apertures.shapes, ids, s.seed, tally.fates, tally.hits, points, normals,
             surfaces, targets,
@@ -155,11 +155,13 @@ def fly_to_the_end(
             break
         if e.is_expected:
             reached = Hits(points[:n], normals[:n], surfaces[:n], np.zeros(n, bool))
-            add_next_event(e, now, ids, tally, reached, _plain_paths(now, pixel[:n], path[:n], targets[:n]), offset)
+            add_next_event(
+                e, flight, ids, tally, reached, _cosine_paths(flight, pixel[:n], path[:n], targets[:n]), offset
+            )
 
 
-def _plain_paths(event: int, pixel: np.ndarray, path: np.ndarray, target: np.ndarray) -> Paths:
-    """Return what `next_event` asks of plain atoms after `event` scatterings; of the rest they remember nothing."""
+def _cosine_paths(event: int, pixel: np.ndarray, path: np.ndarray, target: np.ndarray) -> Paths:
+    """Return the `Paths` that `next_event` needs of cosine-law atoms after `event` scatterings."""
     n = len(pixel)
     order, met_plate = np.full(n, event, np.int32), np.zeros(n, bool)
     none, vectors = np.zeros(n), np.zeros((n, 3))

@@ -1,4 +1,4 @@
-"""Averaging of traced images over neighbouring pixels, without smearing the edges of the surface."""
+"""Edge-preserving smoothing of traced images (joint bilateral filter with local planes)."""
 
 import math
 
@@ -7,21 +7,20 @@ import numpy as np
 from helio_jax.kernel import kernel
 
 SMOOTH_PIXELS = 1.0
-"""Gaussian width of one pass [pixels] ..."""
-SMOOTH_BEND = 0.2
-"""... and the difference of unit normals at which a neighbour counts less."""
+"""Gaussian width of one pass [pixels]."""
+SMOOTH_NORMALS = 0.2
+"""Gaussian width of the range weight: difference of unit normals."""
 _REACH = math.ceil(2.5 * SMOOTH_PIXELS)
 _RIDGE = 0.1
-"""Draws the local planes to be level where few neighbours are alike, in weights of the pixel itself."""
+"""Ridge penalty on the slopes of the local planes, relative to the weight of the centre pixel."""
 
 
 def smooth_along_surface(images: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
-    """Return images [image, y, x] averaged over neighbours whose unit normals [y, x, 3] are alike.
+    """Smooth images [image, y, x] over neighbours with similar unit normals [y, x, 3].
 
-    A plane is fitted to every pixel's neighbourhood with the weights of a joint bilateral filter: traced noise is
-    averaged, the bend at a sphere's rim stays sharp, and so does the rise of multiple scattering towards it, which a
-    mean over neighbours on one side would flatten. Every further pass takes neighbours twice as far apart, so the
-    Gaussian variance of `passes` passes is (4^passes - 1) / 3 squared pixels.
+    A plane is fitted around each pixel with the weights of a joint bilateral filter. Edges stay sharp, and so does the
+    rise of multiple scattering towards a sphere's rim, which a one-sided mean would flatten. Each further pass doubles
+    the spacing of the neighbours: the Gaussian variance of `passes` passes is (4^passes - 1) / 3 squared pixels.
 
     Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004) 664, eq. 3; passes: Dammertz, Sewtz, Hanika and
         Lensch, High Performance Graphics 2010, sec. 3; local planes: Fan and Gijbels, Local Polynomial Modelling
@@ -34,7 +33,7 @@ def smooth_along_surface(images: np.ndarray, normals: np.ndarray, passes: int = 
 
 
 def passes_for(paths: float, wanted: float) -> int:
-    """Return how many passes average at least `wanted` paths, of which every pixel has `paths`."""
+    """Return the number of passes that averages over at least `wanted` paths, with `paths` in each pixel."""
     passes = 1
     while paths * (4**passes - 1) / 3 < wanted:
         passes += 1
@@ -43,7 +42,7 @@ def passes_for(paths: float, wanted: float) -> int:
 
 @kernel
 def _fit_planes(images, normals, spacing):
-    """Return the value at the pixel of the plane fitted around every pixel [y, x, image]."""
+    """Evaluate at each pixel the plane fitted around it [y, x, image]."""
     ny, nx, n_images = images.shape
     out = np.empty_like(images)
     for row in range(ny):
@@ -56,10 +55,10 @@ def _fit_planes(images, normals, spacing):
                 y = min(max(row + i * spacing, 0), ny - 1)
                 for j in range(-_REACH, _REACH + 1):
                     x = min(max(column + j * spacing, 0), nx - 1)
-                    bend = 0.0
+                    change = 0.0
                     for a in range(3):
-                        bend += (normals[y, x, a] - normals[row, column, a]) ** 2
-                    weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + bend / SMOOTH_BEND**2))
+                        change += (normals[y, x, a] - normals[row, column, a]) ** 2
+                    weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + change / SMOOTH_NORMALS**2))
                     matrix[0, 0] += weight
                     matrix[0, 1] += weight * i
                     matrix[0, 2] += weight * j

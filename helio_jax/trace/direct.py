@@ -1,11 +1,10 @@
-"""How much of a diffuse emitter's flux a detector catches: the tracer's own form factor (numba).
+"""Vector form factors and aiming at detectors (numba).
 
-For a point with normal n and an aperture that is neither hidden nor cut by the point's horizon, the detection
-probability is P = n . Phi with the vector form factor Phi = (1/2 pi) contour integral (r x dl)/|r|^2 (DESIGN.md
-section 2; Lambert's formula, Baum et al., SIGGRAPH 1989). Hidden parts are subtracted by the caller,
-sample point by sample point. A detector at infinity, a cone of directions, has its own Phi; besides it is aimed at and
-hit like an aperture, a solid angle standing for area cosine / distance^2. The JAX form factor of `reconstruct` is
-written separately so that each checks the other.
+For a point with normal n and an aperture that is neither masked nor cut by the point's horizon, the detection
+probability is P = n . Phi with the vector form factor Phi = (1/2 pi) contour integral (r x dl)/|r|^2 (Lambert's
+formula, Baum et al., SIGGRAPH 1989; docs/conventions.md, "Physics"). The caller subtracts masked parts. A detector at
+infinity is a cone of directions; its solid angle takes the place of area cosine / distance^2. The form factor of
+`forward` is a second, independent implementation in JAX.
 """
 
 import numpy as np
@@ -13,26 +12,25 @@ import numpy as np
 from helio_jax.detector import Cone
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
-from helio_jax.trace.lobes import turn_to
+from helio_jax.trace.lobes import rotate_from_z
 
 RIM_POINTS = (12, 16, 24, 32, 64, 256)
 """Rim points of the trapezoid rule, the first ones for far points."""
 RIM_RATIOS = (4.0, 2.0, 1.2, 0.7, 0.3)
-"""Distance to the plate in largest semi-axes above which each of RIM_POINTS is used (error < 1e-9)."""
-
-
-_FAR = 6
+"""Distance to the plate, in largest semi-axes, above which each of RIM_POINTS is used (error < 1e-9)."""
+_AT_INFINITY = 6
+"""Column of `ApertureTable.shapes`."""
 
 
 class ApertureTable:
-    """The detectors of an instrument as flat arrays for the numba kernels (lab frame; um).
+    """Detectors of an instrument as flat arrays for the numba kernels (lab frame, um).
 
     Attributes:
-        shapes: of an aperture centre x, y, semi-axes and cosine, sine of its rotation; of a cone at infinity its axis
-            x, y, z, its half-angle's cosine and squared sine, 0; and 1 for a cone, 0 for an aperture [k, 7]. Under a
-            mesh plate, which has its own way to count, NaN for all but cones: nothing is inside.
+        shapes: [k, 7]. Aperture: centre x, y, semi-axes, cosine and sine of the rotation, 0. Cone at infinity: axis
+            x, y, z, cosine and squared sine of the half-angle, 0, 1. Under a mesh plate, which counts by itself, all
+            but cones are NaN: no point is inside.
         area: of an aperture; of a cone the solid angle [k].
-        rims: for each of RIM_POINTS, positions and tangents of apertures [level, k, 2, max points, 2] (zero padded).
+        rims: for each of RIM_POINTS, positions and tangents of the rims [level, k, 2, max points, 2] (zero padded).
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -46,7 +44,7 @@ class ApertureTable:
                 self.area[k] = a.solid_angle
                 continue
             if a is None or instrument.plate.is_mesh:
-                self.shapes[k, :_FAR] = np.nan
+                self.shapes[k, :_AT_INFINITY] = np.nan
                 continue
             self.shapes[k] = *a.center, *a.semi_axes, np.cos(a.rotation), np.sin(a.rotation), 0.0
             self.area[k] = np.pi * np.prod(a.semi_axes)
@@ -57,23 +55,23 @@ class ApertureTable:
         return len(self.area)
 
     def largest_weight(self, gap: float) -> float:
-        """Return a bound of the chance that an atom flies to a detector, all of it taken to be at `gap` [um] or more.
+        """Compute an upper bound of the detection probability of any detector that is at least `gap` [um] away.
 
-        The detector as small as a point: area / (pi gap^2) for an aperture, solid angle / pi for a cone.
+        Point-detector approximation: area / (pi gap^2) for an aperture, solid angle / pi for a cone.
         """
-        square = np.where(self.shapes[:, _FAR] != 0.0, 1.0, max(gap, 0.0) ** 2)
+        square = np.where(self.shapes[:, _AT_INFINITY] != 0.0, 1.0, max(gap, 0.0) ** 2)
         with np.errstate(divide="ignore", invalid="ignore"):
             return float(np.max(np.nan_to_num(self.area / (np.pi * square), nan=np.inf)))
 
 
 @kernel
 def form_factor(x, y, depth, k, shapes, rims):
-    """Return Phi (3 components) of detector `k` seen from (x, y), `depth` below the plate (lab frame, um).
+    """Compute Phi (3 components) of detector `k` at (x, y), `depth` below the plate (lab frame, um).
 
-    Apertures: valid for depth > 0; relative error < 1e-9 from 0.3 semi-axes up. Source: DESIGN.md section 2. Cones at
-    infinity: sin^2(b) a, with half-angle b and axis a: the integral of omega / pi over the cone.
+    Apertures: valid for depth > 0; relative error < 1e-9 from 0.3 semi-axes up. Cones at infinity: sin^2(b) a, with
+    half-angle b and axis a: the integral of omega / pi over the cone.
     """
-    if shapes[k, _FAR] != 0.0:
+    if shapes[k, _AT_INFINITY] != 0.0:
         sin2 = shapes[k, 4]
         return sin2 * shapes[k, 0], sin2 * shapes[k, 1], sin2 * shapes[k, 2]
     ratio = depth / max(shapes[k, 2], shapes[k, 3])
@@ -96,8 +94,8 @@ def form_factor(x, y, depth, k, shapes, rims):
 
 @kernel
 def is_inside(x, y, dx, dy, dz, k, shapes):
-    """Whether detector `k` catches an atom that flies through the plate's point (x, y) in the direction d."""
-    if shapes[k, _FAR] != 0.0:
+    """Whether detector `k` counts an atom at the plate's point (x, y) with direction d."""
+    if shapes[k, _AT_INFINITY] != 0.0:
         return dx * shapes[k, 0] + dy * shapes[k, 1] + dz * shapes[k, 2] >= shapes[k, 3]
     ax, ay = x - shapes[k, 0], y - shapes[k, 1]
     c, s = shapes[k, 4], shapes[k, 5]
@@ -107,7 +105,7 @@ def is_inside(x, y, dx, dy, dz, k, shapes):
 
 @kernel
 def find_aperture(x, y, dx, dy, dz, shapes):
-    """Return the first detector that catches an atom at the plate's point (x, y) with the direction d, or -1."""
+    """Return the first detector that counts an atom at the plate's point (x, y) with direction d, or -1."""
     for k in range(shapes.shape[0]):
         if is_inside(x, y, dx, dy, dz, k, shapes):
             return k
@@ -116,7 +114,7 @@ def find_aperture(x, y, dx, dy, dz, shapes):
 
 @kernel
 def aperture_ahead(origins, directions, i, x, y, plate_z, shapes):
-    """Return the detector that ray `i` flies to, or -1, and the way to the plate [um]; `x`, `y`: the plate's origin."""
+    """Return the detector on ray `i`, or -1, and the distance to the plate [um]; `x`, `y`: the plate's origin."""
     dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
     if dz <= 0.0:
         return -1, 0.0
@@ -133,17 +131,18 @@ def disc_point(u, v):
 
 
 @kernel
-def toward(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
-    """Aim from point `i` at detector `k`: at an aperture's point or a cone's direction, uniform as (p, q) on a disc.
+def aim(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
+    """Aim from point `i` at the point of an aperture, or direction of a cone, given by (p, q) on the unit disc.
 
     Returns:
-        The way there [um], its squared length and whether no detector before `k` has it; to a cone a unit vector.
+        Vector to the aperture point [um] (cone: unit vector), its squared length, and whether detector `k` is the
+        first that counts there.
     """
-    if shapes[k, _FAR] != 0.0:
+    if shapes[k, _AT_INFINITY] != 0.0:
         u = p * p + q * q
         axial = 1.0 - u * (shapes[k, 4] / (1.0 + shapes[k, 3]))
         wide = np.sqrt((1.0 - axial) * (1.0 + axial) / u) if u > 0.0 else 0.0
-        dx, dy, dz = turn_to(shapes[k, 0], shapes[k, 1], shapes[k, 2], wide * p, wide * q, axial)
+        dx, dy, dz = rotate_from_z(shapes[k, 0], shapes[k, 1], shapes[k, 2], wide * p, wide * q, axial)
         if dz <= 0.0:
             return dx, dy, dz, 1.0, False
         r = (plate_z - point[i, 2]) / dz
@@ -159,13 +158,13 @@ def toward(k, p, q, point, i, offset_x, offset_y, plate_z, shapes):
 
 
 @kernel
-def spread(k, square, cosine, shapes):
-    """Return squared distance and cosine by which an area counts as area cosine / square; 1, 1 for a solid angle."""
-    return (1.0, 1.0) if shapes[k, _FAR] != 0.0 else (square, cosine)
+def area_factors(k, square, cosine, shapes):
+    """Return (square, cosine) so that the solid angle is area cosine / square; (1, 1) for a cone at infinity."""
+    return (1.0, 1.0) if shapes[k, _AT_INFINITY] != 0.0 else (square, cosine)
 
 
 def form_factors(instrument: Instrument, points: np.ndarray) -> np.ndarray:
-    """Return Phi of every detector for lab-frame points [n, 3] as [detector, n, 3] (see `form_factor`)."""
+    """Compute Phi of every detector for lab-frame points [n, 3] [um] as [detector, n, 3] (see `form_factor`)."""
     table = ApertureTable(instrument)
     return _form_factors(np.ascontiguousarray(points, float), instrument.working_distance, table.shapes, table.rims)
 

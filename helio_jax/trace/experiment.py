@@ -1,4 +1,4 @@
-"""What a block of work is given, and what is known of the atoms in flight: the nouns of the tracer."""
+"""Records of the tracer: the shared state of a run (`Experiment`) and the atoms in flight (`Paths`)."""
 
 from dataclasses import dataclass, fields
 
@@ -16,9 +16,10 @@ from helio_jax.trace.source import Sampling, Source
 
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a block of work needs, shared read-only between threads.
+    """State shared read-only by all blocks of a run.
 
-    No `laws`: cosine everywhere. No `plate`: a transparent one. `effusive`: the same with the effusive beam, if any.
+    `laws` None: cosine law everywhere. `plate` None: transparent plate. `effusive`: the same experiment with the
+    effusive beam as source, if there is one.
     """
 
     intersector: Intersector
@@ -33,11 +34,11 @@ class Experiment:
     plate: PlateTable | MeshPlate | None = None
     effusive: "Experiment | None" = None
 
-    def is_plain(self, event: int) -> bool:
-        """Whether all that is done after the scattering with `event` events before it is what `analog` does in one go.
+    def can_fuse(self, event: int) -> bool:
+        """Whether `analog.trace_fused` applies from the scattering after `event` events on.
 
-        That is so on Embree for the cosine law and no scattering plate, and, of the expected estimator, where atoms
-        that fly on need not tell what is hidden (`next_event`).
+        True with Embree, the cosine law everywhere and no scattering plate; with the expected estimator, also only
+        where no re-emitted atoms are needed to estimate the masked part (`next_event`).
         """
         if self.laws is not None or self.plate is not None or not self.intersector.has_embree:
             return False
@@ -56,11 +57,17 @@ class Experiment:
 
 @dataclass
 class Paths:
-    """Rays in flight: start [n, 3], direction [n, 3], pixel in block, path in pixel, sphere to skip [n].
+    """Atoms in flight.
 
-    `target` holds the two random numbers of the next aperture point [n, 2], `density` that of the lobes in this
-    direction (laws.scatter_atoms) [n], `normal` that of the sample left (zero: pinhole or plate) [n, 3], `order` how
-    often the sample scattered them, `met_plate` whether the plate did [n].
+    Attributes:
+        origin, direction: of the rays [n, 3].
+        pixel, path: index of the pixel in the block, number of the path in the pixel [n].
+        target: two random numbers of the next aperture point [n, 2].
+        skip: sphere that the ray starts from, or -1 [n].
+        density: of the lobes in this direction (`laws.scatter_atoms`) [n].
+        normal: of the sample at the start; zero for pinhole or plate [n, 3].
+        order: number of scatterings on the sample [n].
+        met_plate: whether the plate has scattered the atom [n].
     """
 
     origin: np.ndarray

@@ -1,8 +1,8 @@
-"""Follow single atoms: where each last scattered, how it flies off, how often it scattered and what became of it.
+"""Record single atoms: point of the last scattering, final direction, scattering order, fate and detector.
 
-The analog tracer ray by ray, with the random numbers of `transport`: the atoms found here are the very ones that an
-analog simulation counts (tests/physics/test_follow.py). Slower, and it keeps everything: for looking closely at a
-pixel, and for the directions in which a surface scatters. Transparent plates only.
+Uses the random numbers of `transport`, so the atoms recorded here are those that an analog simulation counts
+(tests/physics/test_follow.py). Slower than the tracer, for inspecting a pixel or a surface's angular distribution.
+Transparent plates only.
 """
 
 import math
@@ -14,7 +14,7 @@ from helio_jax.errors import SceneError
 from helio_jax.kernel import kernel
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.scene import Scene
-from helio_jax.trace.analog import land
+from helio_jax.trace.analog import flight_outcome
 from helio_jax.trace.experiment import Experiment, lift_off
 from helio_jax.trace.laws import scatter_atoms
 from helio_jax.trace.lawtable import make_law_table
@@ -24,21 +24,21 @@ from helio_jax.trace.source import beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import DETECTED, ESCAPED, FATES, STOPPED
 
 MAX_ATOMS = 5_000_000
-"""Atoms kept at most."""
+"""Limit of recorded atoms."""
 
 
 @dataclass(frozen=True)
 class Atoms:
-    """What became of single atoms (sample frame, um).
+    """Final states of single atoms (sample frame).
 
     Attributes:
         pixel: number of each atom's pixel, row by row [n].
-        point: where it last scattered, or the pinhole if it never did [n, 3].
-        direction: in which it flew from there (an atom that stuck: to there), unit vectors [n, 3].
-        plate_point: (x, y) where that line meets the plate, lab frame; NaN for atoms that fly down [n, 2].
-        order: how often it scattered [n].
+        point: last scattering point, or start in the pinhole if unscattered [n, 3] [um].
+        direction: unit vector of the last flight; of an adsorbed atom, the flight that ended there [n, 3].
+        plate_point: (x, y) of that line in the plate's plane, lab frame [n, 2] [um]; NaN for downward flight.
+        order: number of scatterings [n].
         fate: index into `tally.FATES` [n].
-        detector: which one it hit, from 0; -1: none [n].
+        detector: index of the detector hit, -1 for none [n].
     """
 
     pixel: np.ndarray
@@ -50,7 +50,7 @@ class Atoms:
     detector: np.ndarray
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return all of it as named columns [n]; fates as words."""
+        """Return the attributes as named columns [n], fates as words."""
         names = {"pixel": self.pixel}
         names |= {f"{a}_um": self.point[:, i] for i, a in enumerate("xyz")}
         names |= {f"direction_{a}": self.direction[:, i] for i, a in enumerate("xyz")}
@@ -58,10 +58,10 @@ class Atoms:
         return names | {"order": self.order, "fate": np.array(FATES)[self.fate], "detector": self.detector}
 
     def directions(self, n_theta: int = 45, n_phi: int = 72) -> dict[str, np.ndarray]:
-        """Return the histogram of the directions of all atoms that left the sample upwards, as named columns.
+        """Compute the histogram of directions of the atoms that left the sample upwards, as named columns.
 
-        Bins are equal steps of theta (from the plate normal, 0 to 90 deg) and phi (counter-clockwise from +x); the
-        density per steradian is normalised to all atoms that scattered, its standard error is Poisson's.
+        Bins are equal steps of theta (from the plate normal, 0 to 90 deg) and phi (counter-clockwise from +x). The
+        density per steradian is normalised to all scattered atoms; its standard error assumes Poisson counts.
         """
         has_left = np.isin(self.fate, (DETECTED, ESCAPED)) & (self.order > 0) & (self.direction[:, 2] > 0)
         x, y, z = self.direction[has_left].T
@@ -79,16 +79,16 @@ class Atoms:
 
 
 def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] | None = None, view: int = 0) -> Atoms:
-    """Follow the atoms of one pixel of a scene, or of all.
+    """Record the atoms of one pixel of a scene, or of all pixels.
 
     Args:
         scene: beam, plate, detectors, sample and scan.
-        settings: atoms per pixel (`rays`), seed and the cap on events; the estimator is analog whatever it says.
+        settings: atoms per pixel (`rays`), seed and limit on events; the estimator is always analog.
         pixel: row and column; None: all pixels.
         view: number of the view, from 0.
 
     Raises:
-        SceneError: there is no such pixel or view; too many atoms; the plate scatters.
+        SceneError: no such pixel or view; more than `MAX_ATOMS` atoms; a scattering plate.
     """
     (ny, nx), views = scene.image_shape, scene.views()
     i, j = pixel or (0, 0)
@@ -98,14 +98,14 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
         raise SceneError(f"view must be 0 to {len(views) - 1}, got {view}")
     if scene.plate.kind != "transparent":
         raise SceneError(
-            f"plate.kind = {scene.plate.kind!r}: single atoms are followed with a transparent plate only: set "
+            f"plate.kind = {scene.plate.kind!r}: single atoms can be recorded with a transparent plate only: set "
             "plate.kind = 'transparent' and leave out the plate's size and material"
         )
     inner = np.array([i * nx + j]) if pixel else np.arange(nx * ny)
     if inner.size * settings.rays > MAX_ATOMS:
         raise SceneError(
-            f"at most {MAX_ATOMS} atoms can be followed, got {inner.size} pixels of {settings.rays}: name one pixel or "
-            "trace fewer rays"
+            f"at most {MAX_ATOMS} atoms can be recorded, got {inner.size} pixels of {settings.rays}: select one pixel "
+            "or lower --rays"
         )
     analog = settings.model_copy(update={"estimator": "analog"})
     body = views[view].rotated_body(scene.build_body())
@@ -114,13 +114,7 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
 
 
 def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Atoms:
-    """Follow all atoms of some pixels with an analog experiment.
-
-    Args:
-        experiment: sample, instrument and settings.
-        ids: number of each pixel, the key of its random numbers [pixels].
-        x, y: beam positions [pixels], um.
-    """
+    """Record all atoms of some pixels with an analog experiment (arguments as in `transport.trace_block`)."""
     e, s = experiment, experiment.sampling
     laws = e.laws if e.laws is not None else make_law_table([COSINE_LAW] * len(e.intersector.materials))
     ids = np.ascontiguousarray(ids, np.int64)
@@ -136,14 +130,14 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
     for event in range(e.max_events + 1):
         hits = e.intersector.nearest(origin, direction, skip)
         point_last[atoms], direction_last[atoms], order[atoms] = start, direction, event
-        fate[atoms], detector[atoms] = _land(
+        fate[atoms], detector[atoms] = _outcomes(
             event, event >= e.max_events, origin, direction, hits.surface, hits.is_back, offset[pixel[atoms]],
             e.instrument.sample_distance, e.apertures.shapes,
         )  # fmt: skip
-        goes_on = fate[atoms] < 0
-        if not goes_on.any():
+        is_scattered = fate[atoms] < 0
+        if not is_scattered.any():
             break
-        hits, incoming, atoms = hits.take(goes_on), direction[goes_on], atoms[goes_on]
+        hits, incoming, atoms = hits.take(is_scattered), direction[is_scattered], atoms[is_scattered]
         u = bounce_numbers(ids[pixel[atoms]], path[atoms], 0, s.bounces, event, s.seed)
         material = e.intersector.material_of(hits.surface)
         key = (ids[pixel[atoms]], path[atoms], event, s.seed, False)
@@ -158,19 +152,19 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
 
 
 @kernel
-def _land(event, is_last, origin, direction, surface, is_back, offset, plate_z, shapes):
+def _outcomes(event, is_last, origin, direction, surface, is_back, offset, plate_z, shapes):
     """Return fate (-1: it scatters) and detector of every atom after a flight [n]."""
     n = origin.shape[0]
     fate, detector = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
-        fate[i], detector[i] = land(
+        fate[i], detector[i] = flight_outcome(
             event, is_last, origin, direction, i, surface[i], is_back[i], offset[i, 0], offset[i, 1], plate_z, shapes,
         )  # fmt: skip
     return fate, detector
 
 
 def _on_plate(point: np.ndarray, direction: np.ndarray, offset: np.ndarray, plate_z: float) -> np.ndarray:
-    """Return where lines meet the plate, lab frame [n, 2]; NaN where they do not."""
+    """Return the points where lines meet the plate's plane, lab frame [n, 2]; NaN for downward lines."""
     up = direction[:, 2] > 0
     out = np.full((len(point), 2), math.nan)
     r = (plate_z - point[up, 2]) / direction[up, 2]

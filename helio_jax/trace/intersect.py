@@ -1,10 +1,9 @@
-"""Where rays meet the sample: the only door to embreex. Triangles by Embree, spheres exactly (float64).
+"""Ray-surface intersection: triangles by Embree (float32), spheres analytically (float64).
 
-Embree works in float32, so the geometry is recentred and scaled to about unit size, and hit points are taken
-from the barycentric coordinates on the float64 triangle (about 7x more accurate than o + t d). Rays that start
-on a triangle are first moved off it by `RESTART` of the scene size; a convex sphere cannot be hit by a ray
-leaving it, so such rays skip their own sphere. A slow exhaustive float64 engine stands in where embreex has no
-wheel and is the independent check in the tests. Knows nothing of plates, detectors or counts.
+The geometry is recentred and scaled to about unit size for Embree; hit points are taken from the barycentric
+coordinates on the float64 triangle (about 7x more accurate than o + t d). Rays that start on a triangle are first moved
+off it by `RESTART` of the scene size; a ray that leaves a convex sphere skips that sphere. An exhaustive float64 engine
+replaces Embree where embreex has no wheel and is the independent check in the tests. Only this module imports embreex.
 """
 
 import warnings
@@ -18,9 +17,9 @@ from helio_jax.kernel import kernel
 from helio_jax.scene.body import Body
 
 RESTART = 1e-6
-"""Distance off the surface at which a ray leaving a triangle starts, in scene half-sizes."""
+"""Offset of the start of a ray from its triangle, in scene half-sizes."""
 MISS = np.int32(-1)
-"""`Hits.surface` of a ray that meets nothing; >= 0: triangle; <= -2: sphere number -2 - surface."""
+"""`Hits.surface` of a ray without a hit; >= 0: triangle; <= -2: sphere number -2 - surface."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +27,10 @@ class Hits:
     """First hits of a batch of rays.
 
     Attributes:
-        point: hit points [n, 3], um (undefined for misses).
+        point: hit points [n, 3] [um] (undefined for misses).
         normal: unit normals, outward [n, 3].
-        surface: which surface was hit [n] (see `MISS`).
-        is_back: True where the surface was met from inside: a leak, or inverted normals [n].
+        surface: surface hit [n] (see `MISS`).
+        is_back: True where the surface was hit from inside: a hole in the mesh, or inverted normals [n].
     """
 
     point: np.ndarray
@@ -40,18 +39,18 @@ class Hits:
     is_back: np.ndarray
 
     def take(self, keep: np.ndarray | slice) -> "Hits":
-        """Return some of the hits."""
+        """Select hits."""
         return Hits(self.point[keep], self.normal[keep], self.surface[keep], self.is_back[keep])
 
     @classmethod
     def on_mesh(cls, point: np.ndarray, normal: np.ndarray) -> "Hits":
-        """Return known points [n, 3] of a triangle mesh, with the normals [n, 3] that they scatter by."""
+        """Make hits from known points [n, 3] of a triangle mesh and the normals to scatter by [n, 3]."""
         return cls(point, normal, np.zeros(len(point), np.int32), np.zeros(len(point), bool))
 
 
 @kernel
 def _nearest_sphere(origins, directions, i, spheres, skip):
-    """Return (distance, index) of the nearest sphere ahead of ray `i`, or (inf, -1)."""
+    """Return (distance, index) of the nearest sphere on ray `i`, or (inf, -1)."""
     best, which = np.inf, -1
     for s in range(spheres.shape[0]):
         if s == skip:
@@ -70,7 +69,7 @@ def _nearest_sphere(origins, directions, i, spheres, skip):
 
 @kernel
 def _scale_rays(origins, directions, center, inverse_size, o32, d32):
-    """Write float32 Embree rays; return the number of rays that are not finite or have no direction."""
+    """Write float32 Embree rays; return the number of rays that are not finite or not of unit direction."""
     n_bad = 0
     for i in range(origins.shape[0]):
         total = 0.0
@@ -87,10 +86,10 @@ def _scale_rays(origins, directions, center, inverse_size, o32, d32):
 
 @kernel
 def resolve_hit(origins, directions, i, skip, face, u, v, facets, spheres, points, normals, j):
-    """Find where ray `i` meets the nearest of a hit triangle (or -1) and the spheres; return surface and side.
+    """Find the nearest of triangle `face` (or -1) and the spheres on ray `i`; return `surface` and `is_back`.
 
-    Writes point and normal number `j`. `facets` [triangle, 12] holds corners and normals; see `Hits` for the rest.
-    (Whole arrays and numbers: numba counts the references of every row that is passed, which took a third of the time.)
+    Writes point and normal to row `j`. `facets` [triangle, 12] holds corners and normals. Arguments are whole arrays
+    and indices because numba counts the references of each row that is passed, which took a third of the time.
     """
     t_face, surface = np.inf, -1
     if face >= 0:
@@ -158,15 +157,15 @@ def _exhaustive_faces(origins, directions, vertices, triangles):
 
 
 class Intersector:
-    """Ray queries against one body; safe to share between threads once made.
+    """Ray queries against one body; safe to share between threads.
 
     Args:
-        body: the sample's triangles and spheres, sample frame, um.
-        engine: "embree", or "exhaustive" (every triangle, float64: for checks and for platforms without embreex);
-            None takes Embree where it is installed, with a warning where it is not.
+        body: triangles and spheres, sample frame [um].
+        engine: "embree", or "exhaustive" (every triangle, float64); None: Embree if installed, else "exhaustive" with
+            a warning.
 
     Raises:
-        SceneError: the body has no surface, or a coordinate is not finite.
+        SceneError: the body has no surface, or embreex is not installed.
     """
 
     def __init__(self, body: Body, engine: Literal["embree", "exhaustive"] | None = None) -> None:
@@ -175,18 +174,15 @@ class Intersector:
         self.spheres = np.ascontiguousarray(body.spheres, np.float64).reshape(-1, 4)
         if self.triangles.size == 0 and self.spheres.size == 0:
             raise SceneError("the sample must have at least one surface, got 0 triangles and 0 spheres")
-        if not (np.all(np.isfinite(self.vertices)) and np.all(np.isfinite(self.spheres))):
-            raise SceneError("the sample has non-finite coordinates: repair the mesh")
         corners = self.vertices[self.triangles]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(cross, axis=1)
-        is_flat = length > 0
-        self.triangles = np.ascontiguousarray(self.triangles[is_flat])
-        self.normals = cross[is_flat] / length[is_flat, None]
-        self.facets = np.concatenate([corners[is_flat].reshape(-1, 9), self.normals], 1)
-        self.n_degenerate = int(np.sum(~is_flat))
+        has_area = length > 0
+        self.triangles = np.ascontiguousarray(self.triangles[has_area])
+        self.normals = cross[has_area] / length[has_area, None]
+        self.facets = np.concatenate([corners[has_area].reshape(-1, 9), self.normals], 1)
         self.materials, self._sphere_material = body.materials, body.sphere_material
-        self._face_material = body.face_material[is_flat]
+        self._face_material = body.face_material[has_area]
         self._set_scale()
         self._embree = self._build_embree() if engine in (None, "embree") and self.triangles.size else None
         if engine == "embree" and self._embree is None and self.triangles.size:
@@ -198,7 +194,7 @@ class Intersector:
         return self._embree is not None
 
     def material_of(self, surface: np.ndarray) -> np.ndarray:
-        """Return which of `materials` each hit surface has (`Hits.surface`, no misses) [n]."""
+        """Return the index into `materials` of each hit surface (`Hits.surface`, no misses) [n]."""
         out = np.empty(surface.shape, np.int64)
         is_face = surface >= 0
         out[is_face] = self._face_material[surface[is_face]]
@@ -206,16 +202,11 @@ class Intersector:
         return out
 
     def _set_scale(self) -> None:
-        low, high = [], []
-        if self.triangles.size:
-            used = self.vertices[np.unique(self.triangles)]
-            low, high = [used.min(0)], [used.max(0)]
-        for x, y, z, r in self.spheres:
-            low.append(np.array([x - r, y - r, z - r]))
-            high.append(np.array([x + r, y + r, z + r]))
-        self.low, self.high = np.min(low, 0), np.max(high, 0)
-        self.center = 0.5 * (self.low + self.high)
-        self.half_size = 0.5 * float((self.high - self.low).max())
+        used, center, radius = self.vertices[np.unique(self.triangles)], self.spheres[:, :3], self.spheres[:, 3:]
+        corners = np.concatenate([used, center - radius, center + radius])
+        low, self.high = corners.min(0), corners.max(0)
+        self.center = 0.5 * (low + self.high)
+        self.half_size = 0.5 * float((self.high - low).max())
         self.restart = RESTART * self.half_size
 
     def _build_embree(self):
@@ -224,7 +215,7 @@ class Intersector:
             from embreex.rtcore_scene import EmbreeScene
         except ImportError:
             warnings.warn(
-                "embreex has no wheel for this platform: rays are tested against every triangle", stacklevel=3
+                "embreex is not installed: rays are tested against every triangle, which is slow", stacklevel=3
             )
             return None
         scene = EmbreeScene(robust=True)
@@ -235,7 +226,7 @@ class Intersector:
         return scene
 
     def scaled(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return rays [n, 3] in Embree's frame and precision, checked.
+        """Convert rays [n, 3] to Embree's frame and precision.
 
         Raises:
             GuardError: a ray is not finite or has no unit direction.
@@ -246,7 +237,7 @@ class Intersector:
         n_bad = _scale_rays(origins, directions, self.center, 1.0 / self.half_size, o32, d32)
         if n_bad:
             raise GuardError(
-                f"{n_bad} of {len(origins)} rays are not finite or not of unit direction: please report it"
+                f"{n_bad} of {len(origins)} rays are not finite or not of unit direction: please report this"
             )
         return o32, d32
 
@@ -254,7 +245,7 @@ class Intersector:
         """Find the first surface along each ray.
 
         Args:
-            origins: ray origins [n, 3], um.
+            origins: ray origins [n, 3] [um].
             directions: unit vectors [n, 3].
             skip: sphere that the ray starts from, or -1 [n].
 
@@ -272,13 +263,13 @@ class Intersector:
         return Hits(*_resolve_hits(origins, directions, skip, face, u, v, self.facets, self.spheres))
 
     def shoot(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return triangle (or -1) and barycentric u, v [n] that Embree finds on rays from `scaled`."""
+        """Return the triangle (or -1) that Embree finds on rays from `scaled` and barycentric u, v [n]."""
         assert self._embree is not None
         found = self._embree.run(origins, directions, output=True)
         return found["primID"], found["u"], found["v"]
 
     def is_occluded(self, origins: np.ndarray, directions: np.ndarray, skip: np.ndarray) -> np.ndarray:
-        """Return True where anything lies ahead on the ray [n] (arguments as in `nearest`)."""
+        """Return True where a ray hits any surface [n] (arguments as in `nearest`)."""
         o32, d32 = self.scaled(origins, directions)
         if self.triangles.size == 0:
             occluded = np.zeros(len(origins), bool)

@@ -1,9 +1,8 @@
-"""How atoms leave a surface: draw from, and evaluate, the law of the material that was hit (numba).
+"""Sample and evaluate the scattering law of the material hit (numba).
 
-A law's atoms fall into two kinds: those that leave by the cosine law, for which the chance to reach a detector is
-known in closed form (direct.py), and those in lobes (lobes.py). So a law is evaluated as its share of cosine atoms
-and the density of its lobes; mirrors and exact diffraction peaks have no density and are only drawn. All random
-numbers are functions of (seed, pixel, path, event, trial).
+A law is a mixture of the cosine law, whose detection probability is known in closed form (`direct`), and of lobes
+(`lobes`). It is evaluated as the share of cosine atoms and the density of the lobes; mirrors and exact diffraction
+peaks have no density and are only sampled. All random numbers are functions of (seed, pixel, path, event, trial).
 """
 
 import numpy as np
@@ -15,22 +14,22 @@ from helio_jax.trace.lawtable import LawTable
 from helio_jax.trace.lobes import cosine_direction
 from helio_jax.trace.random import philox
 
-LEAVE, LOOK = np.uint64(5), np.uint64(6)
-"""Streams of random numbers: of the atom that leaves, and of the one that only tells the attenuation."""
+_EMISSION, _ATTENUATION = np.uint64(5), np.uint64(6)
+"""Streams of random numbers: of the emitted atom, and of the sample that estimates the attenuation."""
 EXACT = np.inf
-"""Density of a direction that a detector can only be hit by, not aimed at."""
+"""Density of an exact direction, for which aiming at a detector is impossible."""
 _MAX_TRIALS = 1_000_000
 _CHECK_ORDERS = 64
-"""Before this trial it is asked whether any diffraction order is open at all."""
+"""Trial at which the sampler checks whether any diffraction order is open."""
 _NO_ORDER = 1e-9
-"""Share of open diffraction orders below which all atoms leave by the cosine law."""
+"""Share of open diffraction orders below which all atoms follow the cosine law."""
 _COSINE, _SPECULAR, _UNIFORM, _LOBE = (int(s) for s in (Shape.COSINE, Shape.SPECULAR, Shape.UNIFORM, Shape.LOBE))
 _COSINE_LOBE, _DIFFRACTION, _ROUGH = (int(s) for s in (Shape.COSINE_LOBE, Shape.DIFFRACTION, Shape.ROUGH))
 
 
 @kernel
-def _kept(table, t, d, x, y, z):
-    """Return the Debye-Waller factor of a direction: the share that stays in the lobe."""
+def _debye_waller(table, t, d, x, y, z):
+    """Compute the Debye-Waller factor of a direction: the share that stays in the lobe."""
     if table.attenuation[t] == 0.0:
         return 1.0
     return np.exp(-table.attenuation[t] * ((x - d[0]) ** 2 + (y - d[1]) ** 2 + (z - d[2]) ** 2))
@@ -47,7 +46,7 @@ def _has_orders(table, t, d, n):
 
 @kernel
 def _draw(table, t, d, n, key, stream, pixel, path, event):
-    """Draw from one lobe: (direction, whether it is exact); NaN where no order is open."""
+    """Draw from one lobe: (direction, is_exact); NaN where no order is open."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
     if shape == _SPECULAR:
         x, y, z = lobes.mirror(d, n, 1.0)
@@ -83,7 +82,7 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
 
 @kernel
 def _density(table, t, d, n, o):
-    """Return the density of one lobe (0 for exact directions), attenuation included."""
+    """Compute the density of one lobe with attenuation (0 for exact directions)."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
     nodes = table.nodes[table.first_node[t] : table.first_node[t + 1]]
     if shape == _UNIFORM:
@@ -101,12 +100,12 @@ def _density(table, t, d, n, o):
         out = lobes.rough_density(d, n, p, o)
     else:
         out = lobes.table_density(d, n, nodes, o)
-    return out * _kept(table, t, d, o[0], o[1], o[2])
+    return out * _debye_waller(table, t, d, o[0], o[1], o[2])
 
 
 @kernel
 def lobe_density(table: LawTable, material, d, n, o):
-    """Return the density per steradian of a material's lobes; 0 below the surface. The cosine part is not in it."""
+    """Compute the density per steradian of a material's lobes, without its cosine part; 0 below the surface."""
     total = 0.0
     if o[0] * n[0] + o[1] * n[1] + o[2] * n[2] > 0.0:
         for t in range(table.first[material], table.first[material + 1]):
@@ -116,20 +115,10 @@ def lobe_density(table: LawTable, material, d, n, o):
 
 
 @kernel
-def lobe_densities(table, material, incoming, normal, outgoing):
-    """Return `lobe_density` of one material for many directions [n]; incoming, normal, outgoing: [n, 3]."""
-    out = np.empty(outgoing.shape[0])
-    for i in range(out.size):
-        out[i] = lobe_density(table, material, incoming[i], normal[i], outgoing[i])
-    return out
-
-
-@kernel
 def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
-    """Return the share of the atoms that leave by the cosine law [n].
+    """Compute the share of atoms that leave by the cosine law [n].
 
-    Where a lobe is attenuated its mean is not known in closed form: one atom drawn from the lobe tells how much it
-    loses, which is right on average.
+    The mean attenuation of a lobe has no closed form; one atom drawn from the lobe gives an unbiased estimate.
     """
     out = np.zeros(material.size)
     key = np.uint64(seed)
@@ -139,29 +128,31 @@ def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
             if table.shape[t] == _COSINE:
                 out[i] += table.share[t]
             elif table.attenuation[t] > 0.0:
-                x, y, z, _ = _draw(table, t, d, n, key, LOOK, np.uint64(ids[i]), np.uint64(path[i]), np.uint64(event))
-                out[i] += table.share[t] * (1.0 if np.isnan(x) else 1.0 - _kept(table, t, d, x, y, z))
+                x, y, z, _ = _draw(
+                    table, t, d, n, key, _ATTENUATION, np.uint64(ids[i]), np.uint64(path[i]), np.uint64(event)
+                )
+                out[i] += table.share[t] * (1.0 if np.isnan(x) else 1.0 - _debye_waller(table, t, d, x, y, z))
             elif table.shape[t] == _DIFFRACTION and not _has_orders(table, t, d, n):
                 out[i] += table.share[t]
     return out
 
 
 @kernel
-def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, wants_density=True):
-    """Draw how atoms leave.
+def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, with_density=True):
+    """Sample the directions of scattered atoms.
 
     Args:
         table: laws of the materials.
         material: of each point [n].
         incoming: unit directions [n, 3].
         normal: unit normals, outward [n, 3].
-        u: two numbers for the cosine law, low-discrepancy at the first bounce [n, 2 or more].
-        ids, path, event, seed: key of all other random numbers: pixel [n], path in it [n].
-        wants_density: False saves the time for it.
+        u: random numbers of the cosine law, low-discrepancy at the first scattering [n, 2 or more].
+        ids, path, event, seed: key of the other random numbers: pixel [n], path in the pixel [n].
+        with_density: False skips the density.
 
     Returns:
         Directions [n, 3]; density of the material's lobes there, 0 for atoms of the cosine law, `EXACT` for exact
-        directions [n]; whether the atom leaves at all [n].
+        directions [n]; False for adsorbed atoms [n].
     """
     size = material.size
     out, density, leaves = np.empty((size, 3)), np.zeros(size), np.ones(size, np.bool_)
@@ -170,7 +161,7 @@ def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, 
         d, n = incoming[i], normal[i]
         pixel, ray, number = np.uint64(ids[i]), np.uint64(path[i]), np.uint64(event)
         out[i] = cosine_direction(n[0], n[1], n[2], u[i, 0], u[i, 1])
-        a, b, _, _ = philox(key, LEAVE, pixel, ray, number, np.uint64(0))
+        a, b, _, _ = philox(key, _EMISSION, pixel, ray, number, np.uint64(0))
         t, last = table.first[material[i]], table.first[material[i] + 1]
         while t < last and a >= table.share[t]:
             a -= table.share[t]
@@ -178,10 +169,10 @@ def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, 
         leaves[i] = t < last
         if t == last or table.shape[t] == _COSINE:
             continue
-        x, y, z, is_exact = _draw(table, t, d, n, key, LEAVE, pixel, ray, number)
-        if np.isnan(x) or b >= _kept(table, t, d, x, y, z):
+        x, y, z, is_exact = _draw(table, t, d, n, key, _EMISSION, pixel, ray, number)
+        if np.isnan(x) or b >= _debye_waller(table, t, d, x, y, z):
             continue
         out[i, 0], out[i, 1], out[i, 2] = x, y, z
-        if wants_density:
+        if with_density:
             density[i] = EXACT if is_exact else lobe_density(table, material[i], d, n, out[i])
     return out, density, leaves

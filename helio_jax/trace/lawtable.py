@@ -1,8 +1,8 @@
-"""Scattering laws as flat arrays for the numba kernels of laws.py, with the norms of the lobes tabulated.
+"""Scattering laws as flat arrays for the numba kernels of `laws`, with tabulated norms of the lobes.
 
-A lobe cut at the horizon is normalised by an integral that depends on how far its axis is from the normal: it is
-tabulated once per law, on `N_NODES` nodes, and interpolated linearly (relative error < 1e-3 for a lobe of half a
-degree at grazing incidence, < 1e-5 from 5 deg up, and below 1e-6 away from grazing incidence).
+The norm of a lobe cut at the horizon depends on the tilt of its axis. It is tabulated once per law on `N_NODES` nodes
+and interpolated linearly (relative error < 1e-3 for a lobe of half a degree at grazing incidence, < 1e-5 from 5 deg
+up, < 1e-6 away from grazing incidence).
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,24 @@ from helio_jax.scene.scattering import Shape, Term
 N_NODES = 2049
 """Nodes of the tabulated norms."""
 CUT = 8.0
-"""Standard deviations beyond which a Gaussian counts as zero."""
+"""Cut-off of a Gaussian in standard deviations."""
 STEEPEST_LATTICE = 0.05
-"""Sine of the smallest angle between a lattice's plane and the normal of a face that has it."""
+"""Smallest allowed cosine between a lattice's plane normal and the normal of its face."""
 
 
 class LawTable(NamedTuple):
-    """The laws of all materials of a body (numba reads it as it is).
+    """The laws of all materials of a body.
 
     Attributes:
-        first: of each material's terms; one more at the end [materials + 1].
-        share: of the atoms, per term [terms].
-        shape: of the term (`Shape`) [terms].
-        numbers: of the term (`Shape`) [terms, 2].
-        lattice: its vectors in wavelengths [terms, 2, 3].
+        first: index of each material's first term, and the number of terms [materials + 1].
+        share: share of the atoms of each term [terms].
+        shape, numbers: kind and parameters of each term (`Shape`) [terms], [terms, 2].
+        lattice: lattice vectors in wavelengths [terms, 2, 3].
         attenuation: B of the Debye-Waller factor [terms].
-        first_row: of each term's peaks; one more at the end [terms + 1].
+        first_row: index of each term's first row, and the number of rows [terms + 1].
         rows: diffraction peaks: order, order, weight, width, cumulative weight [rows, 5].
-        first_node: of each term's table; one more at the end [terms + 1].
-        nodes: norms of lobes; of a table see `_pack_table`.
+        first_node: index of each term's first node, and the number of nodes [terms + 1].
+        nodes: norms of lobes, or a table (`_pack_table`).
     """
 
     first: np.ndarray
@@ -50,7 +49,7 @@ class LawTable(NamedTuple):
 
 
 def make_law_table(laws: Sequence[tuple[Term, ...]]) -> LawTable:
-    """Return the arrays of some laws, numbered as given."""
+    """Pack laws into arrays, in the given order."""
     terms = [term for law in laws for term in law]
     rows = [np.column_stack([t.rows, np.cumsum(t.rows[:, 2])]) for t in terms]
     nodes = [_nodes(t) for t in terms]
@@ -70,12 +69,12 @@ def make_law_table(laws: Sequence[tuple[Term, ...]]) -> LawTable:
 
 
 def is_cosine(law: tuple[Term, ...]) -> bool:
-    """Whether a law is the cosine law and nothing else."""
+    """Whether a law is the pure cosine law."""
     return all(term.shape == Shape.COSINE for term in law) and sum(term.share for term in law) == 1.0
 
 
 def check_lattices(laws: Sequence[tuple[Term, ...]], names: Sequence[str], normals: np.ndarray, index: np.ndarray):
-    """Refuse a lattice that stands upright on a face that has it.
+    """Check that no lattice plane is nearly perpendicular to a face of its material.
 
     Args:
         laws, names: of the materials.
@@ -83,7 +82,7 @@ def check_lattices(laws: Sequence[tuple[Term, ...]], names: Sequence[str], norma
         index: material of each face [m].
 
     Raises:
-        SceneError: as said.
+        SceneError: a lattice plane is tilted by more than 87 deg against such a face.
     """
     for i, law in enumerate(laws):
         for term in law:
@@ -99,7 +98,7 @@ def check_lattices(laws: Sequence[tuple[Term, ...]], names: Sequence[str], norma
 
 
 def _nodes(term: Term) -> np.ndarray:
-    """Return the table that a term needs."""
+    """Return the nodes of a term."""
     if term.shape == Shape.LOBE:
         return lobe_norm(np.linspace(0.0, 0.5 * np.pi, N_NODES), term.numbers[0])
     if term.shape == Shape.DIFFRACTION and term.numbers[0] > 0:
@@ -111,23 +110,23 @@ def _nodes(term: Term) -> np.ndarray:
 
 
 def lobe_norm(tilt: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the integral of cos(theta)+ exp(-g^2 / (2 sigma^2)) over all directions, the axis tilted by `tilt` [n].
+    """Compute the integral of cos(theta)+ exp(-g^2 / (2 sigma^2)) over all directions; `tilt` of the axis [n] [rad].
 
-    On a circle at angle g about the axis, cos(theta) = p + q cos(turn) with p = cos(tilt) cos(g) and
-    q = sin(tilt) sin(g); its positive part integrates to 2 (p t + q sin t), t = arccos(-p / q) (own derivation).
+    On a circle at angle g about the axis, cos(theta) = p + q cos(a) with p = cos(tilt) cos(g), q = sin(tilt) sin(g)
+    and azimuth a; its positive part integrates to 2 (p t + q sin t), t = arccos(-p / q). Source: own derivation.
     """
     x, w = np.polynomial.legendre.leggauss(400)
     g = 0.5 * min(np.pi, CUT * sigma) * (x + 1.0)
     p, q = np.cos(tilt)[:, None] * np.cos(g), np.maximum(np.sin(tilt)[:, None] * np.sin(g), 1e-300)
-    turn = np.arccos(np.clip(-p / q, -1.0, 1.0))
-    circle = 2.0 * (p * turn + q * np.sin(turn))
+    angle = np.arccos(np.clip(-p / q, -1.0, 1.0))
+    circle = 2.0 * (p * angle + q * np.sin(angle))
     return circle @ (w * 0.5 * min(np.pi, CUT * sigma) * np.sin(g) * np.exp(-0.5 * (g / sigma) ** 2))
 
 
 def open_share(distance: np.ndarray, sigma: float) -> np.ndarray:
-    """Return how much of a 2-D Gaussian of width `sigma`, centred at `distance` [n], lies in the unit disc.
+    """Compute the share of a 2-D Gaussian of width `sigma`, centred at `distance` [n], within the unit disc.
 
-    Valid for distance <= 1 + CUT * sigma; the quadrature is stretched towards the disc's edge (own derivation).
+    Valid for distance <= 1 + CUT * sigma; the quadrature is stretched towards the disc's edge. Source: own derivation.
     """
     from scipy.special import erf
 
@@ -142,10 +141,10 @@ def open_share(distance: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _pack_table(axes: tuple[np.ndarray, ...], intensity: np.ndarray) -> np.ndarray:
-    """Return a table as one row of numbers.
+    """Pack a tabulated law into one array.
 
-    Sizes (3), the axes, the intensity normalised to 1 over the hemisphere [i, t, p], for every incidence the cumulative
-    envelope of its cells [i, (t - 1) (p - 1)]: largest corner times solid angle, from which cells are drawn.
+    Order: sizes (3), axes, intensity normalised to 1 over the hemisphere [i, t, p], and for each incidence the
+    cumulative envelope (largest corner times solid angle) of its cells [i, (t - 1) (p - 1)], for sampling.
     """
     _, theta, phi = axes
     x, w = np.polynomial.legendre.leggauss(8)

@@ -1,8 +1,8 @@
-"""The distributions of scattered atoms, one by one: how to try a direction, and its density (numba).
+"""Lobes of the scattering laws: rejection samplers and densities (numba).
 
-Every `try_*` turns uniform numbers into a direction on the vacuum side or a refusal, after which the caller tries
-again with fresh numbers; every `*_density` is the density per steradian of what comes out, so that sampling is exact
-and pdf = eval. d is the incoming unit direction (towards the surface), n the normal, o an outgoing unit direction.
+Each `try_*` maps uniform numbers to (is_accepted, direction); after a rejection the caller tries again with new
+numbers. Each `*_density` is the exact density per steradian of that sampler. d is the incoming unit direction (towards
+the surface), n the unit normal, o an outgoing unit direction.
 """
 
 import numpy as np
@@ -10,14 +10,14 @@ import numpy as np
 from helio_jax.kernel import kernel
 from helio_jax.trace.lawtable import CUT
 
-REFUSED = (False, 0.0, 0.0, 0.0)
+_REJECTED = (False, 0.0, 0.0, 0.0)
 _EON_A = 0.5 - 2.0 / (3.0 * np.pi)
 _EON_B = 2.0 / 3.0 - 28.0 / (15.0 * np.pi)
 
 
 @kernel
-def turn_to(nx, ny, nz, x, y, z):
-    """Turn (x, y, z) from a frame whose third axis is the unit vector n; return a unit vector.
+def rotate_from_z(nx, ny, nz, x, y, z):
+    """Rotate (x, y, z) from a frame whose third axis is the unit vector n; return a unit vector.
 
     Source of the frame: Duff et al., J. Comput. Graph. Tech. 6 (2017) 1.
     """
@@ -35,12 +35,12 @@ def turn_to(nx, ny, nz, x, y, z):
 def cosine_direction(nx, ny, nz, u, v):
     """Draw a cosine-distributed direction about a unit vector (Malley's method)."""
     r, angle = np.sqrt(u), 2.0 * np.pi * v
-    return turn_to(nx, ny, nz, r * np.cos(angle), r * np.sin(angle), np.sqrt(1.0 - u))
+    return rotate_from_z(nx, ny, nz, r * np.cos(angle), r * np.sin(angle), np.sqrt(1.0 - u))
 
 
 @kernel
 def mirror(d, n, sign):
-    """Return the specular direction (sign 1) or the way back (sign -1)."""
+    """Return the specular direction (sign 1) or the backscattering direction (sign -1)."""
     if sign < 0.0:
         return -d[0], -d[1], -d[2]
     s = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
@@ -49,7 +49,7 @@ def mirror(d, n, sign):
 
 @kernel
 def interpolate(nodes, x, x_max):
-    """Return a table over [0, x_max] at x, linearly; held beyond its ends."""
+    """Interpolate a table over [0, x_max] linearly at x, constant beyond its ends."""
     s = min(max(x / x_max, 0.0), 1.0) * (nodes.size - 1)
     i = min(int(s), nodes.size - 2)
     return nodes[i] + (s - i) * (nodes[i + 1] - nodes[i])
@@ -57,29 +57,29 @@ def interpolate(nodes, x, x_max):
 
 @kernel
 def try_uniform(n, cos_edge, a, b):
-    """Uniform within a cone about the normal."""
+    """Draw uniformly within a cone about the normal."""
     z, angle = 1.0 - a * (1.0 - cos_edge), 2.0 * np.pi * b
     r = np.sqrt(max(0.0, 1.0 - z * z))
-    x, y, z = turn_to(n[0], n[1], n[2], r * np.cos(angle), r * np.sin(angle), z)
+    x, y, z = rotate_from_z(n[0], n[1], n[2], r * np.cos(angle), r * np.sin(angle), z)
     return True, x, y, z
 
 
 @kernel
 def try_lobe(d, n, sigma, sign, a, b, c):
-    """Density ~ cos(theta) exp(-g^2 / (2 sigma^2)): a Rayleigh angle g, kept with cos(theta) sin(g) / g."""
+    """Draw from cos(theta) exp(-g^2 / (2 sigma^2)): a Rayleigh angle g, accepted with cos(theta) sin(g) / g."""
     g, angle = sigma * np.sqrt(-2.0 * np.log(1.0 - a)), 2.0 * np.pi * b
     if g >= np.pi:
-        return REFUSED
+        return _REJECTED
     ax, ay, az = mirror(d, n, sign)
     s = np.sin(g)
-    x, y, z = turn_to(ax, ay, az, s * np.cos(angle), s * np.sin(angle), np.cos(g))
+    x, y, z = rotate_from_z(ax, ay, az, s * np.cos(angle), s * np.sin(angle), np.cos(g))
     cosine = x * n[0] + y * n[1] + z * n[2]
     return c < cosine * (s / g if g > 0.0 else 1.0), x, y, z
 
 
 @kernel
 def lobe_density(d, n, sigma, sign, norm, o):
-    """Density of `try_lobe`; `norm`: its integral by tilt of the axis (`lawtable.lobe_norm`)."""
+    """Density of `try_lobe`; `norm`: table of `lawtable.lobe_norm`."""
     ax, ay, az = mirror(d, n, sign)
     g = np.arccos(min(1.0, max(-1.0, ax * o[0] + ay * o[1] + az * o[2])))
     tilt = np.arccos(min(1.0, abs(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])))
@@ -89,7 +89,7 @@ def lobe_density(d, n, sigma, sign, norm, o):
 
 @kernel
 def try_cosine_lobe(d, n, a, b):
-    """Cosine law about the specular direction, cut at the horizon."""
+    """Draw from the cosine law about the specular direction, cut at the horizon."""
     ax, ay, az = mirror(d, n, 1.0)
     x, y, z = cosine_direction(ax, ay, az, a, b)
     return x * n[0] + y * n[1] + z * n[2] > 0.0, x, y, z
@@ -97,7 +97,7 @@ def try_cosine_lobe(d, n, a, b):
 
 @kernel
 def cosine_lobe_density(d, n, o):
-    """Density of `try_cosine_lobe`: above the horizon it sums to pi/2 (1 + cos(tilt)) (half disc, half ellipse)."""
+    """Density of `try_cosine_lobe`; its norm is pi/2 (1 + cos(tilt)) (half disc and half ellipse)."""
     ax, ay, az = mirror(d, n, 1.0)
     tilt_cosine = ax * n[0] + ay * n[1] + az * n[2]
     return max(0.0, ax * o[0] + ay * o[1] + az * o[2]) / (0.5 * np.pi * (1.0 + tilt_cosine))
@@ -105,7 +105,7 @@ def cosine_lobe_density(d, n, o):
 
 @kernel
 def _fujii_albedo(cosine, r):
-    """Directional albedo of the single-scattering model (FON) at white."""
+    """Directional albedo of the single-scattering model (FON) at albedo 1."""
     s = np.sqrt(max(0.0, 1.0 - cosine * cosine))
     grazing = s / max(cosine, 1e-12) * (1.0 - s * s * s) - s
     g = s * (np.arccos(min(1.0, cosine)) - s * cosine) + 2.0 / 3.0 * grazing
@@ -114,7 +114,7 @@ def _fujii_albedo(cosine, r):
 
 @kernel
 def rough_density(d, n, r, o):
-    """Density of the energy-preserving Oren-Nayar model at albedo 1: brdf * cos(theta).
+    """Density of the energy-preserving Oren-Nayar model at albedo 1: BRDF times cos(theta).
 
     Source: Portsmouth, Kutz, Hill, JCGT 14 (2025) 1: brdf = (A + B s / t + multiple scattering) / pi.
     """
@@ -130,7 +130,7 @@ def rough_density(d, n, r, o):
 
 @kernel
 def try_rough(d, n, r, a, b, c, e):
-    """Keep cosine or uniform directions so that `rough_density` comes out: B cos(theta) s / t <= B bounds the rest."""
+    """Draw from `rough_density` by rejection from a cosine and a uniform part; B cos(theta) s / t <= B is the bound."""
     ci = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
     flat = 1.0 / (1.0 + _EON_A * r)
     missing = 1.0 - flat * (1.0 + _EON_B * r)
@@ -147,21 +147,21 @@ def try_rough(d, n, r, a, b, c, e):
 
 @kernel
 def lattice_steps(lattice, is_turned, n):
-    """Return the changes of direction of the orders (1, 0) and (0, 1) on a face (see `DiffractionLaw`)."""
+    """Compute the direction changes of the orders (1, 0) and (0, 1) on a face (see `DiffractionLaw`)."""
     z = np.array((0.0, 0.0, 1.0)) if is_turned else n
     b1, b2 = np.cross(lattice[1], z), np.cross(z, lattice[0])
     volume = b1[0] * lattice[0, 0] + b1[1] * lattice[0, 1] + b1[2] * lattice[0, 2]
     if is_turned:
         for b in (b1, b2):
             length = np.sqrt(b[0] * b[0] + b[1] * b[1])
-            x, y, up = turn_to(n[0], n[1], n[2], b[0] / length, b[1] / length, 0.0)
+            x, y, up = rotate_from_z(n[0], n[1], n[2], b[0] / length, b[1] / length, 0.0)
             b[0], b[1], b[2] = length * x, length * y, length * up
     return b1 / volume, b2 / volume
 
 
 @kernel
 def _peak(d, n, b1, b2, row):
-    """Return the tangential direction of one order."""
+    """Compute the tangential direction of one order."""
     s = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
     return (
         d[0] - s * n[0] + row[0] * b1[0] + row[1] * b2[0],
@@ -172,7 +172,7 @@ def _peak(d, n, b1, b2, row):
 
 @kernel
 def diffraction_norm(d, n, b1, b2, rows, sigma, nodes):
-    """Return the share of all peaks that lies above the horizon."""
+    """Compute the share of all peaks above the horizon."""
     total, low = 0.0, max(0.0, 1.0 - CUT * sigma)
     for i in range(rows.shape[0]):
         x, y, z = _peak(d, n, b1, b2, rows[i])
@@ -186,12 +186,12 @@ def diffraction_norm(d, n, b1, b2, rows, sigma, nodes):
 
 @kernel
 def try_diffraction(d, n, b1, b2, rows, a, b, c):
-    """Draw a peak by its weight and a point in it; refuse what lies below the horizon. Also say whether it is exact."""
+    """Draw a peak by weight and a point in it, rejected below the horizon; also return is_exact."""
     i = min(np.searchsorted(rows[:, 4], a * rows[-1, 4], side="right"), rows.shape[0] - 1)
     x, y, z = _peak(d, n, b1, b2, rows[i])
     if rows[i, 3] > 0.0:
         r, angle = rows[i, 3] * np.sqrt(-2.0 * np.log(1.0 - b)), 2.0 * np.pi * c
-        tx, ty, tz = turn_to(n[0], n[1], n[2], np.cos(angle), np.sin(angle), 0.0)
+        tx, ty, tz = rotate_from_z(n[0], n[1], n[2], np.cos(angle), np.sin(angle), 0.0)
         x, y, z = x + r * tx, y + r * ty, z + r * tz
     rest = 1.0 - x * x - y * y - z * z
     if rest <= 0.0:
@@ -202,7 +202,7 @@ def try_diffraction(d, n, b1, b2, rows, a, b, c):
 
 @kernel
 def diffraction_density(d, n, b1, b2, rows, sigma, nodes, o):
-    """Density of the broadened peaks of `try_diffraction`; exact peaks are not part of it."""
+    """Density of the broadened peaks of `try_diffraction`, without exact peaks."""
     if sigma == 0.0:
         return 0.0
     cosine = o[0] * n[0] + o[1] * n[1] + o[2] * n[2]
@@ -222,18 +222,18 @@ def diffraction_density(d, n, b1, b2, rows, sigma, nodes, o):
 
 @kernel
 def _plane_of_incidence(d, n):
-    """Return the forward direction along the surface; any, at normal incidence."""
+    """Return the tangential forward direction; an arbitrary tangent at normal incidence."""
     s = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
     x, y, z = d[0] - s * n[0], d[1] - s * n[1], d[2] - s * n[2]
     length = np.sqrt(x * x + y * y + z * z)
     if length < 1e-9:
-        return turn_to(n[0], n[1], n[2], 1.0, 0.0, 0.0)
+        return rotate_from_z(n[0], n[1], n[2], 1.0, 0.0, 0.0)
     return x / length, y / length, z / length
 
 
 @kernel
 def _between(axis, x):
-    """Return the interval of a growing axis that holds x, and where in it (0 to 1, held at the ends)."""
+    """Return the interval of an increasing axis that contains x and the position in it (clamped to 0..1)."""
     if axis.size == 1:
         return 0, 0.0
     i = min(max(np.searchsorted(axis, x, side="right") - 1, 0), axis.size - 2)
@@ -242,7 +242,7 @@ def _between(axis, x):
 
 @kernel
 def _unpack(nodes):
-    """Return axes, intensity and cumulative envelope of a table (`lawtable._pack_table`)."""
+    """Return axes, intensity and cumulative envelope of a packed table (`lawtable._pack_table`)."""
     ni, nt, np_ = int(nodes[0]), int(nodes[1]), int(nodes[2])
     a = 3 + ni
     b = a + nt
@@ -259,7 +259,7 @@ def _bilinear(f, j, s, k, t):
 
 @kernel
 def try_table(d, n, nodes, a, b, c, e, f, g):
-    """Draw an incidence, a cell by its largest corner, a point in it; keep it by the interpolated intensity."""
+    """Draw an incidence, a cell by its envelope and a point in the cell; accept by the interpolated intensity."""
     incidence, theta, phi, intensity, envelope = _unpack(nodes)
     i, s = _between(incidence, np.arccos(min(1.0, -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2]))))
     i += 1 if a < s else 0
@@ -272,7 +272,7 @@ def try_table(d, n, nodes, a, b, c, e, f, g):
     corners = intensity[i, j : j + 2, k : k + 2]
     at = (np.arccos(z) - theta[j]) / (theta[j + 1] - theta[j])
     if f * corners.max() >= _bilinear(intensity[i], j, at, k, e):
-        return REFUSED
+        return _REJECTED
     angle = -angle if phi[-1] < 4.0 and g < 0.5 else angle
     tx, ty, tz = _plane_of_incidence(d, n)
     bx, by, bz = n[1] * tz - n[2] * ty, n[2] * tx - n[0] * tz, n[0] * ty - n[1] * tx

@@ -1,21 +1,20 @@
-"""Maps of cause: which part of each aperture the sample hides from a point, and what the beam cannot see.
+"""Masking and shadowing maps by ray tracing.
 
-Deterministic: the aperture is sampled at fixed points (Vogel spiral, equal areas), no random numbers, so the
-maps are noise-free and can be differenced. Used for the micrographs' `masked` and `shadowed` maps and, as the
-vector of the hidden form factor, by the pipeline's refinement loop.
+Deterministic: each aperture is sampled at fixed points (Vogel spiral, equal areas), so the maps are free of noise and
+can be differenced. They give the micrographs' `masked` and `shadowed` maps and the masked form factor of the fit.
 """
 
 import numpy as np
 
 from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
-from helio_jax.trace.direct import ApertureTable, spread, toward
+from helio_jax.trace.direct import ApertureTable, aim, area_factors
 from helio_jax.trace.experiment import lift_off
 from helio_jax.trace.intersect import MISS, Intersector
 
 
 def aperture_samples(n_points: int) -> np.ndarray:
-    """Return equal-area points of the unit disc [n_points, 2] (Vogel, Math. Biosci. 44 (1979) 179)."""
+    """Compute equal-area points of the unit disc [n_points, 2] (Vogel, Math. Biosci. 44 (1979) 179)."""
     i = np.arange(n_points) + 0.5
     r, angle = np.sqrt(i / n_points), np.pi * (3.0 - np.sqrt(5.0)) * i
     return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
@@ -23,15 +22,15 @@ def aperture_samples(n_points: int) -> np.ndarray:
 
 @kernel
 def _sample_rays(k, sample, point, normal, offset, plate_z, shapes, area):
-    """Return directions to one detector sample, vector weights cos(theta_d) r / (pi r^3) dA, and the horizon."""
+    """Return directions to one detector sample, vector weights cos(theta_d) r / (pi r^3) dA, and whether it counts."""
     n = point.shape[0]
     direction, weight, is_up = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
     for i in range(n):
         x, y = offset[i, 0], offset[i, 1]
-        dx, dy, dz, r2, is_own = toward(k, sample[0], sample[1], point, i, x, y, plate_z, shapes)
+        dx, dy, dz, r2, is_own = aim(k, sample[0], sample[1], point, i, x, y, plate_z, shapes)
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
-        square, flat = spread(k, r2, dz / r, shapes)
+        square, flat = area_factors(k, r2, dz / r, shapes)
         w = area * flat / square / np.pi
         for a in range(3):
             weight[i, a] = w * direction[i, a]
@@ -48,22 +47,22 @@ def hidden_form_factor(
     offset: np.ndarray,
     n_samples: int = 48,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part of each aperture's vector form factor that the sample hides from each point.
+    """Compute the masked part of each aperture's vector form factor at points of the sample.
 
-    The detection probability of a point is n . (Phi - hidden). The error falls as 1/n_samples; a point with a
-    free view of the whole aperture gets exactly 0.
+    The detection probability of a point is n . (Phi - masked). The error falls as 1/n_samples; it is exactly 0 where
+    the whole aperture is visible.
 
     Args:
         intersector: the sample.
-        instrument: its apertures.
-        point: points on the sample [n, 3], sample frame, um.
+        instrument: with the apertures.
+        point: points on the sample, sample frame [n, 3] [um].
         normal: unit normals, outward [n, 3].
-        surface: which surface each point lies on (`Hits.surface`) [n].
-        offset: lab-to-sample shift (x, y) of each point's pixel [n, 2], um.
+        surface: surface of each point (`Hits.surface`) [n].
+        offset: lab-to-sample shift (x, y) of each point's pixel [n, 2] [um].
         n_samples: points per aperture.
 
     Returns:
-        Hidden form factor [detector, n, 3] and the hidden fraction of the aperture's solid angle [detector, n].
+        Masked form factor [detector, n, 3] and masked fraction of the aperture's solid angle [detector, n].
     """
     table = ApertureTable(instrument)
     origin, skip = lift_off(point, normal, surface, intersector.restart)
@@ -88,17 +87,16 @@ def hidden_form_factor(
 
 
 def axis_rays(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the beam axis of each pixel as rays from the pinhole: origins and directions [n, 3], sample frame."""
+    """Return the beam axis of each pixel as a ray from the pinhole: origins and directions [n, 3], sample frame."""
     dx, dy, dz = instrument.sample_origin(x, y)
     origin = instrument.pinhole_center + np.stack([dx, dy, np.full_like(dx, dz)], -1)
     return origin, np.broadcast_to(instrument.beam_direction, origin.shape).copy()
 
 
 def is_shadowed(intersector: Intersector, instrument: Instrument, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return True where the topmost surface point above (x, y) cannot be seen by the beam [n].
+    """Whether the beam cannot reach the topmost surface point at (x, y) [n].
 
-    Unlike the micrographs this map lives on the sample plane: the beam itself never sees a shadowed point.
-    Positions with no surface below them are False.
+    (x, y) [um] are positions on the sample, not beam positions. False where there is no surface.
     """
     top = intersector.high[2] + intersector.half_size
     down = np.stack([x, y, np.full_like(x, top)], -1)
@@ -106,8 +104,8 @@ def is_shadowed(intersector: Intersector, instrument: Instrument, x: np.ndarray,
     hits = intersector.nearest(down, np.broadcast_to([0.0, 0.0, -1.0], down.shape).copy(), none)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, intersector.restart)
     found = np.flatnonzero(hits.surface != MISS)
-    toward = np.broadcast_to(-instrument.beam_direction, origin.shape).copy()
+    to_source = np.broadcast_to(-instrument.beam_direction, origin.shape).copy()
     faces_away = hits.normal @ instrument.beam_direction >= 0
     shadow = np.zeros(len(x), bool)
-    shadow[found] = faces_away[found] | intersector.is_occluded(origin[found], toward[found], skip[found])
+    shadow[found] = faces_away[found] | intersector.is_occluded(origin[found], to_source[found], skip[found])
     return shadow

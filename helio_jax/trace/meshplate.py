@@ -1,10 +1,9 @@
-"""A plate that is a solid from a mesh: atoms fly through its channels, scatter on its walls, and are counted (numba).
+"""Pinhole plate from a mesh: atoms fly through its channels, scatter on its walls and are counted (numba).
 
-The plate stands still in the instrument's frame while the sample moves: a second `Intersector` is asked with rays
-shifted by each pixel's offset. It lies wholly at or above the plane of the pinhole, the sample below, so an atom that
-comes from below meets the plate only after it has missed the sample, and one from within the plate meets that first.
-What counts atoms are parts of the mesh and ellipses at a height of their own, whichever an atom meets first, from
-either side; of two ellipses in one plane the first in the list. Whole atoms only: nothing here tells an expected share.
+The plate is fixed in the instrument's frame while the sample moves: a second `Intersector` traces rays shifted by each
+pixel's offset. The plate lies at or above the plane of the pinhole and the sample below it, so an atom from below can
+hit the plate only after it has missed the sample. Detectors are parts of the mesh, and ellipses at their own height,
+whichever an atom hits first from either side; of two ellipses in one plane the first in the list. Analog only.
 """
 
 import numpy as np
@@ -20,10 +19,10 @@ from helio_jax.trace.tally import DETECTED, Tally
 
 
 class MeshPlate:
-    """The mesh of a plate, ready for rays; safe to share between threads.
+    """Ray queries against a plate mesh; safe to share between threads.
 
     Args:
-        body: from `scene.plates.read_plate`, plate frame, um.
+        body: from `scene.plates.read_plate`, plate frame [um].
         instrument: with the plate.
         material: number of the plate's material among the laws.
     """
@@ -49,14 +48,9 @@ class MeshPlate:
         self, hits: Hits, origin: np.ndarray, direction: np.ndarray, pixel: np.ndarray, offset: np.ndarray,
         apertures: ApertureTable,
     ) -> np.ndarray:  # fmt: skip
-        """Put the plate into `hits` where rays meet it; return the detector that catches each, or -1 [n].
+        """Enter hits of the plate into `hits`; return the detector that counts each ray, or -1 [n].
 
-        Args:
-            hits: of all rays with the sample [n]; overwritten.
-            origin, direction: of the rays [n, 3], sample frame, um.
-            pixel: of each ray [n].
-            offset: the plate's origin in the sample frame for every pixel [pixels, 2], um.
-            apertures: not used: nothing is caught in the plane of the pinhole but by an ellipse there.
+        Arguments as in `PlateTable.catch`; `apertures` is not used.
         """
         caught = np.full(len(origin), -1)
         todo = np.flatnonzero(((hits.surface == MISS) & (direction[:, 2] > 0.0)) | (origin[:, 2] > self.z))
@@ -79,7 +73,7 @@ class MeshPlate:
 
 @kernel
 def _first(origin, direction, point, is_hit, counts, ellipses):
-    """Return the detector that each ray meets before anything of the plate that does not count, or -1 [n]."""
+    """Return the detector that each ray hits first, or -1 where it hits a wall or nothing [n]."""
     out = np.empty(origin.shape[0], np.int64)
     for i in range(origin.shape[0]):
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
@@ -102,7 +96,7 @@ def _first(origin, direction, point, is_hit, counts, ellipses):
 
 
 def count_caught(tally: Tally, caught: np.ndarray, pixel: np.ndarray, order: np.ndarray, met_plate: np.ndarray) -> None:
-    """Add caught atoms to the tally: detector, pixel, order and whether they met the plate, of each [n]."""
+    """Add detected atoms to the tally, given their detector, pixel, order and `met_plate` [n]."""
     n_orders = len(tally.hits)
     np.add.at(tally.hits, (np.minimum(order, n_orders) - 1, caught, pixel), 1)
     np.add.at(tally.fates[DETECTED], pixel, 1)

@@ -1,16 +1,16 @@
-"""The expected estimator: what every scattering sends straight to each detector (next-event estimation).
+"""Expected estimator: probability of flying directly from a scattering point to each detector (next-event estimation).
 
-For atoms of the cosine law that is the closed-form form factor minus the hidden part; it has no variance where nothing
-hides the aperture. The hidden part is estimated by a shadow ray to a random point of the aperture or, where an aperture
-is so wide that this has the larger variance, by the atoms that fly on and do not get there (maximum heuristic); what
-lobes send by both at once, weighted by the balance heuristic (Veach and Guibas, SIGGRAPH 1995). So neither a narrow
-lobe nor a wide aperture makes heavy tails. Exact directions (mirrors) are estimated by the atoms that hit alone.
+For the cosine law this is the closed-form form factor minus the masked part, without variance where nothing masks the
+aperture. The masked part is estimated by a shadow ray to a random point of the aperture or, for apertures so wide that
+this has the larger variance, by the re-emitted atoms that are blocked (maximum heuristic). Lobes use both techniques,
+weighted by the balance heuristic (Veach and Guibas, SIGGRAPH 1995). So neither a narrow lobe nor a wide aperture gives
+heavy tails. Exact directions (mirrors) are estimated by detected atoms only.
 """
 
 import numpy as np
 
 from helio_jax.kernel import kernel
-from helio_jax.trace.direct import aperture_ahead, disc_point, form_factor, is_inside, spread, toward
+from helio_jax.trace.direct import aim, aperture_ahead, area_factors, disc_point, form_factor, is_inside
 from helio_jax.trace.experiment import Experiment, Paths, lift_off
 from helio_jax.trace.intersect import MISS, Hits
 from helio_jax.trace.laws import cosine_shares, lobe_density
@@ -20,15 +20,15 @@ from helio_jax.trace.tally import Tally
 
 
 def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
-    """Return the replicate of each path, with one or several paths per beam ray."""
+    """Return the replicate of each path, for `n_branches` paths per beam ray."""
     return path // (s.n_rays * n_branches // s.n_replicates)
 
 
 @kernel
 def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
-    """Return the chance that an atom goes to a detector as small as a point and `area` large, if aiming may tell it.
+    """Compute the detection probability in the point-detector approximation if aiming is used, else 0.
 
-    It is 0 where `n_hits` atoms that fly on tell it with less variance. Signed as the cosine at the surface.
+    Aiming is not used where the `n_hits` re-emitted atoms have less variance. The sign is that of `cosine_surface`.
     """
     weight = area * cosine_surface * cosine_plate / square / np.pi
     return weight if n_hits * abs(weight) <= 1.0 else 0.0
@@ -36,17 +36,17 @@ def _aimed_weight(n_hits, square, cosine_surface, cosine_plate, area):
 
 @kernel
 def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area):
-    """Aim at a random point of detector `k`: direction, weight of that point, and whether it can count at all."""
+    """Aim at a random point of detector `k`: direction, weight of the point, whether it is above the horizon."""
     n = point.shape[0]
     direction, weight, is_open = np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
     for i in range(n):
         u, v = disc_point(target[i, 0], target[i, 1])
         x, y = offset[pixel[i], 0], offset[pixel[i], 1]
-        dx, dy, dz, r2, is_own = toward(k, u, v, point, i, x, y, plate_z, shapes)
+        dx, dy, dz, r2, is_own = aim(k, u, v, point, i, x, y, plate_z, shapes)
         r = np.sqrt(r2)
         direction[i, 0], direction[i, 1], direction[i, 2] = dx / r, dy / r, dz / r
         cosine = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / r
-        square, flat = spread(k, r2, dz / r, shapes)
+        square, flat = area_factors(k, r2, dz / r, shapes)
         weight[i] = _aimed_weight(n_hits, square, cosine, flat, area[k])
         is_open[i] = cosine > 0.0 and is_own
     return direction, weight, is_open
@@ -54,7 +54,7 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area)
 
 @kernel
 def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
-    """Add what detector `k` catches of path `i`, scattered `order` times."""
+    """Add the contribution of path `i` to detector `k` and scattering order `order`."""
     r, p = replicate[i], pixel[i]
     sums[min(order, sums.shape[0]) - 1, r, k, p] += value
     if met_plate[i]:
@@ -66,7 +66,7 @@ def _score(
     k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, shapes,
     rims, sums, plate_sums,
 ):  # fmt: skip
-    """Add P = n . Phi - (hidden part), times the share of cosine atoms, of every vertex to its pixel and replicate."""
+    """Add P = n . Phi - (masked part), times the share of cosine atoms, for each scattering point."""
     for i in range(point.shape[0]):
         if cosine[i] == 0.0:
             continue
@@ -83,7 +83,7 @@ def _score(
 
 @kernel
 def _balance(density, n_hits, square, cosine, area):
-    """Return density / (density of aiming + n density of hitting): the balance heuristic of both estimates."""
+    """Compute the balance heuristic: density / (density of aiming + n_hits density)."""
     return 1.0 / n_hits if density == np.inf else density / (square / (area * cosine) + n_hits * density)
 
 
@@ -92,12 +92,12 @@ def _score_lobes(
     k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
     plate_z, shapes, area, sums, plate_sums,
 ):  # fmt: skip
-    """Add what the lobes of every vertex send to where it aims at."""
+    """Add the contribution of the lobes at each scattering point to the point aimed at."""
     for i in range(point.shape[0]):
         if is_open[i]:
             density = lobe_density(table, material[i], incoming[i], normal[i], direction[i])
             r = (plate_z - point[i, 2]) / direction[i, 2]
-            square, flat = spread(k, r * r, direction[i, 2], shapes)
+            square, flat = area_factors(k, r * r, direction[i, 2], shapes)
             value = _balance(density, n_hits, square, flat, area[k]) if density > 0.0 else 0.0
             _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
 
@@ -107,25 +107,25 @@ def _score_hits(
     share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, shapes,
     area, sums, plate_sums,
 ):  # fmt: skip
-    """Add the lobes' atoms that hit a detector."""
+    """Add the atoms of lobes that hit a detector."""
     for i in range(origin.shape[0]):
         if density[i] > 0.0 and surface[i] == MISS:
             p = pixel[i]
             k, r = aperture_ahead(origin, direction, i, offset[p, 0], offset[p, 1], plate_z, shapes)
             if k >= 0:
-                square, flat = spread(k, r * r, direction[i, 2], shapes)
+                square, flat = area_factors(k, r * r, direction[i, 2], shapes)
                 value = _balance(density[i], n_hits, square, flat, area[k])
                 _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
 
 
 @kernel
-def _subtract_hidden(
+def _subtract_masked(
     share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
     shapes, area, sums, plate_sums,
 ):  # fmt: skip
-    """Subtract the wide detectors that cosine atoms do not reach though they fly towards them: what `_score` left.
+    """Subtract the masked part of wide detectors, which `_score` leaves out: blocked cosine atoms flying towards them.
 
-    The mirror image of an atom's direction below the surface it leaves tells of the parts below the horizon there.
+    The mirror image of an atom's direction at its surface estimates the parts of the detectors below the horizon.
     """
     for i in range(origin.shape[0]):
         if density[i] != 0.0:
@@ -136,7 +136,7 @@ def _subtract_hidden(
             dx, dy, dz = d[0], d[1], d[2]
             if sign < 0.0:
                 dx, dy, dz = dx - 2.0 * cosine * n[0], dy - 2.0 * cosine * n[1], dz - 2.0 * cosine * n[2]
-            is_hidden = sign < 0.0 or surface[i] != MISS
+            is_masked = sign < 0.0 or surface[i] != MISS
             if dz <= 0.0 or cosine <= 0.0:
                 continue
             r = (plate_z - origin[i, 2]) / dz
@@ -144,19 +144,19 @@ def _subtract_hidden(
             y = origin[i, 1] - offset[pixel[i], 1] + r * dy
             for k in range(shapes.shape[0]):
                 if is_inside(x, y, dx, dy, dz, k, shapes):
-                    square, flat = spread(k, r * r, dz, shapes)
-                    if is_hidden and _aimed_weight(n_hits, square, cosine, flat, area[k]) == 0.0:
+                    square, flat = area_factors(k, r * r, dz, shapes)
+                    if is_masked and _aimed_weight(n_hits, square, cosine, flat, area[k]) == 0.0:
                         _add(-sign * share, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
-                    is_hidden = True  # where detectors overlap, the first one has it
+                    is_masked = True  # where detectors overlap, the first one counts
 
 
 def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hits: Hits, paths: Paths, offset):
-    """Add the expected contribution of every vertex on the sample to every detector (the next-event estimate)."""
+    """Add the next-event estimate of each scattering point on the sample for each detector to `tally`."""
     if e.plate is not None and (on_plate := hits.surface == PLATE).any():
         hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
     point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
-    whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    path_data = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
     if e.laws is not None:
@@ -170,23 +170,23 @@ def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hit
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
-            k, 1.0 / n_branches, cosine, point, normal, *whose, offset, plate_z, weight, is_open, table.shapes,
+            k, 1.0 / n_branches, cosine, point, normal, *path_data, offset, plate_z, weight, is_open, table.shapes,
             table.rims, tally.sums, tally.plate_sums,
         )  # fmt: skip
         if e.laws is not None:
             _score_lobes(
-                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *whose, direction,
+                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *path_data, direction,
                 is_open, plate_z, table.shapes, table.area, tally.sums, tally.plate_sums,
             )  # fmt: skip
 
 
 def add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, paths: Paths, offset) -> None:
-    """Add what the atoms that fly on after `event` events tell: lobes' hits, and what is hidden."""
+    """Add the estimates by re-emitted atoms after `event` events: hits of lobes, and the masked part."""
     n_branches, table = e.sampling.n_branches, e.apertures
     weight = 1.0 / n_branches, n_branches if event == 1 else 1
-    whose = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
-    flight = paths.origin, paths.direction, *whose, surface
+    path_data = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    flight = paths.origin, paths.direction, *path_data, surface
     plate = offset, e.instrument.sample_distance, table.shapes, table.area
-    _subtract_hidden(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
+    _subtract_masked(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
     if e.laws is not None:
         _score_hits(*weight, paths.density, *flight, *plate, tally.sums, tally.plate_sums)

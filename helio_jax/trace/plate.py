@@ -1,8 +1,8 @@
-"""The underside of a flat scattering plate: where atoms that come up from the sample meet it (numba).
+"""Underside of a flat scattering plate (numba).
 
-The sample lies wholly below the plate, so a ray meets the plate only after it has missed the sample. The apertures and
-the pinhole are holes: an atom there goes on as if there were no plate. Nothing is hidden by the plate: apertures seen
-from the sample have nothing of it in front, and from the plate itself, in whose plane they lie, they are not seen.
+The sample lies below the plate, so a ray can hit the plate only after it has missed the sample. Apertures and pinhole
+are holes. The plate masks no aperture: seen from the sample it is not in front of them, and seen from the plate itself
+they lie in its plane.
 """
 
 from typing import NamedTuple
@@ -15,20 +15,20 @@ from helio_jax.trace.direct import ApertureTable, aperture_ahead
 from helio_jax.trace.intersect import MISS, Hits
 
 PLATE = np.int32(2**31 - 1)
-"""`Hits.surface` of an atom on the plate."""
+"""`Hits.surface` of a point on the plate."""
 FACING_DOWN = np.array([0.0, 0.0, -1.0])
 """The plate's normal."""
 
 
 class PlateTable(NamedTuple):
-    """A scattering plate as numbers for the kernel (lab x, y; z above the sample's plane; um).
+    """A flat scattering plate for the kernels (lab frame, um).
 
     Attributes:
-        z: of the plate.
+        z: height above the substrate.
         is_disc: whether the outline is a disc, else a rectangle.
-        center, half: middle and half extents of the outline [2].
+        center, half: centre and half extents of the outline [2].
         pinhole: x, y and radius of the pinhole [3].
-        material: its number among the laws.
+        material: index among the laws.
     """
 
     z: float
@@ -49,21 +49,21 @@ class PlateTable(NamedTuple):
         self, hits: Hits, origin: np.ndarray, direction: np.ndarray, pixel: np.ndarray, offset: np.ndarray,
         apertures: ApertureTable,
     ) -> None:  # fmt: skip
-        """Put the plate into `hits` where rays that missed the sample meet it.
+        """Enter hits of the plate into `hits` for rays that missed the sample.
 
         Args:
-            hits: of all rays [n]; overwritten.
-            origin, direction: of the rays [n, 3], sample frame, um.
+            hits: of all rays with the sample [n]; updated in place.
+            origin, direction: of the rays, sample frame [n, 3] [um].
             pixel: of each ray [n].
-            offset: the plate's origin in the sample frame for every pixel [pixels, 2], um.
-            apertures: its holes.
+            offset: the plate's origin in the sample frame for each pixel [pixels, 2] [um].
+            apertures: the holes.
         """
         _catch(self, origin, direction, pixel, offset, apertures.shapes, hits.point, hits.normal, hits.surface)
 
 
 @kernel
 def is_solid(plate, x, y):
-    """Whether the plate point (x, y), lab frame, lies within the outline and not in the pinhole."""
+    """Whether the plate point (x, y), lab frame, is within the outline and outside the pinhole."""
     p, q = (x - plate.center[0]) / plate.half[0], (y - plate.center[1]) / plate.half[1]
     is_within = p * p + q * q <= 1.0 if plate.is_disc else max(abs(p), abs(q)) <= 1.0
     dx, dy = x - plate.pinhole[0], y - plate.pinhole[1]

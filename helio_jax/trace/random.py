@@ -1,8 +1,8 @@
-"""Random numbers of the tracer: a counter-based generator and a low-discrepancy point set.
+"""Random numbers of the tracer: a counter-based generator and Sobol points.
 
-Every random number is a pure function of (seed, pixel, ray, event), so a result does not depend on how
-the work is divided among threads or machines. Philox 4x64-10: Salmon et al., "Parallel random numbers: as easy
-as 1, 2, 3", SC11; tested word for word against NumPy's own Philox (tests/physics/test_tracer.py).
+Each random number is a pure function of (seed, pixel, ray, event), so results do not depend on how the work is divided
+among threads or machines. Philox 4x64-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11; tested
+word for word against NumPy's Philox (tests/physics/test_tracer.py).
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ _TO_UNIT = 2.0**-53
 
 @intrinsic
 def _multiply_high(_context, a, b):
-    """Return the high 64 bits of the 128-bit product: one machine instruction."""
+    """Compute the high 64 bits of the 128-bit product in one machine instruction."""
 
     def generate(_context, builder, _signature, arguments):
         wide = ir.IntType(128)
@@ -36,7 +36,7 @@ def _multiply_high(_context, a, b):
 
 @kernel
 def philox(key0, key1, c0, c1, c2, c3):
-    """Return four uniform numbers in [0, 1) for one key and counter (all uint64)."""
+    """Compute four uniform numbers in [0, 1) for one key and counter (all uint64)."""
     for i in range(10):
         if i:
             key0 += _W0
@@ -53,10 +53,10 @@ def philox(key0, key1, c0, c1, c2, c3):
 
 
 def low_discrepancy_points(n_points: int, n_dimensions: int) -> np.ndarray:
-    """Return the first Sobol points in the unit cube [n_points, n_dimensions], unscrambled.
+    """Compute the first Sobol points in the unit cube [n_points, n_dimensions], unscrambled.
 
     Each pixel and replicate shifts them by its own random vector modulo 1 (Cranley-Patterson rotation, SIAM
-    J. Numer. Anal. 13 (1976) 904), which keeps every estimate unbiased.
+    J. Numer. Anal. 13 (1976) 904), so estimates are unbiased.
     """
     n_bits = max(int(n_points - 1).bit_length(), 1)
     return qmc.Sobol(n_dimensions, scramble=False).random_base2(n_bits)[:n_points]

@@ -1,9 +1,8 @@
-"""The beam: where the atoms of each pixel start and in which direction (numba), and their first random numbers.
+"""Beam: start points and directions of the atoms of each pixel (numba), and their random numbers.
 
 Source models: `uniform` within a cone (theta = theta_max sqrt(u)), `gaussian` (theta = sigma sqrt(-2 ln(1 - u)))
-and `pencil` (parallel) about the beam axis, `effusive` (cos(theta) = (1 - u)^(1/(n + 1)), which is cos^n per steradian)
-about the plate normal, all from a disc-shaped pinhole in the plate plane; `rays` draws from a list by weight.
-Knows nothing of the sample.
+and `pencil` (parallel) about the beam axis; `effusive` (cos(theta) = (1 - u)^(1/(n + 1)), which is cos^n per steradian)
+about the plate normal; all from a disc-shaped pinhole in the plate's plane. `rays` draws from a list by weight.
 """
 
 from dataclasses import dataclass
@@ -22,11 +21,11 @@ _SHIFT_STREAM, _RAY_STREAM, _BOUNCE_STREAM, _BRANCH_STREAM = np.uint64(1), np.ui
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the rays of a pixel are drawn.
+    """Numbers of rays and point sets of a pixel.
 
     Attributes:
         n_rays: beam rays per pixel.
-        n_branches: paths that leave the first scattering point of every beam ray.
+        n_branches: paths re-emitted at the first scattering point of each beam ray.
         n_replicates: independently shifted copies of the low-discrepancy points; 0: independent random rays.
         seed: key of the generator.
         points: low-discrepancy points of the beam ray and its first aperture point [n_rays / n_replicates, 6].
@@ -42,7 +41,7 @@ class Sampling:
 
     @property
     def per_replicate(self) -> int:
-        """Paths of a replicate; 0: the rays are independent."""
+        """Paths per replicate; 0: the rays are independent."""
         return self.n_rays * self.n_branches // self.n_replicates if self.n_replicates else 0
 
     @classmethod
@@ -57,14 +56,14 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Source:
-    """How atoms leave the plate plane.
+    """Distribution of atoms in the plate's plane.
 
     Attributes:
         model: number in `_MODELS`.
-        size: angular size [rad], or the exponent of an effusive beam.
+        size: angular size [rad], or exponent of an effusive beam.
         frame: axes of the directions, the last one along the source's axis [3, 3].
         radius: of the pinhole [um].
-        rays: position [um], unit direction and cumulative weight, 1 at last, of given rays [n, 7].
+        rays: position [um], unit direction and normalised cumulative weight of given rays [n, 7].
     """
 
     model: int
@@ -75,18 +74,18 @@ class Source:
 
     @classmethod
     def beam(cls, instrument: Instrument, rays: np.ndarray | None = None) -> "Source":
-        """Return the beam of an instrument.
+        """Make the source of an instrument's beam.
 
         Args:
             instrument: with the beam.
-            rays: position [um], unit direction and weight of the given rays [n, 7], where the beam is made of such.
+            rays: position [um], unit direction and weight of the rays of a beam of kind "rays" [n, 7].
 
         Raises:
-            SceneError: the beam is made of rays, and they are not given.
+            SceneError: `rays` is missing.
         """
         beam = instrument.beam
         if beam.source == "rays" and rays is None:
-            raise SceneError(f"beam.file: the rays of {beam.file} are not known here: trace from the scene file")
+            raise SceneError(f"beam.file: the rays of {beam.file} are not loaded: trace from the scene file")
         given = np.zeros((0, 7)) if rays is None else np.column_stack([rays[:, :6], np.cumsum(rays[:, 6])])
         given[:, 6] /= given[-1, 6] if len(given) else 1.0
         size, frame = beam.source_size_mrad * 1e-3, axis_frame(instrument.beam_direction)
@@ -94,14 +93,14 @@ class Source:
 
     @classmethod
     def effusive(cls, instrument: Instrument, exponent: float) -> "Source":
-        """Return the effusive beam of an instrument."""
+        """Make the source of an instrument's effusive beam."""
         frame = axis_frame(np.array([0.0, 0.0, -1.0]))
         return cls(_MODELS["effusive"], exponent, frame, instrument.beam.pinhole_radius_um, np.zeros((0, 7)))
 
 
 @kernel
 def beam_numbers(pixels, n_rays, n_replicates, points, seed):
-    """Return the random numbers of every beam ray [pixels * rays, 6], rays of a pixel together.
+    """Compute the random numbers of all beam rays [pixels * rays, 6], rays of a pixel together.
 
     Columns: pinhole 2, source angle 2, first aperture point 2.
     """
@@ -123,14 +122,14 @@ def beam_numbers(pixels, n_rays, n_replicates, points, seed):
 
 @kernel
 def bounce_number(seed, pixel_id, path, event):
-    """Return four random numbers of one path of a pixel for the bounce after `event`."""
+    """Compute four random numbers of one path of a pixel for the scattering after `event` events."""
     key, zero = np.uint64(seed), np.uint64(0)
     return philox(key, _BOUNCE_STREAM, np.uint64(pixel_id), np.uint64(path), np.uint64(event), zero)
 
 
 @kernel
 def first_bounce_shift(seed, pixel_id, replicate):
-    """Return the random shift of the low-discrepancy points of the first bounces of one replicate of a pixel."""
+    """Compute the random shift of the low-discrepancy points of first bounces of one replicate of a pixel."""
     zero = np.uint64(0)
     a, b, _, _ = philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), np.uint64(replicate), zero, zero)
     return a, b
@@ -145,10 +144,10 @@ def shifted(a, b, points, i):
 
 @kernel
 def bounce_numbers(pixel_ids, path, per_replicate, bounces, event, seed):
-    """Return two random numbers per path for the bounce after `event`, and two for the next aperture point [n, 4].
+    """Compute two random numbers per path for the scattering after `event` events, and two for the aperture [n, 4].
 
-    `path` counts the paths of a pixel (beam ray times branch); the first bounce (event 0) is low-discrepancy where
-    replicates of `per_replicate` > 0 paths are drawn (`Sampling.per_replicate`).
+    `path` counts the paths of a pixel (beam ray times branch). The first scattering (event 0) is low-discrepancy if
+    `per_replicate` (`Sampling.per_replicate`) is > 0.
     """
     out = np.empty((path.size, 4))
     for i in range(path.size):
@@ -192,16 +191,16 @@ def _launch(numbers, x, y, n_rays, pinhole, frame, radius, model, size, rays, or
 def footprint(
     instrument: Instrument, heights: np.ndarray, n_rays: int, seed: int, rays: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return where the beam's rays cross planes above the reference plane, along and across the beam [height, n, 2].
+    """Compute the points where the beam's rays cross planes above the substrate [height, n, 2] [um].
 
-    Positions are relative to where the beam's axis crosses the plane; the first one is along the beam's azimuth, um.
+    Points are relative to the beam axis in that plane: along the beam's azimuth, and across.
 
     Args:
         instrument: with the beam.
-        heights: of the planes above the sample's reference plane [height], um; below the plate.
-        n_rays: how many rays.
+        heights: of the planes above the substrate [height] [um]; below the plate.
+        n_rays: number of rays.
         seed: of the random numbers.
-        rays: of a beam that is made of such [n, 7].
+        rays: of a beam of kind "rays" [n, 7].
     """
     points = Sampling.make(n_rays, 1, 1, seed).points
     numbers = beam_numbers(np.zeros(1, np.int64), n_rays, 1, points, seed)
@@ -216,30 +215,18 @@ def footprint(
 def launch_rays(
     instrument: Instrument, x: np.ndarray, y: np.ndarray, numbers: np.ndarray, source: Source | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return origins [um] and unit directions of the rays, sample frame, both [pixels * rays, 3].
+    """Compute origins [um] and unit directions of the rays, sample frame, both [pixels * rays, 3].
 
     Args:
         instrument: beam and plate.
-        x, y: beam position of each pixel [pixels], um.
-        numbers: from `beam_numbers`, rays of one pixel together.
-        source: of the atoms; default: the instrument's beam.
+        x, y: beam position of each pixel [pixels] [um].
+        numbers: from `beam_numbers`.
+        source: default: the instrument's beam.
     """
     source = source or Source.beam(instrument)
-    dx, dy, dz = instrument.sample_origin(0.0, 0.0)
-    pinhole = instrument.pinhole_center + np.array([dx, dy, dz])
+    pinhole = instrument.pinhole_center + np.array(instrument.sample_origin(0.0, 0.0))
     origins, directions = np.empty((len(numbers), 3)), np.empty((len(numbers), 3))
-    _launch(
-        numbers,
-        np.ascontiguousarray(x, float),
-        np.ascontiguousarray(y, float),
-        len(numbers) // len(x),
-        pinhole,
-        source.frame,
-        source.radius,
-        source.model,
-        source.size,
-        source.rays,
-        origins,
-        directions,
-    )
+    x, y = (np.ascontiguousarray(a, float) for a in (x, y))
+    s, n_rays = source, len(numbers) // len(x)
+    _launch(numbers, x, y, n_rays, pinhole, s.frame, s.radius, s.model, s.size, s.rays, origins, directions)
     return origins, directions

@@ -1,4 +1,4 @@
-"""What the tracer counts: exact integer fates of all rays, analog hits, and sums of expected contributions."""
+"""Tallies of the tracer: integer fates of all rays, analog hits, and sums of expected contributions."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -6,9 +6,9 @@ import numpy as np
 
 DETECTED, ESCAPED, STOPPED, LOST = range(4)
 FATES = ("detected", "escaped", "stopped", "lost")
-"""Launched = detected + escaped + stopped + lost, per pixel, in exact integers (DESIGN.md section 2).
+"""Launched = detected + escaped + stopped + lost, per pixel, in integers.
 
-Stopped: ended by the cap on events, or stuck to a surface whose albedo is below 1."""
+Stopped: ended by `max_events`, or adsorbed on a surface whose albedo is below 1. Lost: hit a surface from behind."""
 
 
 @dataclass(frozen=True)
@@ -16,13 +16,13 @@ class Tally:
     """Counts of a set of pixels.
 
     Attributes:
-        fates: number of rays per fate (`FATES`) [4, pixels].
-        hits: detected rays (analog) [order, detector, pixels]; the last order is "and above".
+        fates: number of paths per fate (`FATES`) [4, pixels].
+        hits: detected paths (analog) [order, detector, pixels]; the last order includes all higher ones.
         sums: expected detections summed over the rays [order, replicate, detector, pixels] (no replicates: analog).
-        plate_hits, plate_sums: those of `hits` [detector, pixels] and `sums` [replicate, detector, pixels] that met
-            the plate before.
-        n_rays: beam rays launched per pixel.
-        n_branches: paths followed from the first hit of each beam ray; fates and hits count paths.
+        plate_hits, plate_sums: parts of `hits` [detector, pixels] and `sums` [replicate, detector, pixels] by paths
+            that a plate has scattered.
+        n_rays: beam rays per pixel.
+        n_branches: paths from the first hit of each beam ray.
     """
 
     fates: np.ndarray
@@ -37,7 +37,7 @@ class Tally:
     def zeros(
         cls, n_orders: int, n_detectors: int, n_pixels: int, n_replicates: int, n_rays: int, n_branches: int
     ) -> "Tally":
-        """Return an empty tally."""
+        """Make an empty tally."""
         return cls(
             np.zeros((len(FATES), n_pixels), np.int64),
             np.zeros((n_orders, n_detectors, n_pixels), np.int64),
@@ -56,9 +56,9 @@ class Tally:
     def estimate(self) -> "Estimate":
         """Reduce the replicates to means and variances.
 
-        With replicates: mean over them, variance of the mean from their spread (R - 1 degrees of freedom); the orders
-        of one path are correlated, so those of the total are taken from the replicates' totals. Analog: hits / rays
-        with the Poisson variance hits / rays^2.
+        With R replicates: their mean, and the variance of the mean from their spread (R - 1 degrees of freedom). The
+        orders of one path are correlated, so the variance of the total is that of the replicates' totals. Analog:
+        hits / rays with the Poisson variance hits / rays^2.
         """
         kept = (self.fates, self.hits, self.plate_hits, self.n_rays, self.n_branches)
         n_replicates, n = self.sums.shape[1], self.n_launched
@@ -71,20 +71,20 @@ class Tally:
 
 
 def _mean_and_variance(replicates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over the replicates (third axis from the end) and the variance of that mean."""
+    """Compute the mean over the replicates (third axis from the end) and the variance of that mean."""
     return replicates.mean(-3), replicates.var(-3, ddof=1) / replicates.shape[-3]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is kept of a tally once its pixels are traced: detection probabilities per ray, without the replicates.
+    """Detection probabilities per beam ray: a tally without its replicates.
 
     Attributes:
-        mean, variance: by order, the variance being that of the mean [order, detector, pixels].
-        total_mean, total_variance: of all orders together [detector, pixels].
-        plate_mean, plate_variance: of those of them that met the plate before [detector, pixels].
+        mean, variance: by order; variance of the mean [order, detector, pixels].
+        total_mean, total_variance: sum of all orders [detector, pixels].
+        plate_mean, plate_variance: part of the total by paths that a plate has scattered [detector, pixels].
         fates, hits, plate_hits, n_branches: as in `Tally`.
-        n_rays: beam rays launched per pixel: one number, or one for every pixel [pixels].
+        n_rays: beam rays per pixel: one number, or one for each pixel [pixels].
     """
 
     mean: np.ndarray
@@ -101,16 +101,16 @@ class Estimate:
 
     @classmethod
     def join(cls, parts: list["Estimate"]) -> "Estimate":
-        """Put blocks of pixels side by side, in order."""
+        """Concatenate blocks of pixels, in order."""
         joined = {name: np.concatenate([getattr(p, name) for p in parts], -1) for name in parts[0]._arrays()}
         return replace(parts[0], **joined)
 
     def take(self, pixels: np.ndarray | slice) -> "Estimate":
-        """Return some of the pixels, in the given order."""
+        """Select pixels, in the given order."""
         return replace(self, **{name: getattr(self, name)[..., pixels] for name in self._arrays()})
 
     def _arrays(self) -> list[str]:
-        """Return the names of what is kept per pixel."""
+        """Return the names of the attributes that are per pixel."""
         return [f.name for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)]
 
     @property
@@ -120,13 +120,13 @@ class Estimate:
 
     @property
     def n_unaccounted(self) -> int:
-        """Launched minus all fates, summed over pixels; anything but 0 is a bug."""
+        """Absolute difference of launched paths and all fates, summed over pixels; 0 unless there is a bug."""
         return int(np.abs(self.n_launched - self.fates.sum(0)).sum())
 
     def probability(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean detection probability per ray and its variance, both [order, detector, pixels]."""
+        """Return `mean` and `variance`."""
         return self.mean, self.variance
 
     def total(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same for all orders together [detector, pixels]."""
+        """Return `total_mean` and `total_variance`."""
         return self.total_mean, self.total_variance

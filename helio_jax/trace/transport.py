@@ -1,15 +1,15 @@
-"""Follow the atoms of a block of pixels from the pinhole to a detector or out of the scene.
+"""Trace the atoms of a block of pixels from the pinhole to a detector or out of the scene.
 
-All rays of a block fly in step: flight e starts after e events, each a scattering on the sample, which raises the
-path's order, or on the plate, which does not. Every path is walked as nature does it (re-emission by the law of the
-surface hit) and tallied in exact integers; the `expected` estimator adds, at every scattering, the probability of going
-straight to each detector (`next_event`).
+All rays of a block advance together: flight e starts after e events. An event is a scattering on the sample, which
+raises the path's order, or on the plate, which does not. Each path is an analog random walk (re-emission by the law of
+the surface hit), tallied in integers. The `expected` estimator adds at every scattering point the probability of
+flying directly to each detector (`next_event`).
 """
 
 import numpy as np
 
 from helio_jax.kernel import kernel
-from helio_jax.trace.analog import fly_to_the_end, land
+from helio_jax.trace.analog import flight_outcome, trace_fused
 from helio_jax.trace.experiment import Experiment, Paths, lift_off
 from helio_jax.trace.intersect import Hits
 from helio_jax.trace.laws import scatter_atoms
@@ -22,13 +22,13 @@ from helio_jax.trace.tally import STOPPED, Tally
 
 
 @kernel
-def _settle(
+def _tally_flight(
     event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
     shapes, fates, hits, plate_hits,
 ):  # fmt: skip
     """Tally the rays that end after this flight; return the indices of those that scatter.
 
-    A beam ray (event 0) stands for all of its branches.
+    A beam ray (event 0) counts as all of its branches.
     """
     n = origin.shape[0]
     keep = np.empty(n, np.int64)
@@ -36,7 +36,7 @@ def _settle(
     share = n_branches if event == 0 else 1
     for i in range(n):
         p = pixel[i]
-        fate, k = land(
+        fate, k = flight_outcome(
             event, event >= max_events, origin, direction, i, surface[i], is_back[i], offset[p, 0], offset[p, 1],
             plate_z, shapes,
         )  # fmt: skip
@@ -64,7 +64,7 @@ def _bounce(normal, u):
 
 @kernel
 def _history(surface, normal, order, met_plate):
-    """Return what is kept of each path's past once this surface has scattered it: `normal`, `order`, `met_plate`."""
+    """Return `normal`, `order` and `met_plate` of each path after its scattering on `surface`."""
     normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
     for i in range(surface.size):
         if surface[i] == PLATE:
@@ -89,9 +89,9 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
 
 
 def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, stopped: np.ndarray) -> Paths:
-    """Return the rays that leave the scattering points, several from each after the beam's first hit.
+    """Return the rays re-emitted at the scattering points, `n_branches` from each of the beam's first hits.
 
-    Atoms that stick are added to `stopped` [pixels].
+    Adsorbed atoms are added to `stopped` [pixels].
     """
     s = e.sampling
     if event == 0 and s.n_branches > 1:
@@ -120,8 +120,8 @@ def trace_block(
     Args:
         experiment: sample, instrument and settings.
         pixel_ids: number of each pixel in the scan, the key of its random numbers [pixels].
-        x, y: beam positions [pixels], um.
-        first: where all beam rays of a pixel meet the sample [pixels], where that is known; default: traced.
+        x, y: beam positions [pixels] [um].
+        first: known first hit of all beam rays of each pixel [pixels]; None: the beam is traced.
     """
     e, s, table = experiment, experiment.sampling, experiment.apertures
     tally = Tally.zeros(
@@ -140,7 +140,7 @@ def trace_block(
             if caught is not None and (ends := caught >= 0).any():
                 count_caught(tally, caught[ends], paths.pixel[ends], paths.order[ends], paths.met_plate[ends])
                 hits, paths = hits.take(~ends), paths.take(~ends)
-        keep = _settle(
+        keep = _tally_flight(
             event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
             hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes, tally.fates, tally.hits,
             tally.plate_hits,
@@ -152,8 +152,8 @@ def trace_block(
         hits, paths = hits.take(keep), paths.take(keep)
         if e.is_expected:
             add_next_event(e, event, ids, tally, hits, paths, offset)
-        if e.is_plain(event):
-            fly_to_the_end(e, event, ids, hits, paths, offset, tally)
+        if e.can_fuse(event):
+            trace_fused(e, event, ids, hits, paths, offset, tally)
             break
         paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
     return tally

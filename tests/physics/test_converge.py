@@ -104,7 +104,7 @@ def test_as_good_as_counting(bshem):
     [
         ({"trace.estimator": "analog", "trace.target_error": 0.1}, "trace: target_error needs estimator = 'expected'"),
         ({"trace.target_error": 0.1, "trace.max_rays": 8}, "max_rays must be >= rays = 64, got 8"),
-        ({"trace.target_error": 0.1, "trace.target_atoms": 9.0}, "remove one of both"),
+        ({"trace.target_error": 0.1, "trace.target_atoms": 9.0}, "remove one of them"),
         ({"trace.target_atoms": 9.0, "trace.max_rays": 8}, "max_rays must be >= rays = 64, got 8"),
         ({"trace.target_error": 0.0}, r"trace.target_error = 0.0: must be > 0"),
     ],

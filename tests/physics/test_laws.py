@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from stats import assert_likely, assert_mean, pooled_chi2
 
+from helio_jax.kernel import kernel
 from helio_jax.scene.body import Body
 from helio_jax.scene.scattering import (
     BackscatteringLaw,
@@ -20,7 +21,7 @@ from helio_jax.scene.scattering import (
     UniformLaw,
 )
 from helio_jax.scene.shapes import FlatSample, Sphere, SpheresSample, TrenchSample
-from helio_jax.trace.laws import lobe_densities, scatter_atoms
+from helio_jax.trace.laws import lobe_density, scatter_atoms
 from helio_jax.trace.lawtable import make_law_table, open_share
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
@@ -71,9 +72,18 @@ def draw(law, direction, normal=UP, n=N_DRAWN, seed=3):
 
 def density(law, direction, out, normal=UP):
     """Density of the lobes for directions out [..., 3]."""
+    d, n = (np.asarray(v, float) for v in (direction, normal))
     flat = np.ascontiguousarray(out.reshape(-1, 3))
-    d, n = (np.tile(np.asarray(v, float), (len(flat), 1)) for v in (direction, normal))
-    return lobe_densities(make_law_table([law.terms()]), 0, d, n, flat).reshape(out.shape[:-1])
+    return lobe_densities(make_law_table([law.terms()]), d, n, flat).reshape(out.shape[:-1])
+
+
+@kernel
+def lobe_densities(table, d, n, out):
+    """`lobe_density` of the first material for directions out [n, 3]."""
+    found = np.empty(out.shape[0])
+    for i in range(found.size):
+        found[i] = lobe_density(table, 0, d, n, out[i])
+    return found
 
 
 def hemisphere(n_cosines: int, n_turns: int) -> np.ndarray:

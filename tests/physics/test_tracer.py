@@ -63,7 +63,7 @@ def test_one_kernel_gives_the_bits_of_separate_steps(bshem, monkeypatch, estimat
     x, y = grid(9, 1200.0)
     settings = TraceSettings(rays=16, branches=branches, estimator=estimator)
     fast = trace_pixels(make_experiment(sphere_a(), bshem, settings), x, y)
-    monkeypatch.setattr(Experiment, "is_plain", lambda *_: False)
+    monkeypatch.setattr(Experiment, "can_fuse", lambda *_: False)
     slow = trace_pixels(make_experiment(sphere_a(), bshem, settings), x, y)
     for name in ("mean", "variance", "hits", "fates"):
         assert np.array_equal(getattr(fast, name), getattr(slow, name)), name
