@@ -1,8 +1,8 @@
-"""What is traced: a scan's description under a key, cut into units of work.
+"""Description of a scan to be traced (`Job`) and its units of work.
 
-The key is a hash of everything that the result depends on: scene, settings of the tracer, the sample's surface, this
-program's code and the libraries under it. Two results belong together when their keys are equal; when not,
-`differences` says why.
+The key of a job is a hash of everything that the result depends on: scene, settings of the tracer, the sample's
+surface, this program's code and its libraries. Results may be merged if their keys are equal; if not, `differences`
+lists why.
 """
 
 import functools
@@ -28,18 +28,18 @@ from helio_jax.trace.run import effusive_settings, paths_of
 from helio_jax.trace.settings import TraceSettings
 
 MAX_PIXELS = 65536
-"""Pixels of a unit at most, so that its maps of cause need no more memory than a block of rays."""
+"""Limit of pixels per unit, so that its maps need no more memory than a block of rays."""
 SURFACE_STEP = 1e-7
-"""Surfaces are the same when their coordinates agree to this share of their size: CPUs differ in a sine's last bit."""
+"""Rounding of coordinates before hashing, relative to the size: CPUs differ in the last bit of a sine."""
 LAW_STEP = 1e-9
-"""Likewise for the numbers of scattering laws, which are of order 1."""
+"""Rounding of the numbers of scattering laws, which are of order 1."""
 _PROGRAM = ("trace/*.py", "scene/*.py", "instrument.py", "detector.py")
 _LIBRARIES = ("numpy", "numba", "embreex")
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A run of pixels in scan order: `start` up to and without `stop`."""
+    """Pixels `start` to `stop` (exclusive) in scan order."""
 
     number: int
     start: int
@@ -48,12 +48,12 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What all units of a scan have in common; small and made to be sent.
+    """Common description of all units of a scan, small enough to send to other processes.
 
     Attributes:
-        scene: what is imaged.
-        settings: how it is traced.
-        about: everything that the result depends on, as JSON-compatible values: `key` is its hash.
+        scene: sample and instrument.
+        settings: of the tracer.
+        about: everything that the result depends on, as JSON-compatible values; `key` is its hash.
     """
 
     scene: Scene
@@ -62,9 +62,9 @@ class Job:
 
     @classmethod
     def of(cls, scene: Scene, settings: TraceSettings, body: Body) -> "Job":
-        """Describe the tracing of a scene whose surface is `body`."""
+        """Make the job of a scene whose surface is `body`."""
         file = getattr(scene.sample, "file", None)
-        if scene.plate.is_mesh:  # maps of cause are of apertures in a flat plate
+        if scene.plate.is_mesh:  # maps need apertures in a flat plate
             settings = settings.model_copy(update={"maps": False})
         about = {
             "scene": scene.model_dump(mode="json", include=set(Scene.model_fields) - {"description"}),
@@ -72,8 +72,6 @@ class Job:
             "the materials' laws": _hash(scene.read_laws(), LAW_STEP),
             "the beam's rays": _hash(scene.read_rays(), LAW_STEP),
             "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
-            **_list_of_positions(scene),
-            **({} if (plate := scene.read_plate()) is None else {"the plate's surface": _hash_body(plate)}),
             "program": {
                 "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
                 **{name: _version(name) for name in _LIBRARIES},
@@ -94,7 +92,7 @@ class Job:
 
     @property
     def n_pixels(self) -> int:
-        """Pixels of all views; those of one view follow those of the one before."""
+        """Pixels of all views, view after view."""
         return self.n_view_pixels * len(self.views)
 
     @functools.cached_property
@@ -107,13 +105,19 @@ class Job:
         """Pixels of one view."""
         return math.prod(self.scene.image_shape)
 
+    @property
+    def paths_per_pixel(self) -> tuple[int, int]:
+        """Paths per pixel of the beam (without a target) and of the effusive beam."""
+        effusive = self.scene.beam.effusive
+        n_effusive = math.prod(paths_of(effusive_settings(self.settings, effusive))) if effusive else 0
+        return math.prod(paths_of(self.settings)), n_effusive
+
     def units(self) -> list[Unit]:
-        """Return the units of the scan, none across two views; they depend on the job alone, not on who runs them."""
-        n_rays, n_branches = paths_of(self.settings)
-        n_paths = (self.settings.max_rays if self.settings.has_target else n_rays) * n_branches
-        if effusive := self.scene.beam.effusive:
-            n_paths += math.prod(paths_of(effusive_settings(self.settings, effusive)))
-        size = min(max(1, self.settings.paths_per_unit // n_paths), MAX_PIXELS)
+        """Return the units of the scan, none across two views; a function of the job alone."""
+        n_beam, n_effusive = self.paths_per_pixel
+        if self.settings.has_target:
+            n_beam = self.settings.max_rays * self.settings.branches
+        size = min(max(1, self.settings.paths_per_unit // (n_beam + n_effusive)), MAX_PIXELS)
         n = self.n_view_pixels
         runs = [
             (s, min(s + size, first + n)) for first in range(0, self.n_pixels, n) for s in range(first, first + n, size)
@@ -121,23 +125,17 @@ class Job:
         return [Unit(i, start, stop) for i, (start, stop) in enumerate(runs)]
 
     def view_number(self, unit: Unit) -> int:
-        """Return which of the views a unit is of."""
+        """Return the index of the view that a unit belongs to."""
         return unit.start // self.n_view_pixels
 
     def pixels(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return numbers and beam positions x, y [um] of a run of pixels of one view."""
+        """Return numbers and beam positions x, y [um] of the pixels `start` to `stop` of one view."""
         ids = np.arange(start, stop)
         return ids, *self.scene.points(ids % self.n_view_pixels)
 
 
-def _list_of_positions(scene: Scene) -> dict[str, str]:
-    """Return what tells a list of positions that is in a file."""
-    is_list = isinstance(scene.scan, PositionList)
-    return {"the scan's positions": _hash(scene.scan.read(scene.base_dir), LAW_STEP)} if is_list else {}  # type: ignore[union-attr]
-
-
 def differences(then: Any, now: Any, names: tuple[str, str], place: str = "") -> list[str]:
-    """Say in which places two trees of JSON values differ; `names` are what to call the one and the other."""
+    """List the places where two trees of JSON values differ; `names` label the two."""
     if isinstance(then, (list, tuple)) and isinstance(now, (list, tuple)) and len(then) == len(now):
         then, now = dict(enumerate(then)), dict(enumerate(now))
     if isinstance(then, dict) and isinstance(now, dict):
@@ -154,19 +152,19 @@ def _short(value: Any) -> str:
 
 @functools.cache
 def instruction_set() -> str:
-    """Return the CPU's architecture and widest vector instructions: Embree and NumPy choose their code by them."""
+    """Return architecture and widest vector instructions of the CPU, by which Embree and NumPy choose their code."""
     found = llvm.get_host_cpu_features()
     kinds = ("avx512f", "avx2", "avx", "sse4.2", "sse2", "sve", "neon")
     return f"{platform.machine()} {next((k for k in kinds if found.get(k)), 'scalar')}"
 
 
 def _hash_body(body: Body) -> str:
-    """Return a hash of a surface that does not depend on the CPU which built it."""
+    """Hash a surface, independent of the CPU that built it."""
     return _hash(body, SURFACE_STEP * float(np.ptp(body.bounds, axis=0).max()))
 
 
 def _hash(value: Any, step: float) -> str:
-    """Return a hash of a tree of records, tables and arrays, whose numbers agree to `step`."""
+    """Hash a tree of records, tables and arrays, floating-point numbers rounded to `step`."""
     digest = hashlib.sha256()
     for piece in _pieces(value, step):
         digest.update(piece)
@@ -174,7 +172,7 @@ def _hash(value: Any, step: float) -> str:
 
 
 def _pieces(value: Any, step: float) -> Iterator[bytes]:
-    """Yield what identifies a tree of records, tables and arrays; floating-point numbers are rounded to `step`."""
+    """Yield the bytes that `_hash` hashes."""
     if isinstance(value, float):
         value = np.asarray(value)
     if is_dataclass(value):
@@ -193,7 +191,7 @@ def _pieces(value: Any, step: float) -> Iterator[bytes]:
 
 @functools.cache
 def _hash_program() -> str:
-    """Return a hash of the source files that a unit runs."""
+    """Hash the source files that a unit runs."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for path in sorted(path for pattern in _PROGRAM for path in root.glob(pattern)):

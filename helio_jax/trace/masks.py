@@ -38,7 +38,7 @@ def _sample_rays(k, sample, point, normal, offset, plate_z, shapes, area):
     return direction, weight, is_up
 
 
-def hidden_form_factor(
+def masked_form_factor(
     intersector: Intersector,
     instrument: Instrument,
     point: np.ndarray,
@@ -67,7 +67,7 @@ def hidden_form_factor(
     table = ApertureTable(instrument)
     origin, skip = lift_off(point, normal, surface, intersector.restart)
     n_detectors, n = len(table), len(point)
-    hidden, fraction = np.zeros((n_detectors, n, 3)), np.zeros((n_detectors, n))
+    masked, fraction = np.zeros((n_detectors, n, 3)), np.zeros((n_detectors, n))
     samples = aperture_samples(n_samples)
     for k in range(n_detectors):
         solid_angle = np.zeros(n)
@@ -80,10 +80,10 @@ def hidden_form_factor(
             is_open[todo] = ~intersector.is_occluded(origin[todo], direction[todo], skip[todo])
             size = np.linalg.norm(weight, axis=1)
             solid_angle += size
-            hidden[k, ~is_open] += weight[~is_open]
+            masked[k, ~is_open] += weight[~is_open]
             fraction[k, ~is_open] += size[~is_open]
         fraction[k] /= solid_angle
-    return hidden, fraction
+    return masked, fraction
 
 
 def axis_rays(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

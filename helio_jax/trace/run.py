@@ -1,7 +1,7 @@
-"""Trace pixels: cut them into blocks, trace these on threads, reduce each as it finishes, put them in order.
+"""Trace pixels in blocks on threads.
 
-A block is a pure function of the experiment and its pixels, and the blocks are joined in their order, so the
-result is bitwise the same for any number of worker threads. Whole scans: `scan`.
+A block is a pure function of the experiment and its pixels, and blocks are joined in order, so the result is bit for
+bit the same for any number of threads. `scan` traces whole scans.
 """
 
 import os
@@ -29,24 +29,24 @@ from helio_jax.trace.tally import LOST, Estimate
 from helio_jax.trace.transport import trace_block
 
 RAYS_PER_BLOCK = 65536
-"""Rays traced together: Embree is fastest with about 64k neighbouring rays."""
+"""Rays per block: Embree is fastest with about 64k neighbouring rays."""
 N_REPLICATES = 8
-"""Independent shifts of the low-discrepancy points, from whose spread the standard error is taken."""
+"""Independent shifts of the low-discrepancy points; their spread gives the standard error."""
 MAX_LOST = 1e-4
-"""Largest share of lost rays that is tolerated."""
+"""Limit of the share of lost rays."""
 
 T = TypeVar("T")
 Progress = Callable[[int, int], None]
-"""Called with (pixels done, pixels in all)."""
+"""Called with (pixels done, pixels in total)."""
 
 
 def n_cpus() -> int:
-    """Return how many CPUs this process may use: those of a batch job's allocation, not all of the machine."""
+    """Return the number of CPUs that this process may use, e.g. those that a batch system allocated."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def paths_of(settings: TraceSettings) -> tuple[int, int]:
-    """Return beam rays per pixel and paths per ray; the expected estimator rounds the rays up to a multiple of 8."""
+    """Return beam rays per pixel (`expected`: rounded up to a multiple of `N_REPLICATES`) and paths per ray."""
     if settings.estimator == "analog":
         return settings.rays, 1
     return -(-settings.rays // N_REPLICATES) * N_REPLICATES, settings.branches
@@ -66,13 +66,13 @@ def make_experiment(
         body: the sample.
         instrument: beam, plate and detectors.
         settings: rays, estimator, seed.
-        laws: scattering law of each of the body's materials and the plate's; "cosine" need not be given.
-        rays: position [um], direction and weight of the beam's rays, where it is made of such [n, 7].
-        plate: mesh of a plate of kind "mesh", in its frame.
+        laws: scattering laws of the materials of body and plate; "cosine" is known.
+        rays: position [um], direction and weight of the rays of a beam of kind "rays" [n, 7].
+        plate: mesh of a plate of kind "mesh", plate frame.
 
     Raises:
-        SceneError: a material has no law, the beam's rays or the plate's mesh are missing, or a lattice stands upright
-            on a face; or expected counts are asked for under a mesh plate.
+        SceneError: a law, the beam's rays or the plate's mesh are missing; a lattice plane is nearly perpendicular to
+            a face; or the expected estimator with a mesh plate.
     """
     intersector = body if isinstance(body, Intersector) else Intersector(body)
     solid = _plate_of(instrument, settings, plate, len(intersector.materials))
@@ -91,12 +91,14 @@ def make_experiment(
     if (effusive := instrument.beam.effusive) is None:
         return experiment
     source = Source.effusive(instrument, effusive.exponent)
-    sampling = _sampling(effusive_settings(settings, effusive), settings.seed - 2**63)  # no seed of a beam is negative
+    sampling = _sampling(
+        effusive_settings(settings, effusive), settings.seed - 2**63
+    )  # differs from all seeds of beams, which are >= 0
     return replace(experiment, effusive=replace(experiment, source=source, sampling=sampling))
 
 
 def effusive_settings(settings: TraceSettings, effusive: Effusive) -> TraceSettings:
-    """Return how the effusive beam is traced: as the beam, with its own number of rays."""
+    """Return the settings of the effusive beam: those of the beam with its own number of rays."""
     return settings.model_copy(update={"rays": effusive.rays})
 
 
@@ -107,25 +109,24 @@ def _sampling(settings: TraceSettings, seed: int) -> Sampling:
 def _plate_of(
     instrument: Instrument, settings: TraceSettings, body: Body | None, material: int
 ) -> PlateTable | MeshPlate | None:
-    """Return what scatters above the sample; `material` is its number among the laws."""
+    """Return the scattering plate, if any; `material` is its index among the laws."""
     if not instrument.plate.is_scattering:
         return None
     if not instrument.plate.is_mesh:
         return PlateTable.of(instrument, material)
     if settings.estimator != "analog":
         raise SceneError(
-            f"estimator = {settings.estimator!r}: under a plate of kind 'mesh' only whole atoms are counted: set "
-            "trace.estimator = 'analog'"
+            f"trace.estimator = {settings.estimator!r}: a plate of kind 'mesh' needs trace.estimator = 'analog'"
         )
     if body is None:
-        raise SceneError(f"plate.file: the mesh {instrument.plate.file} is not known here: trace from the scene file")
+        raise SceneError(f"plate.file: the mesh {instrument.plate.file} is not loaded: trace from the scene file")
     return MeshPlate(body, instrument, material)
 
 
 def _law_table(
     intersector: Intersector, plate: Plate, solid: PlateTable | MeshPlate | None, laws: Mapping[str, tuple[Term, ...]]
 ) -> LawTable | None:
-    """Return the laws of the body's materials, and at last a scattering plate's; None if all are the cosine law."""
+    """Return the laws of the body's materials, then of a scattering plate; None if all are the cosine law."""
     names = (*intersector.materials, *((plate.material or COSINE,) if plate.is_scattering else ()))
     if missing := [name for name in names if name not in laws]:
         raise SceneError(f"material {missing[0]!r} has no law: add the table [material.{missing[0]}] to the scene")
@@ -142,7 +143,7 @@ def _law_table(
 def in_order(workers: int, tasks: Iterable[Callable[[], T]]) -> Generator[T, None, None]:
     """Run tasks on threads and yield their results in order.
 
-    At most two per thread are begun or wait to be fetched; a single thread begins none while a result is dealt with.
+    At most two per thread are submitted or unread; a single thread starts no task while the caller uses a result.
     """
     waiting: list[Future[T]] = []
     n_ahead = 2 * workers if workers > 1 else 1
@@ -160,7 +161,7 @@ def in_order(workers: int, tasks: Iterable[Callable[[], T]]) -> Generator[T, Non
 
 
 def pixels_per_block(experiment: Experiment) -> int:
-    """Return how many pixels are traced together."""
+    """Return the number of pixels per block."""
     return max(1, RAYS_PER_BLOCK // (experiment.sampling.n_rays * experiment.sampling.n_branches))
 
 
@@ -172,12 +173,12 @@ def trace_pixels(
     first: Hits | None = None,
     max_lost: float = MAX_LOST,
 ) -> Estimate:
-    """Trace the pixels at beam positions (x, y) [n], um, in this order.
+    """Trace the pixels at beam positions (x, y) [n] [um], in this order.
 
-    With `first` [n] the atoms start from these points of the sample, with these normals, instead of from the beam.
+    With `first` [n], the first scattering points and normals are these instead of the hits of the beam.
 
     Raises:
-        GuardError: rays are unaccounted for, or a larger share than `max_lost` of them was lost.
+        GuardError: rays are unaccounted for, or a larger share than `max_lost` was lost.
     """
     size = pixels_per_block(experiment)
 
@@ -192,13 +193,13 @@ def trace_pixels(
 
 
 def check_rays(fates: np.ndarray, n_unaccounted: int, n_launched: int, max_lost: float = MAX_LOST) -> None:
-    """Check the book-keeping of (a part of) a run: rays per fate [4], of `n_launched` in the whole run.
+    """Check the rays per fate [4] of (a part of) a run with `n_launched` rays in total.
 
     Raises:
-        GuardError: rays are unaccounted for, or a larger share than `max_lost` of all was lost.
+        GuardError: rays are unaccounted for, or a larger share than `max_lost` of all rays was lost.
     """
     if n_unaccounted:
-        raise GuardError(f"{n_unaccounted} rays are unaccounted for: please report it with the scene")
+        raise GuardError(f"{n_unaccounted} rays are unaccounted for: please report this with the scene")
     lost = int(fates[LOST])
     if lost > max_lost * n_launched:
         raise GuardError(
@@ -208,6 +209,6 @@ def check_rays(fates: np.ndarray, n_unaccounted: int, n_launched: int, max_lost:
 
 
 def first_hits(intersector: Intersector, instrument: Instrument, x: np.ndarray, y: np.ndarray) -> Hits:
-    """Return where the beam axis first meets the sample, for beam positions (x, y) [n], um."""
+    """Compute the first hits of the beam axis on the sample for beam positions (x, y) [n] [um]."""
     origin, direction = axis_rays(instrument, x, y)
     return intersector.nearest(origin, direction, np.full(len(x), -1, np.int32))

@@ -1,10 +1,9 @@
-"""Trace a whole scan: run its units on threads, processes or a cluster, and put their results together.
+"""Trace a whole scan: run its units on threads, processes or a cluster and join the results.
 
-`Executor` says who runs the units; all run the same code, so the counts do not depend on it. Nothing is stored here:
-`checkpoint` keeps finished units on disk.
+All kinds of `Executor` run the same code, so the counts do not depend on it. Results stay in memory;
+`workflows.checkpoint` stores finished units on disk.
 """
 
-import math
 import os
 import signal
 import threading
@@ -27,30 +26,30 @@ from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.job import Job, Unit
-from helio_jax.trace.run import Progress, check_rays, effusive_settings, in_order, n_cpus, paths_of
+from helio_jax.trace.run import Progress, check_rays, in_order, n_cpus
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.tally import FATES, Estimate
-from helio_jax.trace.units import UnitResult, experiment_of, join_pieces, tasks, trace_unit
+from helio_jax.trace.tally import FATES
+from helio_jax.trace.units import UnitResult, join_pieces, result_shapes, trace_unit, unit_tasks, view_experiment
 
 MAX_DEATHS = 3
-"""Times that worker processes may die without any unit finished in between."""
+"""Consecutive deaths of worker processes without a finished unit that stop the run."""
 MAX_SENT = 1024
-"""Units sent to a cluster at a time."""
+"""Limit of units submitted to a cluster at a time."""
 CONNECT_SECONDS = 10
-"""How long a scheduler may take to answer [s]."""
+"""Time limit for the connection to a scheduler [s]."""
 Results = Generator[tuple[Unit, UnitResult], None, None]
-"""Units with their results, as they finish; close it to stop the work."""
+"""Yields units with their results as they finish; closing it stops the work."""
 
 
 @dataclass(frozen=True)
 class Executor:
-    """Who runs the units of a job: threads of this process unless told otherwise.
+    """Runs the units of a job, by default on threads of this process.
 
     Attributes:
-        workers: threads or processes; default: one per CPU that this process may use.
-        processes: run worker processes instead of threads. They import the main module again: a script that calls
-            this needs `if __name__ == "__main__":`.
-        scheduler: address of a dask scheduler, whose workers run the units.
+        workers: number of threads or processes; default: one per CPU that this process may use.
+        processes: use worker processes instead of threads. They import the main module: a calling script needs
+            `if __name__ == "__main__":`.
+        scheduler: address of a dask scheduler whose workers run the units.
     """
 
     workers: int | None = None
@@ -58,10 +57,10 @@ class Executor:
     scheduler: str | None = None
 
     def run(self, job: Job, units: list[Unit], body: Body, progress: Progress | None = None) -> Results:
-        """Yield every unit with its result as it finishes.
+        """Yield each unit with its result as it finishes.
 
         Raises:
-            StoppedRun: workers died or were lost again and again.
+            StoppedRun: workers died or were lost repeatedly.
             MissingDependencyError: dask.distributed is not installed.
             SceneError: no scheduler answers at the address.
         """
@@ -71,11 +70,11 @@ class Executor:
             results = _on_processes(self.workers or n_cpus(), job, units)
         else:
             return _on_threads(self.workers or n_cpus(), job, units, body, progress)
-        return _watched(results, job.n_pixels, sum(u.stop - u.start for u in units), progress)
+        return _with_progress(results, job.n_pixels, sum(u.stop - u.start for u in units), progress)
 
 
-def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | None) -> Results:
-    """Report every finished unit."""
+def _with_progress(results: Results, n_pixels: int, n_todo: int, progress: Progress | None) -> Results:
+    """Call `progress` after each unit."""
     done = n_pixels - n_todo
     with closing(results):
         for unit, unit_result in results:
@@ -86,14 +85,14 @@ def _watched(results: Results, n_pixels: int, n_todo: int, progress: Progress | 
 
 
 def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress: Progress | None) -> Results:
-    """Run the pieces of all units on threads, in order, so that all CPUs work on one or two units at a time."""
+    """Run the tasks of all units on threads, in order, so that all CPUs work on one or two units at a time."""
 
-    @lru_cache(maxsize=2)  # work is begun on the next view before the last one is finished
+    @lru_cache(maxsize=2)  # tasks of the next view start before the last view is finished
     def prepared(number: int) -> Experiment:
-        return experiment_of(job, body, number)
+        return view_experiment(job, body, number)
 
     def tasks_of(unit: Unit) -> list:
-        return tasks(prepared(job.view_number(unit)), job, unit)
+        return unit_tasks(prepared(job.view_number(unit)), job, unit)
 
     done = job.n_pixels - sum(unit.stop - unit.start for unit in units)
     with closing(in_order(workers, (task for unit in units for task in tasks_of(unit)))) as results:
@@ -101,14 +100,14 @@ def _on_threads(workers: int, job: Job, units: list[Unit], body: Body, progress:
             pieces = []
             for piece in islice(results, len(tasks_of(unit))):
                 pieces.append(piece)
-                done += piece.total_mean.shape[1] if isinstance(piece, Estimate) else 0
+                done += piece[1].total_mean.shape[1] if piece[0] == "beam" else 0
                 if progress:
                     progress(done, job.n_pixels)
             yield unit, join_pieces(prepared(job.view_number(unit)), pieces)
 
 
 def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
-    """Run units on spawned processes; those that die are replaced, and what they were at is done again."""
+    """Run units on spawned processes; dead processes are replaced and their units repeated."""
     left = {unit.number: unit for unit in units}
     n_deaths = 0
     while left:
@@ -129,7 +128,7 @@ def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the process that started this one, and end when that one ends, however it does."""
+    """Ignore Ctrl-C, which the parent process handles, and exit when the parent process ends for any reason."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
 
@@ -141,7 +140,7 @@ def _begin_worker() -> None:
 
 
 def _on_cluster(address: str, job: Job, units: list[Unit]) -> Results:
-    """Run units on the workers of a dask scheduler, which repeats what a lost worker was at."""
+    """Run units on the workers of a dask scheduler, which repeats the units of lost workers."""
     try:
         from distributed import Client, KilledWorker
     except ImportError:
@@ -159,7 +158,7 @@ def _on_cluster(address: str, job: Job, units: list[Unit]) -> Results:
                 yield from results
         except (KilledWorker, futures.CancelledError, OSError) as e:
             raise StoppedRun(
-                f"the cluster lost the work ({type(e).__name__}: {e}): look at its workers' logs"
+                f"the cluster lost the work ({type(e).__name__}: {e}): see the logs of its workers"
             ) from None
 
 
@@ -173,7 +172,7 @@ def _submit(pool: futures.Executor, n_ahead: int, job: Job, units: list[Unit]) -
             if not waiting:
                 return
             done, _ = futures.wait(waiting, return_when=futures.FIRST_COMPLETED)
-            for future in sorted(done, key=lambda f: f.exception() is not None):  # keep what was finished
+            for future in sorted(done, key=lambda f: f.exception() is not None):  # finished units first
                 yield waiting[future], future.result()
                 del waiting[future]
     finally:
@@ -182,68 +181,59 @@ def _submit(pool: futures.Executor, n_ahead: int, job: Job, units: list[Unit]) -
 
 
 class ScanResult:
-    """The micrographs of a job, filled unit by unit."""
+    """Result of a whole scan, filled unit by unit."""
 
     def __init__(self, job: Job) -> None:
-        n, n_detectors = job.n_pixels, len(job.scene.detector)
-        n_maps = n if job.settings.maps else 0
         self.job = job
-        self.by_order = np.zeros((job.settings.n_orders, n_detectors, n))
-        self.total, self.variance = np.zeros((n_detectors, n)), np.zeros((n_detectors, n))
-        self.plate = np.zeros((n_detectors, n if job.scene.plate.is_scattering else 0))
-        effusive = job.scene.beam.effusive
-        self.effuse = np.zeros((n_detectors, n if effusive else 0))
-        self.masked, self.shadowed = np.zeros((n_detectors, n_maps)), np.zeros(n_maps)
-        self.fates, self.effuse_fates = np.zeros(len(FATES), np.int64), np.zeros(len(FATES), np.int64)
+        self.arrays = {name: np.zeros(shape) for name, shape in result_shapes(job, job.n_pixels).items()}
         self.cpus: set[str] = set()
         self.missing = {unit.number for unit in job.units()}
-        self.n_launched = job.n_pixels * math.prod(paths_of(job.settings))
-        self.n_effused = (
-            job.n_pixels * math.prod(paths_of(effusive_settings(job.settings, effusive))) if effusive else 0
-        )
+        self.n_launched = {
+            name: job.n_pixels * n for name, n in zip(("fates", "effuse_fates"), job.paths_per_pixel, strict=True)
+        }
 
     def put(self, unit: Unit, unit_result: UnitResult) -> None:
         """Store the result of a unit at the pixels of the unit.
 
         Raises:
-            GuardError: more rays were lost so far than the whole scan may lose.
+            GuardError: the units so far have lost more rays than allowed in the whole scan.
         """
-        part = slice(unit.start, unit.stop)
-        for name in ("by_order", "total", "variance", "plate", "effuse", "masked", "shadowed"):
-            if getattr(self, name).size:
-                getattr(self, name)[..., part] = getattr(unit_result, name)
-        self.fates += unit_result.fates
-        self.effuse_fates += unit_result.effuse_fates
+        for name, array in self.arrays.items():
+            if name in self.n_launched:
+                array += getattr(unit_result, name)
+            else:
+                array[..., unit.start : unit.stop] = getattr(unit_result, name)
         self.cpus.add(unit_result.cpu)
         self.missing.remove(unit.number)
-        check_rays(self.fates, 0, max(self.n_launched, int(self.fates.sum())))
-        check_rays(self.effuse_fates, 0, self.n_effused)
+        for name, n in self.n_launched.items():
+            check_rays(self.arrays[name], 0, max(n, int(self.arrays[name].sum())))
 
     def micrographs(self) -> Micrographs:
-        """Return the micrographs, a set of stacks where there are several views. All units must have been put.
+        """Return the micrographs of the complete scan: a stack, or a set of stacks for several views.
 
-        The estimate of a nearly dark pixel may fall below zero by its own error; it is then set to 0, and the number
-        of such pixels is recorded in the provenance (`trace_pixels` gives the unclipped values).
+        An estimate in a nearly dark pixel may be negative within its error. It is set to 0, and the number of such
+        pixels is recorded in the provenance (`trace_pixels` gives the original values).
+
+        Raises:
+            ValueError: units are missing.
         """
         if self.missing:
             raise ValueError(f"units {sorted(self.missing)} are missing")
-        n, n_views = self.job.n_view_pixels, len(self.job.views)
+        job, n = self.job, self.job.n_view_pixels
         fates, effuse_fates = (
             {"launched": int(f.sum()), **{name: int(n) for name, n in zip(FATES, f, strict=True)}}
-            for f in (self.fates, self.effuse_fates)
+            for f in (self.arrays["fates"], self.arrays["effuse_fates"])
         )
-        note = {"note": "traced on CPUs of several kinds: equal in the mean, not in the last bits"}
-        about: dict[str, Any] = {
-            "rays": fates,
-            **({"effusive_rays": effuse_fates} if self.job.scene.beam.effusive else {}),
-            "job": self.job.key,
-            "cpu": sorted(self.cpus),
-            **(note if len(self.cpus) > 1 else {}),
-        }
-        if self.job.settings.has_target:
-            about["rays_per_pixel"] = fates["launched"] / self.job.settings.branches / self.job.n_pixels
-        stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(n_views))
-        if n_views == 1:
+        about: dict[str, Any] = {"rays": fates}
+        if job.scene.beam.effusive:
+            about["effusive_rays"] = effuse_fates
+        about |= {"job": job.key, "cpu": sorted(self.cpus)}
+        if len(self.cpus) > 1:
+            about["note"] = "traced on CPUs of several kinds: equal in the mean, not in the last bits"
+        if job.settings.has_target:
+            about["rays_per_pixel"] = fates["launched"] / job.settings.branches / job.n_pixels
+        stacks = tuple(self._stack_of(i, slice(i * n, (i + 1) * n)) for i in range(len(job.views)))
+        if len(stacks) == 1:
             return stacks[0].replace(provenance={**stacks[0].provenance, **about})
         return MicrographSet(stacks, about)
 
@@ -254,25 +244,29 @@ class ScanResult:
         scale = float(scene.scan.atoms_per_pixel) if is_expected else 1.0
         effusive = scene.beam.effusive
         effused = float(effusive.atoms_per_pixel) if is_expected and effusive else 1.0
-        n_negative = int(np.sum(self.total[:, pixels] < 0))
-        missed = {}
+        total, variance = (self.arrays[name][:, pixels] for name in ("total", "variance"))
+        about = {"trace": settings.model_dump(mode="json"), "n_negative": int(np.sum(total < 0))}
         if settings.target_error is not None:
-            limit = settings.target_error * self.total[:, pixels]
-            missed["n_above_target"] = int(np.sum(np.any(np.sqrt(self.variance[:, pixels]) > limit, axis=0)))
+            is_above = np.sqrt(variance) > settings.target_error * total
+            about["n_above_target"] = int(np.sum(np.any(is_above, axis=0)))
+        about["materials"] = {name: law.kind for name, law in scene.used_materials.items()}
+        if view.about:
+            about["view"] = view.about
         images: dict[str, Any] = {}
-        for name, array, factor in (
-            ("by_order", self.by_order, scale),
-            ("counts", self.total, scale),
-            ("variance", self.variance, scale**2),
-            ("plate", self.plate, scale),
-            ("effuse", self.effuse, effused),
+        for name, array_name, factor in (
+            ("by_order", "by_order", scale),
+            ("counts", "total", scale),
+            ("variance", "variance", scale**2),
+            ("plate", "plate", scale),
+            ("effuse", "effuse", effused),
         ):
-            if not array.size:
-                continue
-            images[name] = array[..., pixels]
-            np.maximum(images[name], 0.0, out=images[name])
-            images[name] *= factor
-        images |= {"masked": self.masked[:, pixels], "shadowed": self.shadowed[pixels]} if settings.maps else {}
+            array = self.arrays[array_name]
+            if array.size:
+                images[name] = array[..., pixels]  # scaled in place, to save memory
+                np.maximum(images[name], 0.0, out=images[name])
+                images[name] *= factor
+        if settings.maps:
+            images |= {"masked": self.arrays["masked"][:, pixels], "shadowed": self.arrays["shadowed"][pixels]}
         x, y = scene.positions()
         is_list = isinstance(scene.scan, PositionList)
         return MicrographStack(
@@ -298,19 +292,19 @@ class ScanResult:
 def trace_scene(
     scene: Scene, settings: TraceSettings, progress: Progress | None = None, body: Body | None = None
 ) -> Micrographs:
-    """Simulate the micrographs of a scene in memory, on threads: a stack, or a set where the scan has several views.
+    """Simulate the micrographs of a scene in memory, on threads: a stack, or a set for a scan with several views.
 
-    The `expected` estimator gives the expected counts for `scene.scan.atoms_per_pixel` atoms and the variance of
-    its own mean; `analog` gives the integer counts of `settings.rays` atoms and their Poisson variance.
+    The `expected` estimator gives expected counts for `scene.scan.atoms_per_pixel` atoms and the variance of their
+    mean; `analog` gives integer counts of `settings.rays` atoms and their Poisson variance.
 
     Args:
         scene: beam, plate, detectors, sample and scan.
         settings: rays, estimator, seed, workers.
-        progress: called as blocks finish.
-        body: the sample's surface, where it is known already (else `scene.sample` is built).
+        progress: called after each block.
+        body: the sample's surface; default: built from `scene.sample`.
 
     Raises:
-        GuardError: ray book-keeping failed.
+        GuardError: rays are unaccounted for, or too many were lost.
     """
     body = scene.build_body() if body is None else body
     job = Job.of(scene, settings, body)

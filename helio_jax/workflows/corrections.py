@@ -160,7 +160,7 @@ class _Side:
         """Compute the masked vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
         r, p = self.raster, self.points.take(is_wanted.ravel())
         offset = np.stack(r.instrument.sample_origin(r.x[is_wanted], r.y[is_wanted])[:2], -1)
-        found, _ = masks.hidden_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)
+        found, _ = masks.masked_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)
         out = np.zeros((len(found), 3, *is_wanted.shape))
         out[:, :, is_wanted] = np.moveaxis(found, -1, 1)
         return out

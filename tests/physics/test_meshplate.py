@@ -259,7 +259,7 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"trace\.estimator = 'expected': .* set trace\.estimator = 'analog'"):
         load_scene(scene_of(tmp_path))
     scene = load_scene(scene_of(tmp_path, 'estimator = "analog"\n'))
-    with pytest.raises(SceneError, match="only whole atoms are counted"):
+    with pytest.raises(SceneError, match=r"needs trace\.estimator = 'analog'"):
         pipeline.simulate(scene, estimator="expected")
     for changes, message in (
         ({"plate.radius_um": 9.0}, 'a mesh plate has no radius_um: set kind = "scattering" or remove the key'),

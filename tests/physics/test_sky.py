@@ -17,7 +17,7 @@ from helio_jax.formats.hdf5 import read, write
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.scattering import BroadSpecularLaw
 from helio_jax.scene.shapes import FlatSample, TrenchSample
-from helio_jax.trace.masks import hidden_form_factor
+from helio_jax.trace.masks import masked_form_factor
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.workflows import pipeline
@@ -123,7 +123,7 @@ def test_masked_share_of_a_cone():
     x, y = np.zeros(2), np.array([40.0, 800.0])
     hits = first_hits(experiment.intersector, instrument, x, y)
     about = hits.point, hits.normal, hits.surface, np.stack(instrument.sample_origin(x, y)[:2], -1)
-    hidden, fraction = hidden_form_factor(experiment.intersector, instrument, *about, n_samples=4000)
+    hidden, fraction = masked_form_factor(experiment.intersector, instrument, *about, n_samples=4000)
     single = trace_pixels(experiment, x, y).mean[0]
     closed = np.array([share(30.0, 25.0), share(50.0, 39.0)])[:, None]
     assert np.all(fraction[:, 1] == 0.0) and np.all(fraction[:, 0] > 0.1)

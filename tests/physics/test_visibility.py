@@ -12,7 +12,7 @@ from helio_jax.forward.masking import hidden_form_factor, hidden_response
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.surfaces import first_hit_spheres, surface_body
 from helio_jax.trace.intersect import Intersector
-from helio_jax.trace.masks import hidden_form_factor as hidden_by_rays
+from helio_jax.trace.masks import masked_form_factor as hidden_by_rays
 
 PITCH = (12.0, 9.0)
 """Raster pitch dx, dy, um: unequal, so that exchanged axes show."""
