@@ -12,16 +12,13 @@ import numpy as np
 
 from helio_jax.errors import SceneError
 from helio_jax.kernel import kernel
-from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.analog import flight_outcome
-from helio_jax.trace.experiment import Experiment, lift_off
-from helio_jax.trace.laws import scatter_atoms
-from helio_jax.trace.lawtable import make_law_table
+from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.run import make_experiment
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.source import beam_numbers, bounce_numbers, launch_rays
 from helio_jax.trace.tally import DETECTED, ESCAPED, FATES, STOPPED
+from helio_jax.trace.transport import launch_paths, scatter
 
 MAX_ATOMS = 5_000_000
 """Limit of recorded atoms."""
@@ -115,40 +112,29 @@ def follow_scene(scene: Scene, settings: TraceSettings, pixel: tuple[int, int] |
 
 def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Atoms:
     """Record all atoms of some pixels with an analog experiment (arguments as in `transport.trace_block`)."""
-    e, s = experiment, experiment.sampling
-    laws = e.laws if e.laws is not None else make_law_table([COSINE_LAW] * len(e.intersector.materials))
+    e = experiment
     ids = np.ascontiguousarray(ids, np.int64)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
-    numbers = beam_numbers(ids, s.n_rays, 0, s.points, s.seed)
-    origin, direction = launch_rays(e.instrument, x, y, numbers, e.source)
-    n = len(origin)
-    pixel, path = np.repeat(np.arange(len(ids)), s.n_rays), np.tile(np.arange(s.n_rays), len(ids))
-    atoms, skip = np.arange(n), np.full(n, -1, np.int32)
-    point_last, direction_last = np.empty((n, 3)), np.empty((n, 3))
-    order, fate, detector = np.zeros(n, np.int64), np.full(n, -1), np.full(n, -1)
-    start = origin
+    paths = launch_paths(e, ids, x, y)
+    n, pixel, point, direction = len(paths.path), paths.pixel, paths.origin.copy(), paths.direction.copy()
+    order, fate, detector = np.zeros(n, np.int64), np.empty(n, np.int64), np.full(n, -1)
     for event in range(e.max_events + 1):
-        hits = e.intersector.nearest(origin, direction, skip)
-        point_last[atoms], direction_last[atoms], order[atoms] = start, direction, event
+        atoms = paths.pixel * e.sampling.n_rays + paths.path
+        direction[atoms] = paths.direction
+        hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
         fate[atoms], detector[atoms] = _outcomes(
-            event, event >= e.max_events, origin, direction, hits.surface, hits.is_back, offset[pixel[atoms]],
-            e.instrument.sample_distance, e.apertures.shapes,
+            event, event >= e.max_events, paths.origin, paths.direction, hits.surface, hits.is_back,
+            offset[paths.pixel], e.instrument.sample_distance, e.apertures.shapes,
         )  # fmt: skip
         is_scattered = fate[atoms] < 0
         if not is_scattered.any():
             break
-        hits, incoming, atoms = hits.take(is_scattered), direction[is_scattered], atoms[is_scattered]
-        u = bounce_numbers(ids[pixel[atoms]], path[atoms], 0, s.bounces, event, s.seed)
-        material = e.intersector.material_of(hits.surface)
-        key = (ids[pixel[atoms]], path[atoms], event, s.seed, False)
-        direction, _, leaves = scatter_atoms(laws, material, incoming, hits.normal, u, *key)
-        origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
-        stuck = atoms[~leaves]
-        fate[stuck], order[stuck], point_last[stuck] = STOPPED, event + 1, hits.point[~leaves]
-        start, atoms = hits.point[leaves], atoms[leaves]
-        origin, direction, skip = origin[leaves], direction[leaves], skip[leaves]
-    plate_point = _on_plate(point_last, direction_last, offset[pixel], e.instrument.sample_distance)
-    return Atoms(ids[pixel], point_last, direction_last, plate_point, order, fate, detector)
+        hits, paths, atoms = hits.take(is_scattered), paths.take(is_scattered), atoms[is_scattered]
+        point[atoms], order[atoms] = hits.point, event + 1
+        fate[atoms] = STOPPED  # of adsorbed atoms; the others get their fate after the next flight
+        paths = scatter(e, event, ids, hits, paths, np.zeros(len(ids), np.int64))
+    plate_point = _on_plate(point, direction, offset[pixel], e.instrument.sample_distance)
+    return Atoms(ids[pixel], point, direction, plate_point, order, fate, detector)
 
 
 @kernel

@@ -75,7 +75,7 @@ def _history(surface, normal, order, met_plate):
     return normal, order, met_plate
 
 
-def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Paths:
+def launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Paths:
     """Return the beam rays of a block of pixels."""
     s = e.sampling
     numbers = beam_numbers(ids, s.n_rays, s.n_replicates, s.points, s.seed)
@@ -88,7 +88,7 @@ def _launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) 
     return Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal, *history)
 
 
-def _scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, stopped: np.ndarray) -> Paths:
+def scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, stopped: np.ndarray) -> Paths:
     """Return the rays re-emitted at the scattering points, `n_branches` from each of the beam's first hits.
 
     Adsorbed atoms are added to `stopped` [pixels].
@@ -129,7 +129,7 @@ def trace_block(
     )
     ids = np.ascontiguousarray(pixel_ids, np.int64)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
-    paths = _launch_paths(e, ids, x, y)
+    paths = launch_paths(e, ids, x, y)
     for event in range(e.max_events + 1):
         if event == 0 and first is not None:
             hits = first.take(paths.pixel)
@@ -155,5 +155,5 @@ def trace_block(
         if e.can_fuse(event):
             trace_fused(e, event, ids, hits, paths, offset, tally)
             break
-        paths = _scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
+        paths = scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
     return tally
