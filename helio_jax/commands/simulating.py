@@ -1,7 +1,4 @@
-"""Commands that trace: run, simulate, rays, resume, study, spot.
-
-Each parses, calls, prints; no logic of its own.
-"""
+"""Commands around the tracer: run, simulate, rays, resume, study, spot, plate. They parse, call and print only."""
 
 import json
 import math
@@ -85,7 +82,7 @@ def simulate(
     scheduler: Scheduler = None,
     restart: Restart = False,
 ) -> None:
-    """Trace the micrographs of a scene and write them to an HDF5 file; if interrupted, give it again to go on."""
+    """Trace the micrographs of a scene and write them to an HDF5 file; repeat the command to resume it."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
@@ -98,7 +95,7 @@ def simulate(
             view = f"{one.name}: " if one is not stack else ""
             print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
             if "rays_per_pixel" in stack.provenance:
-                print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel in the mean", end="")
+                print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel on average", end="")
                 missed = one.provenance.get("n_above_target")
                 print("" if missed is None else f"; {missed} of {nx * ny} pixels are above the target error")
             for name, share in one.count_fractions().items():
@@ -138,7 +135,7 @@ def resume(
         Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
     ],
 ) -> None:
-    """Go on with what was interrupted or killed; no unit that was finished is traced again."""
+    """Resume an interrupted or killed run or study; finished units are not traced again."""
     from helio_jax.workflows.pipeline import resume as resume_run
 
     if (path / "study.json").is_file():
@@ -161,10 +158,10 @@ def study(
     go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
     workers: Workers = None,
     processes: Processes = False,
-    shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, beginning with the i-th.")] = None,
+    shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, starting with the i-th.")] = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Vary any values of a scene: every point in its own folder, with an index of values and scores."""
+    """Vary values of a scene: each point in its own folder, with an index of values and scores."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions
     from helio_jax.workflows.study import run_study
 
@@ -178,10 +175,10 @@ def spot(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg)."), FIGURE
     ] = None,
-    heights: Annotated[str, typer.Option(help="Heights above the reference plane [um], commas between.")] = "0",
+    heights: Annotated[str, typer.Option(help="Heights above the substrate [um], separated by commas.")] = "0",
     as_json: AsJson = False,
 ) -> None:
-    """Measure the beam's spot at one or more heights above the reference plane, and draw it."""
+    """Measure and draw the beam's spot at one or more heights above the substrate."""
     from helio_jax.errors import SceneError
     from helio_jax.workflows.scene_file import load_scene
     from helio_jax.workflows.spot import draw_spot
@@ -189,7 +186,7 @@ def spot(
     try:
         at = [float(text) for text in heights.split(",")]
     except ValueError:
-        raise SceneError(f"--heights must be numbers with commas between them, got {heights!r}") from None
+        raise SceneError(f"--heights must be numbers separated by commas, got {heights!r}") from None
     found = draw_spot(load_scene(scene), at, output)
     if as_json:
         print(json.dumps(found))
@@ -209,12 +206,12 @@ def plate(
         Path, typer.Option("--output", "-o", help="File to write (.obj)."), Writes("OBJ, which names parts", (".obj",))
     ],
     thickness_um: Annotated[float, typer.Option(help="Thickness of the plate [um].")],
-    radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: room for all).")] = None,
+    radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: all apertures).")] = None,
     channel_deg: Annotated[
         float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
     ] = None,
 ) -> None:
-    """Make the watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
+    """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
     from helio_jax.formats.safe import atomic_path
     from helio_jax.scene.drill import drill_plate
     from helio_jax.workflows.scene_file import load_instrument

@@ -74,7 +74,7 @@ class Job:
             "the sample's surface": _hash_body(body) + (f" from {Path(file).name}" if file else ""),
             "program": {
                 "helio_jax": f"{helio_jax.__version__}, sources {_hash_program()}",
-                **{name: _version(name) for name in _LIBRARIES},
+                **{name: package_version(name) for name in _LIBRARIES},
             },
         }
         return cls(scene.with_base_dir(scene.base_dir.resolve()), settings, about)
@@ -199,7 +199,8 @@ def _hash_program() -> str:
     return digest.hexdigest()[:16]
 
 
-def _version(name: str) -> str:
+def package_version(name: str) -> str:
+    """Return the version of an installed package, or "not installed"."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:

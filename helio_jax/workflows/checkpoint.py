@@ -1,8 +1,8 @@
-"""Long simulations: every finished unit is kept on disk until all are there, so that a killed run can go on.
+"""Checkpoints of long simulations: each finished unit is stored on disk, so that a killed run can be resumed.
 
-Joins the tracer's units (`trace.scan`) and the folder that keeps them (`formats.parts`). A run of a single unit leaves
-no trace on disk. A run goes on only where scene, settings, surface and program are what they were (`Job.about`); as
-units are pure functions of these, going on gives the bits of an undisturbed run.
+Joins the tracer's units (`trace.scan`) and their storage (`formats.parts`). A run of a single unit stores nothing. A
+run resumes only if scene, settings, surface and program are unchanged (`Job.about`); units are pure functions of these,
+so a resumed run equals an undisturbed one bit for bit.
 """
 
 import re
@@ -33,17 +33,17 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class Shard:
-    """The share of one of several independent processes: units `number`, `number` + `of`, ... (counted from 1)."""
+    """Share of one of several independent processes: units `number`, `number` + `of`, ... (counted from 1)."""
 
     number: int
     of: int
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """Read "2/8", the second of eight.
+        """Parse e.g. "2/8", the second of eight.
 
         Raises:
-            SceneError: it is not of this form, or out of range.
+            SceneError: another form, or out of range.
         """
         found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
         number, of = (int(found[1]), int(found[2])) if found else (0, 0)
@@ -54,14 +54,14 @@ class Shard:
 
 @dataclass(frozen=True)
 class CheckpointedRun:
-    """Traces a scene into a file's parts.
+    """Simulation of a scene that stores finished units.
 
     Attributes:
-        parts: where finished units are kept.
-        command: what `helio resume` needs to start this again (JSON-compatible).
-        executor: who runs the units.
+        parts: storage of finished units.
+        command: what `helio resume` needs to repeat the command (JSON-compatible).
+        executor: runs the units.
         shard: run this share only; None: all units.
-        restart: discard what an earlier run left.
+        restart: discard units of an earlier run.
         say: called with messages.
     """
 
@@ -73,20 +73,21 @@ class CheckpointedRun:
     say: Callable[[str], None] = lambda text: None
 
     def trace(self, scene: Scene, settings: TraceSettings, progress: Progress | None = None) -> Micrographs | None:
-        """Return the micrographs, or None where other shards are not finished. The parts are left to the caller.
+        """Return the micrographs, or None while other shards are unfinished. The caller removes the parts.
 
         Raises:
-            ResumeError: the parts are of something else than this scene.
-            InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; what was finished is kept.
-            GuardError: ray book-keeping failed.
+            ResumeError: the parts belong to another scene, other settings or another version.
+            InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; finished units are kept.
+            GuardError: rays are unaccounted for, or too many were lost.
         """
         body = scene.build_body()
         job = Job.of(scene, settings, body)
         units, scan_result = job.units(), ScanResult(job)
+        own = units[self.shard.number - 1 :: self.shard.of] if self.shard else units
         self._begin(job, len(units))
         try:
             with _sigterm_raises():
-                todo = list(self._not_loaded(job, self._share(units), scan_result))
+                todo = list(self._not_loaded(job, own, scan_result))
                 with closing(self.executor.run(job, todo, body, progress)) as results:
                     for unit, unit_result in results:
                         if self.parts.exist:
@@ -103,15 +104,15 @@ class CheckpointedRun:
                 self._remove_own()
 
     def _remove_own(self) -> None:
-        """Remove the folder of parts, unless other shards use it too."""
+        """Remove the folder of parts, unless other shards use it."""
         if self.shard is None:
             self.parts.remove()
 
     def _begin(self, job: Job, n_units: int) -> None:
-        """Make the folder of parts, or check that the one found belongs to this job."""
+        """Make the folder of parts, or check that an existing one belongs to this job."""
         parts = self.parts
         if self.restart and self.shard:
-            raise SceneError(f"--restart would discard what other shards did: remove {parts.folder} before they start")
+            raise SceneError(f"--restart would discard units of other shards: remove {parts.folder} before they start")
         if self.restart:
             parts.remove()
         if not parts.exist and n_units == 1 and self.shard is None:
@@ -119,15 +120,12 @@ class CheckpointedRun:
         about = parts.manifest().get("about") if parts.exist else job.about
         if changes := differences(about, job.about, ("then", "now")):
             raise ResumeError(
-                f"{parts.folder} holds an unfinished run of something else:\n  " + "\n  ".join(changes) + "\nput back "
-                "what was changed to go on; to discard that run, give the command that began it (simulate, run) with "
-                "--restart; or name another output"
+                f"{parts.folder} holds an unfinished run that differs:\n  " + "\n  ".join(changes) + "\nundo these "
+                "changes to resume it; repeat the command (simulate, run) with --restart to discard it; or choose "
+                "another output"
             )
-        if not parts.exist or self.shard is None:  # the last command given is the one that is resumed
+        if not parts.exist or self.shard is None:  # the latest command is the one to resume
             parts.begin({"format": FORMAT, "command": self.command, "about": job.about, "n_units": n_units})
-
-    def _share(self, units: list[Unit]) -> list[Unit]:
-        return units if self.shard is None else units[self.shard.number - 1 :: self.shard.of]
 
     def _not_loaded(self, job: Job, units: list[Unit], scan_result: ScanResult) -> Iterator[Unit]:
         """Load stored results into `scan_result`; yield the units that are missing or damaged."""
@@ -138,10 +136,10 @@ class CheckpointedRun:
                 n_loaded += 1
             except InputFileError as e:
                 if self.parts.has(unit.number):
-                    self.say(f"{e}: computing it again")
+                    self.say(f"{e}: it is computed again")
                 yield unit
         if n_loaded:
-            self.say(f"going on: {n_loaded} of {len(units)} units were finished")
+            self.say(f"resuming: {n_loaded} of {len(units)} units are finished")
 
     def _load(self, job: Job, unit: Unit) -> UnitResult:
         """Load the stored result of a unit."""
@@ -154,15 +152,15 @@ class CheckpointedRun:
             raise InputFileError(f"{self.parts.path(unit.number)} is damaged ({e})") from None
 
     def _complete(self, job: Job, units: list[Unit], scan_result: ScanResult) -> Micrographs | None:
-        """Return the micrographs, once, when all shards are finished."""
+        """Return the micrographs when all shards are finished, to one process only."""
         if self.shard is not None:
             n_there = sum(self.parts.has(unit.number) for unit in units)
             mine = f"shard {self.shard.number}/{self.shard.of} is finished"
             if n_there < len(units):
-                self.say(f"{mine}; {n_there} of all {len(units)} units are there")
+                self.say(f"{mine}; {n_there} of all {len(units)} units are finished")
                 return None
             if not self.parts.claim():
-                self.say(f"{mine}, as are all others; another process is writing {self.parts.output}")
+                self.say(f"{mine}, as are all others; another process writes {self.parts.output}")
                 return None
             for unit in units:
                 if unit.number in scan_result.missing:
@@ -170,45 +168,45 @@ class CheckpointedRun:
         return scan_result.micrographs()
 
     def _stopped(self, e: BaseException, units: list[Unit]) -> Exception:
-        """Return the error that says what is kept and how to go on."""
+        """Make the error that states what is kept and how to resume."""
         kind = StoppedRun if isinstance(e, (StoppedRun, _Terminated)) else InterruptedRun
         why = str(e) or ("stopped by SIGTERM" if kind is StoppedRun else "interrupted")
         n_kept = sum(self.parts.has(unit.number) for unit in units)
         if n_kept == 0 and self.shard is None:
-            return kind(f"{why}; no unit of work was finished yet, nothing is left behind")
+            return kind(f"{why}; no unit of work was finished, nothing is kept")
         how = "the same command" if self.shard else f"`helio resume {self.parts.output}`"
-        return kind(f"{why}; {n_kept} of {len(units)} units are kept in {self.parts.folder}: {how} goes on")
+        return kind(f"{why}; {n_kept} of {len(units)} units are kept in {self.parts.folder}: {how} resumes")
 
 
 def _label(job: Job, unit: Unit) -> np.ndarray:
-    """Return what tells a part of one run from one of another."""
+    """Return the label by which a part is recognised as a unit of this job."""
     return np.array(f"{job.key} {unit.start} {unit.stop}")
 
 
 def is_finished(output: Path) -> bool:
-    """Whether a file without parts is there and what a finished run leaves: whole micrographs.
+    """Whether `output` is a complete file of micrographs; False if there is no file.
 
     Raises:
-        ResumeError: it is empty, damaged or of another kind.
+        ResumeError: the file is empty, damaged or of another kind.
     """
     if not output.is_file():
         return False
     try:
         kind = describe(output)["kind"]
     except InputFileError as e:
-        raise ResumeError(f"{e}; no parts of it are left to go on with: remove it and start anew") from None
+        raise ResumeError(f"{e}; there are no parts to resume from: remove it and start again") from None
     if not kind.startswith("micrograph"):
-        raise ResumeError(f"{output} holds a {kind}, nothing that is traced: name the file of micrographs")
+        raise ResumeError(f"{output} holds a {kind}: name a file of micrographs")
     return True
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM: a batch system's time limit."""
+    """SIGTERM, e.g. at the time limit of a batch system."""
 
 
 @contextmanager
 def _sigterm_raises() -> Iterator[None]:
-    """Let SIGTERM interrupt the block as Ctrl-C does."""
+    """Let SIGTERM raise `_Terminated` in the block, as Ctrl-C raises KeyboardInterrupt."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,8 +1,8 @@
-"""What JAX compiles, kept between runs of the command line: a second fit of an instrument and raster starts at once.
+"""JAX's persistent compilation cache for the command line.
 
-A third of the time of a small fit is XLA's compilation. Compiled code is of one kind of processor, so each has a folder
-of its own. JAX's variables JAX_COMPILATION_CACHE_DIR, JAX_COMPILATION_CACHE_MAX_SIZE (bytes) and
-JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS win; an empty folder name keeps nothing.
+XLA's compilation takes a third of the time of a small fit. Compiled code is specific to a kind of processor, so each
+kind has its own folder. JAX's variables JAX_COMPILATION_CACHE_DIR, JAX_COMPILATION_CACHE_MAX_SIZE (bytes) and
+JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS have precedence; an empty folder name disables the cache.
 """
 
 import hashlib
@@ -15,13 +15,13 @@ from platformdirs import user_cache_path
 _FOLDER = "JAX_COMPILATION_CACHE_DIR"
 _MAX_BYTES = 500_000_000
 _LEAST_SECONDS = 0.2
-"""What compiles in less is not kept."""
+"""Code that compiles in less time is not cached."""
 
 
 def keep_compiled() -> Path | None:
-    """Tell JAX, before it is imported, where to keep what it compiles; return that folder, or None.
+    """Set JAX's cache folder, before JAX is imported, and return it.
 
-    None where the user has named a folder himself, or where the user's folder for caches cannot be written to.
+    Returns None if the user has set a folder, or if the user's cache folder is not writable.
     """
     if _FOLDER in os.environ:
         return None
@@ -39,7 +39,7 @@ def keep_compiled() -> Path | None:
 
 
 def _processor() -> str:
-    """Return a name for this kind of processor and what it can do."""
+    """Return a name for the architecture and instruction set of this processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         able = next((line for line in lines if line.startswith(("flags", "Features"))), "")

@@ -1,4 +1,4 @@
-"""Versions, and whether a small trace gives the closed form: `helio doctor`."""
+"""Check of an installation for `helio doctor`: versions, and a small trace against its closed form."""
 
 import math
 import os
@@ -10,13 +10,13 @@ import numpy as np
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.scene.surfaces import flat_body
 from helio_jax.trace.intersect import Intersector
+from helio_jax.trace.job import package_version
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.workflows.provenance import package_version
 
 
 def diagnose() -> dict[str, Any]:
-    """Return versions and the outcome of a small trace, for `helio doctor`; `ok` says whether all is well."""
+    """Return versions and the result of a small trace; `ok` is True if it agrees with the closed form."""
     import jax
 
     names = ("helio-jax", "numpy", "scipy", "numba", "embreex", "jax", "optimistix", "trimesh", "h5py", "plotly")

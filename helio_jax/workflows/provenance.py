@@ -1,4 +1,4 @@
-"""Where micrographs come from: what is needed to make them again, as their file keeps it."""
+"""Provenance of simulated micrographs: everything needed to reproduce them, stored in their file."""
 
 import os
 import platform
@@ -6,15 +6,15 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from helio_jax.micrograph import Micrographs
+from helio_jax.trace.job import package_version
 from helio_jax.workflows.scene_file import SceneFile, resolved
 
 
 def with_provenance(stack: Micrographs, scene: SceneFile, scene_path: str | Path) -> Micrographs:
-    """Return the micrographs with what is needed to make it again: scene text, versions, commit, command line, time."""
+    """Add scene text, resolved scene, versions, commit, machine, command line and time to the provenance."""
     path = Path(scene_path)
     names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
     about = {
@@ -30,16 +30,8 @@ def with_provenance(stack: Micrographs, scene: SceneFile, scene_path: str | Path
     return replace(stack, provenance={**stack.provenance, **about})
 
 
-def package_version(name: str) -> str:
-    """Return the version of an installed package."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
-
-
 def git_commit() -> str:
-    """Return the commit of the checkout that this package runs from, or "" outside one."""
+    """Return the git commit of this package's checkout, or "" outside a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=5, check=False).stdout.strip()

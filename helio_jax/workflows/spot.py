@@ -1,4 +1,4 @@
-"""The beam's spot: the tracer's beam and its picture joined. Behind `helio spot`."""
+"""Measure and draw the beam's spot: `helio spot`."""
 
 import math
 from collections.abc import Sequence
@@ -12,17 +12,11 @@ from helio_jax.scene.scene import Scene
 from helio_jax.trace.source import footprint
 
 SPOT_RAYS = 32768
-"""Rays from which the spot is measured and drawn."""
+"""Number of rays."""
 
 
 def draw_spot(scene: Scene, heights: Sequence[float], path: str | Path | None, seed: int = 1) -> list[dict[str, float]]:
-    """Measure the beam's spot on planes above the reference plane, and draw it.
-
-    Args:
-        scene: from `load_scene`.
-        heights: of the planes [um].
-        path: of the figure, or None.
-        seed: of the random numbers.
+    """Measure the beam's spot on planes at `heights` [um] above the substrate; draw it if `path` is given.
 
     Raises:
         SceneError: a height is not finite, or not below the plate.
@@ -30,8 +24,8 @@ def draw_spot(scene: Scene, heights: Sequence[float], path: str | Path | None, s
     if wrong := [h for h in heights if not math.isfinite(h)]:
         raise SceneError(f"heights must be finite numbers of um, got {wrong[0]:g}: correct or remove it")
     if wrong := [h for h in heights if h >= scene.sample_distance]:
-        limit = f"{scene.sample_distance:g} um above the reference plane"
-        raise SceneError(f"heights must lie below the plate, which is {limit}, got {wrong[0]:g} um: choose lower ones")
+        limit = f"{scene.sample_distance:g} um above the substrate"
+        raise SceneError(f"heights must be below the plate, which is {limit}, got {wrong[0]:g} um: lower them")
     points = footprint(scene.instrument, np.array(heights), SPOT_RAYS, seed, scene.read_rays())
     spots = [{"height_um": float(h), **measure_spot(p)} for h, p in zip(heights, points, strict=True)]
     if path is not None:

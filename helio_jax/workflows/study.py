@@ -1,9 +1,9 @@
-"""Studies: a scene again and again with some of its values varied, every point in a folder of its own.
+"""Parameter studies: one scene with varied values, each point in its own folder.
 
-A study file names a scene, what is set for all points and what is varied: every combination (`grid`), values side by
-side (`list`) or a low-discrepancy cover of ranges (`sobol`). A point's folder holds its whole scene as TOML (so that
-`helio run` repeats it alone), its micrographs and, where wanted, height map and scores; index.csv and index.json list
-them all. Micrographs are traced by the same units as ever, so a killed study loses seconds.
+A study file names a scene, values set for all points, and varied values: all combinations (`grid`), lists of equal
+length (`list`) or Sobol points in ranges (`sobol`). The folder of a point holds its scene as TOML (which `helio run`
+repeats), its micrographs and optionally height map and scores; index.csv and index.json list all points. Tracing stores
+finished units, so a killed study loses seconds.
 """
 
 import csv
@@ -37,7 +37,7 @@ from helio_jax.workflows.scene_file import files_read, load_scene, resolved, wit
 
 MAX_POINTS = 100_000
 INDEX_SECONDS = 5.0
-"""The index is written at most this often, and at the end."""
+"""Minimum time between two updates of the index [s]."""
 MAX_STUDY_MB = 4.0
 WRITTEN = ("study.json", "index.json", "index.csv", "index.png")
 """Files in a study's folder, beside those of its points."""
@@ -51,7 +51,7 @@ class Range(Settings):
     high: float
     """Largest value."""
     n: int | None = Field(default=None, ge=2, le=MAX_POINTS)
-    """`grid`, `list`: how many equally spaced values."""
+    """`grid`, `list`: number of equally spaced values."""
     log: bool = False
     """Spaced equally in the logarithm."""
     whole: bool = False
@@ -65,7 +65,7 @@ class Range(Settings):
         return self
 
     def at(self, shares: np.ndarray) -> list[float | int]:
-        """Return the values at shares 0 to 1 of the range."""
+        """Return the values at fractions `shares` (0 to 1) of the range."""
         ends = np.log([self.low, self.high]) if self.log else np.array([self.low, self.high])
         found = ends[0] + shares * (ends[1] - ends[0])
         found = np.clip(np.exp(found) if self.log else found, self.low, self.high)
@@ -73,24 +73,24 @@ class Range(Settings):
 
 
 class Study(Settings):
-    """A study file: which scene, what is set, what is varied."""
+    """A study file."""
 
     scene: str = Field(min_length=1, max_length=4096)
     """Scene file, relative to the study file."""
     name: str = Field(default="study", min_length=1, max_length=200)
-    """Short name, the title of the plot."""
+    """Title of the plot."""
     design: Literal["grid", "list", "sobol"] = "grid"
-    """`grid`: every combination; `list`: first values together, second values together; `sobol`: ranges covered."""
+    """`grid`: all combinations; `list`: the i-th values together; `sobol`: scrambled Sobol points in the ranges."""
     n_points: int | None = Field(default=None, ge=1, le=MAX_POINTS)
-    """`sobol`: how many points."""
+    """`sobol`: number of points."""
     seed: int = Field(default=1, ge=0, lt=2**63)
-    """`sobol`: seed of the scrambling. (The tracer's own: set "trace.seed".)"""
+    """`sobol`: seed of the scrambling (the tracer's seed is "trace.seed")."""
     reconstruct: bool = True
-    """Reconstruct and score the heights; else only the micrographs are made."""
+    """Reconstruct and score the heights, too; false: micrographs only."""
     report: bool = False
-    """Write the HTML report of every point, too."""
+    """Write an HTML report for each point, too."""
     score: str | None = None
-    """Column of the index that is plotted; default: the RMS error, or the share of multiple scattering."""
+    """Column of the index to plot; default: the RMS error, or the share of multiple scattering."""
     set: dict[str, Any] = {}
     """Values for all points, by dotted key, e.g. "trace.rays" = 32."""
     vary: dict[str, list[Any] | Range] = Field(min_length=1)
@@ -104,13 +104,13 @@ class Study(Settings):
             if self.design == "sobol" and not is_range:
                 problems.append(f'vary: "{key}" must be a range for design "sobol", e.g. {{ low = 1.0, high = 2.0 }}')
             if self.design != "sobol" and is_range and values.n is None:
-                problems.append(f'vary: "{key}" needs n, how many values, for design "{self.design}"')
+                problems.append(f'vary: "{key}" needs n, the number of values, for design "{self.design}"')
             if not is_range and not values:
                 problems.append(f'vary: "{key}" must have at least one value, got []')
         if self.design == "sobol" and self.n_points is None:
             problems.append('n_points: is missing, design "sobol" needs it')
         if not problems and (n := self._n_points()) > MAX_POINTS:
-            problems.append(f"vary: makes {n} points, the limit is {MAX_POINTS}: vary less")
+            problems.append(f"vary: gives {n} points, the limit is {MAX_POINTS}: vary less")
         if not problems and self.design == "list" and len({len(v) for v in self._lists()}) > 1:
             counts = ", ".join(f'"{k}" {len(v)}' for k, v in zip(self.vary, self._lists(), strict=True))
             problems.append(f'vary: design "list" needs as many values of each, got {counts}')
@@ -128,7 +128,7 @@ class Study(Settings):
         return math.prod(n or 0 for n in sizes) if self.design == "grid" else sizes[0] or 0
 
     def points(self) -> list[dict[str, Any]]:
-        """Return the varied values of every point, by dotted key."""
+        """Return the varied values of each point, by dotted key."""
         if self.design == "sobol":
             n = self._n_points()
             unit = qmc.Sobol(len(self.vary), scramble=True, rng=self.seed).random_base2((n - 1).bit_length())[:n]
@@ -143,7 +143,7 @@ def load_study(path: Path) -> Study:
     """Read a study file.
 
     Raises:
-        SceneError: missing, not TOML, or wrong; the message lists all errors.
+        SceneError: missing, not TOML, or invalid; the message lists all errors.
     """
     try:
         data = tomllib.loads(read_bytes(path, MAX_STUDY_MB, SceneError).decode("utf-8-sig"))
@@ -159,7 +159,7 @@ def load_study(path: Path) -> Study:
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and their values; keys may be quoted ("trace.rays") or nested (trace.rays)."""
+    """Yield dotted keys and values of a table whose keys are quoted ("trace.rays") or nested (trace.rays)."""
     for key, value in table.items():
         if isinstance(value, Mapping) and not set(value) <= set(Range.model_fields):
             yield from _flat(value, f"{above}{key}.")
@@ -169,14 +169,14 @@ def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]
 
 @dataclass(frozen=True)
 class _Point:
-    """One point: its number from 1, its values, and its folder."""
+    """One point: number from 1, varied values, folder."""
 
     number: int
     values: dict[str, Any]
     folder: Path
 
     def row(self) -> dict[str, Any] | None:
-        """Return what is known of the finished (or failed) point, or None."""
+        """Return the row of the index of a finished or failed point, or None."""
         try:
             return json.loads((self.folder / "point.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -190,18 +190,18 @@ def run_study(
     resume: bool = False,
     options: pipeline.SimulateOptions = pipeline.SimulateOptions(),
 ) -> Path:
-    """Run a study; return the index.
+    """Run a study; return the path of index.csv.
 
     Args:
-        path: of the study file.
-        folder: where the points and the index go.
-        resume: go on in a folder that holds this study; points that are finished stay, failed ones are tried again.
-        options: who traces; with a shard, every N-th point is run.
+        path: study file.
+        folder: output folder of the points and the index.
+        resume: continue the study in `folder`: finished points are kept, failed ones repeated.
+        options: executor of the tracer; with a shard, every N-th point is run.
 
     Raises:
-        SceneError: the study or the scene of a point is wrong (found before anything is run).
-        ResumeError: the folder holds a study already, or another one.
-        GuardError: some points failed; the index tells which and why.
+        SceneError: the study or the scene of a point is invalid (checked before any point is run).
+        ResumeError: the folder holds a study and `resume` is false, or another study.
+        GuardError: some points failed; the index lists the reasons.
     """
     path, folder = Path(path), Path(folder)
     study = load_study(path)
@@ -226,23 +226,23 @@ def run_study(
 
 
 def resume_study(folder: Path, *, say: Callable[[str], None] = print) -> Path:
-    """Go on with the study of a folder; return the index.
+    """Resume the study of a folder; return the path of index.csv.
 
     Raises:
-        ResumeError: the study file is gone or was changed since.
+        ResumeError: the study file is missing or has changed.
     """
     manifest = folder / "study.json"
     try:
         path = Path(json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError))["study"])
     except (KeyError, TypeError, ValueError) as e:
-        raise ResumeError(f"{manifest} is damaged ({e!r}): give the study command again with --resume") from None
+        raise ResumeError(f"{manifest} is damaged ({e!r}): repeat the study command with --resume") from None
     if not path.is_file():
-        raise ResumeError(f"the study {path} of {folder} is gone: put it back, or name another folder")
+        raise ResumeError(f"the study {path} of {folder} is missing: restore it, or choose another folder")
     return run_study(path, folder, resume=True, options=pipeline.SimulateOptions(say=say))
 
 
 def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None:
-    """Make the folder, or check that it holds this very study."""
+    """Make the folder, or check that it holds this study."""
     make_folder(folder)
     manifest = folder / "study.json"
     now = {"study": str(path.resolve()), "scenes": hashlib.sha256("\n".join(scenes).encode()).hexdigest()}
@@ -251,30 +251,30 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
             part.write_text(json.dumps(now) + "\n", encoding="utf-8")
         return
     if not is_shared:
-        raise ResumeError(f"{folder} holds a study already: --resume goes on with it, -o names another folder")
+        raise ResumeError(f"{folder} holds a study already: continue it with --resume, or set another folder with -o")
     try:
         then = dict(json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError)))
     except (ValueError, TypeError):
-        raise ResumeError(f"{manifest} is damaged: remove it, and give the study again with --resume") from None
+        raise ResumeError(f"{manifest} is damaged: remove it, and repeat the study command with --resume") from None
     if then.get("scenes") != now["scenes"]:
         raise ResumeError(
-            f"{folder} holds another study, or {path} or its scene was changed since: name another folder"
+            f"{folder} holds another study, or {path} or its scene has changed since: choose another folder"
         )
 
 
 def _scene_text(path: Path, overrides: dict[str, Any], place: str) -> str:
-    """Return the scene of a point as TOML; file names are made absolute."""
+    """Return the scene of a point as TOML, with absolute file names."""
     try:
         scene = load_scene(path, overrides)
     except SceneError as e:
         raise SceneError(f"{place}: {e}") from None
-    # what [reconstruct] leaves open stays open: a calibration may set it
+    # values that [reconstruct] does not set stay unset: a calibration may set them
     tables = resolved(scene) | {"reconstruct": scene.reconstruct.model_dump(mode="json", exclude_unset=True)}
     return to_toml(with_files(tables, lambda name: str((scene.base_dir / name).resolve())))
 
 
 def _run_point(study: Study, point: _Point, text: str, options: pipeline.SimulateOptions) -> None:
-    """Run one point; its failure is written down, not raised."""
+    """Run one point; a failure is recorded, not raised."""
     point.folder.mkdir(exist_ok=True)
     scene = point.folder / "scene.toml"
     if not scene.exists():
@@ -293,7 +293,7 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
                 row |= {f"{key}{view}": value for key, value in image_scores(one).items()}
     except HelioError as e:
         if isinstance(e, (StoppedRun, InterruptedRun)):
-            how = f"`helio resume {point.folder.parent}` goes on with the study"
+            how = f"`helio resume {point.folder.parent}` resumes the study"
             raise type(e)(f"stopped in point {point.number}, whose finished units are kept: {how}") from e
         row |= {"status": "failed", "problem": str(e)}
     with atomic_path(point.folder / "point.json") as part:
@@ -301,7 +301,7 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
 
 
 def image_scores(stack: MicrographStack) -> dict[str, float]:
-    """Return what micrographs alone tell: mean counts, contrast (deviation over mean), share of multiple scattering."""
+    """Compute mean counts, contrast (std_dev / mean) and share of multiple scattering of each micrograph."""
     out: dict[str, float] = {}
     multiple = stack.multiple
     for k, name in enumerate(stack.instrument.detector_names):
@@ -314,7 +314,7 @@ def image_scores(stack: MicrographStack) -> dict[str, float]:
 
 
 def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: bool = False) -> Path:
-    """Write index.json, index.csv and, at the end, the plot; return the CSV's path."""
+    """Write index.json, index.csv and, if `is_last`, the plot; return the path of index.csv."""
     blank = {"status": "not run", "problem": ""}
     rows = [p.row() or {"point": p.number, **p.values, **blank} for p in points]
     columns = list(dict.fromkeys(key for row in rows for key in row))
@@ -328,7 +328,7 @@ def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: b
     failed = [row for row in rows if row["status"] == "failed"]
     if is_last:
         if study.score and study.score not in columns:
-            raise SceneError(f"{study.name}: score = {study.score!r} is none of the scores: {', '.join(columns)}")
+            raise SceneError(f"{study.name}: score must be one of {', '.join(columns)}, got {study.score!r}")
         score = study.score or next(
             (c for c in columns if c.startswith(("rms_region", "rms_image", "multiple_"))), None
         )

@@ -169,7 +169,7 @@ def test_stop_refuse_and_resume(small_scene, tmp_path):
     refused = helio("simulate", scene, "-o", out, "--seed", "5", "--rays", "256")
     assert refused.returncode == 6 and "trace.seed: 1 (then), 5 (now)" in refused.stderr
     done = helio("resume", out)
-    assert done.returncode == 0 and "units were finished" in done.stderr, done.stderr
+    assert done.returncode == 0 and "units are finished" in done.stderr, done.stderr
     assert {p.name for p in tmp_path.iterdir()} == {"scene.toml", "s.h5"}
 
 

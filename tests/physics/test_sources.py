@@ -232,5 +232,5 @@ def test_draw_spot(tmp_path):
     assert high["gaussian_fwhm_across_um"] == pytest.approx(0.3, rel=0.01)
     assert low["gaussian_fwhm_across_um"] > 1.1 * high["gaussian_fwhm_across_um"]
     assert (tmp_path / "spot.png").read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(SceneError, match="472 um above the reference plane, got 472 um"):
+    with pytest.raises(SceneError, match="472 um above the substrate, got 472 um"):
         draw_spot(scene, [472.0], None)

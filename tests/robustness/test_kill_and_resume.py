@@ -110,7 +110,7 @@ def test_interrupted_run_goes_on(whole, half):
     shutil.copytree(half.folder, Parts(copy).folder)
     said = []
     assert pipeline.resume(half.output, say=said.append) == [half.output]
-    assert said == [f"going on: {N_UNITS // 2} of {N_UNITS} units were finished"]
+    assert said == [f"resuming: {N_UNITS // 2} of {N_UNITS} units are finished"]
     pipeline.simulate_file(SCENE, copy, overrides=SMALL)
     for path in (half.output, copy):
         assert_same_bits(hx.read(path), whole[0])
@@ -182,7 +182,7 @@ def test_damaged_parts_are_found(whole, half):
     pipeline.resume(half.output, say=said.append)
     assert_same_bits(hx.read(half.output), whole[0])
     assert [s.split(" is ")[0].rpartition("/")[2] for s in said[:-1]] == [f"{i:06d}.npz" for i in range(4)]
-    assert said[-1] == f"going on: {N_UNITS // 2 - 4} of {N_UNITS} units were finished"
+    assert said[-1] == f"resuming: {N_UNITS // 2 - 4} of {N_UNITS} units are finished"
 
 
 def test_any_turned_bit_is_harmless(half):
@@ -215,7 +215,7 @@ def test_shards_make_the_same_file(whole, tmp_path):
         pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
     assert_same_bits(hx.read(output), whole[0])
     assert list(tmp_path.iterdir()) == [output]
-    assert f"{N_UNITS // 3} of {N_UNITS // 3} units were finished" in said[2]
+    assert f"{N_UNITS // 3} of {N_UNITS // 3} units are finished" in said[2]
 
 
 def test_killed_process_is_replaced(whole, tmp_path):
@@ -334,7 +334,7 @@ def test_interrupted_run_goes_on_in_its_folder(tmp_path):
         pipeline.run(SCENE, folder, overrides=overrides, stage=Stage, executor=Executor(1), report=False)
     said: list[str] = []
     pipeline.resume(folder, say=said.append)
-    assert said == [f"going on: 5 of {N_UNITS} units were finished"]
+    assert said == [f"resuming: 5 of {N_UNITS} units are finished"]
     assert not Parts(folder / "micrographs.h5").exist and (folder / "scores.json").is_file()
     stack, scene = hx.read(folder / "micrographs.h5"), hx.load_scene(SCENE, overrides)
     assert np.array_equal(stack.counts, pipeline.record(scene, pipeline.simulate(scene)).counts)
