@@ -5,7 +5,6 @@ Uses the random numbers of `transport`, so the atoms recorded here are those tha
 Transparent plates only.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,7 +132,10 @@ def follow_atoms(experiment: Experiment, ids: np.ndarray, x: np.ndarray, y: np.n
         point[atoms], order[atoms] = hits.point, event + 1
         fate[atoms] = STOPPED  # of adsorbed atoms; the others get their fate after the next flight
         paths = scatter(e, event, ids, hits, paths, np.zeros(len(ids), np.int64))
-    plate_point = _on_plate(point, direction, offset[pixel], e.instrument.sample_distance)
+    up = direction[:, 2] > 0
+    r = (e.instrument.sample_distance - point[up, 2:]) / direction[up, 2:]
+    plate_point = np.full((n, 2), np.nan)
+    plate_point[up] = point[up, :2] + r * direction[up, :2] - offset[pixel[up]]
     return Atoms(ids[pixel], point, direction, plate_point, order, fate, detector)
 
 
@@ -147,12 +149,3 @@ def _outcomes(event, is_last, origin, direction, surface, is_back, offset, plate
             event, is_last, origin, direction, i, surface[i], is_back[i], offset[i, 0], offset[i, 1], plate_z, shapes,
         )  # fmt: skip
     return fate, detector
-
-
-def _on_plate(point: np.ndarray, direction: np.ndarray, offset: np.ndarray, plate_z: float) -> np.ndarray:
-    """Return the points where lines meet the plate's plane, lab frame [n, 2]; NaN for downward lines."""
-    up = direction[:, 2] > 0
-    out = np.full((len(point), 2), math.nan)
-    r = (plate_z - point[up, 2]) / direction[up, 2]
-    out[up] = point[up, :2] + r[:, None] * direction[up, :2] - offset[up]
-    return out

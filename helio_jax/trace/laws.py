@@ -36,11 +36,17 @@ def _debye_waller(table, t, d, x, y, z):
 
 
 @kernel
+def _arrays(table, t):
+    """Return the rows and nodes of a term."""
+    rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
+    return rows, table.nodes[table.first_node[t] : table.first_node[t + 1]]
+
+
+@kernel
 def _has_orders(table, t, d, n):
     """Whether any diffraction order of a term is open."""
     b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
-    rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
-    nodes = table.nodes[table.first_node[t] : table.first_node[t + 1]]
+    rows, nodes = _arrays(table, t)
     return lobes.diffraction_norm(d, n, b1, b2, rows, table.numbers[t, 0], nodes) > _NO_ORDER
 
 
@@ -51,8 +57,7 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
     if shape == _SPECULAR:
         x, y, z = lobes.mirror(d, n, 1.0)
         return x, y, z, True
-    nodes = table.nodes[table.first_node[t] : table.first_node[t + 1]]
-    rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
+    rows, nodes = _arrays(table, t)
     b1, b2 = n, n
     if shape == _DIFFRACTION:
         b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
@@ -84,7 +89,7 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
 def _density(table, t, d, n, o):
     """Compute the density of one lobe with attenuation (0 for exact directions)."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
-    nodes = table.nodes[table.first_node[t] : table.first_node[t + 1]]
+    rows, nodes = _arrays(table, t)
     if shape == _UNIFORM:
         cosine = o[0] * n[0] + o[1] * n[1] + o[2] * n[2]
         out = 1.0 / (2.0 * np.pi * (1.0 - p)) if cosine >= p else 0.0
@@ -94,7 +99,6 @@ def _density(table, t, d, n, o):
         out = lobes.cosine_lobe_density(d, n, o)
     elif shape == _DIFFRACTION:
         b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
-        rows = table.rows[table.first_row[t] : table.first_row[t + 1]]
         out = lobes.diffraction_density(d, n, b1, b2, rows, p, nodes, o)
     elif shape == _ROUGH:
         out = lobes.rough_density(d, n, p, o)

@@ -13,13 +13,6 @@ from helio_jax.trace.experiment import lift_off
 from helio_jax.trace.intersect import MISS, Intersector
 
 
-def aperture_samples(n_points: int) -> np.ndarray:
-    """Compute equal-area points of the unit disc [n_points, 2] (Vogel, Math. Biosci. 44 (1979) 179)."""
-    i = np.arange(n_points) + 0.5
-    r, angle = np.sqrt(i / n_points), np.pi * (3.0 - np.sqrt(5.0)) * i
-    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
-
-
 @kernel
 def _sample_rays(k, sample, point, normal, offset, plate_z, shapes, area):
     """Return directions to one detector sample, vector weights cos(theta_d) r / (pi r^3) dA, and whether it counts."""
@@ -59,7 +52,7 @@ def masked_form_factor(
         normal: unit normals, outward [n, 3].
         surface: surface of each point (`Hits.surface`) [n].
         offset: lab-to-sample shift (x, y) of each point's pixel [n, 2] [um].
-        n_samples: points per aperture.
+        n_samples: equal-area points per aperture (Vogel, Math. Biosci. 44 (1979) 179).
 
     Returns:
         Masked form factor [detector, n, 3] and masked fraction of the aperture's solid angle [detector, n].
@@ -68,7 +61,9 @@ def masked_form_factor(
     origin, skip = lift_off(point, normal, surface, intersector.restart)
     n_detectors, n = len(table), len(point)
     masked, fraction = np.zeros((n_detectors, n, 3)), np.zeros((n_detectors, n))
-    samples = aperture_samples(n_samples)
+    i = np.arange(n_samples) + 0.5
+    r, angle = np.sqrt(i / n_samples), np.pi * (3.0 - np.sqrt(5.0)) * i
+    samples = np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
     for k in range(n_detectors):
         solid_angle = np.zeros(n)
         for sample in samples:
@@ -84,13 +79,6 @@ def masked_form_factor(
             fraction[k, ~is_open] += size[~is_open]
         fraction[k] /= solid_angle
     return masked, fraction
-
-
-def axis_rays(instrument: Instrument, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the beam axis of each pixel as a ray from the pinhole: origins and directions [n, 3], sample frame."""
-    dx, dy, dz = instrument.sample_origin(x, y)
-    origin = instrument.pinhole_center + np.stack([dx, dy, np.full_like(dx, dz)], -1)
-    return origin, np.broadcast_to(instrument.beam_direction, origin.shape).copy()
 
 
 def is_shadowed(intersector: Intersector, instrument: Instrument, x: np.ndarray, y: np.ndarray) -> np.ndarray:

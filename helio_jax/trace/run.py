@@ -20,7 +20,6 @@ from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.lawtable import LawTable, check_lattices, is_cosine, make_law_table
-from helio_jax.trace.masks import axis_rays
 from helio_jax.trace.meshplate import MeshPlate
 from helio_jax.trace.plate import FACING_DOWN, PlateTable
 from helio_jax.trace.settings import TraceSettings
@@ -210,5 +209,7 @@ def check_rays(fates: np.ndarray, n_unaccounted: int, n_launched: int, max_lost:
 
 def first_hits(intersector: Intersector, instrument: Instrument, x: np.ndarray, y: np.ndarray) -> Hits:
     """Compute the first hits of the beam axis on the sample for beam positions (x, y) [n] [um]."""
-    origin, direction = axis_rays(instrument, x, y)
+    dx, dy, dz = instrument.sample_origin(x, y)
+    origin = instrument.pinhole_center + np.stack([dx, dy, np.full_like(dx, dz)], -1)
+    direction = np.broadcast_to(instrument.beam_direction, origin.shape).copy()
     return intersector.nearest(origin, direction, np.full(len(x), -1, np.int32))

@@ -48,11 +48,6 @@ class Tally:
             n_branches,
         )
 
-    @property
-    def n_launched(self) -> int:
-        """Paths launched per pixel: beam rays times branches."""
-        return self.n_rays * self.n_branches
-
     def estimate(self) -> "Estimate":
         """Reduce the replicates to means and variances.
 
@@ -61,7 +56,7 @@ class Tally:
         hits / rays with the Poisson variance hits / rays^2.
         """
         kept = (self.fates, self.hits, self.plate_hits, self.n_rays, self.n_branches)
-        n_replicates, n = self.sums.shape[1], self.n_launched
+        n_replicates, n = self.sums.shape[1], self.n_rays * self.n_branches
         if n_replicates == 0:
             orders, total, plate = ((c / n, c / n**2) for c in (self.hits, self.hits.sum(0), self.plate_hits))
         else:

@@ -62,19 +62,6 @@ def _bounce(normal, u):
     return out
 
 
-@kernel
-def _history(surface, normal, order, met_plate):
-    """Return `normal`, `order` and `met_plate` of each path after its scattering on `surface`."""
-    normal, order, met_plate = normal.copy(), order.copy(), met_plate.copy()
-    for i in range(surface.size):
-        if surface[i] == PLATE:
-            met_plate[i] = True
-            normal[i] = 0.0
-        else:
-            order[i] += 1
-    return normal, order, met_plate
-
-
 def launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -> Paths:
     """Return the beam rays of a block of pixels."""
     s = e.sampling
@@ -101,7 +88,9 @@ def scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths
     path, pixel = paths.path, paths.pixel
     u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
-    history = _history(hits.surface, hits.normal, paths.order, paths.met_plate)
+    on_plate = hits.surface == PLATE
+    normal = np.where(on_plate[:, None], 0.0, hits.normal)
+    history = normal, paths.order + ~on_plate, paths.met_plate | on_plate
     if e.laws is None:
         direction, density, leaves = _bounce(hits.normal, u), np.zeros(len(path)), None
     else:
