@@ -19,9 +19,9 @@ from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import Tally
 
 
-def _replicate(s: Sampling, path: np.ndarray, n_branches: int) -> np.ndarray:
-    """Return the replicate of each path, for `n_branches` paths per beam ray."""
-    return path // (s.n_rays * n_branches // s.n_replicates)
+def _path_data(s: Sampling, paths: Paths, n_branches: int) -> tuple[np.ndarray, ...]:
+    """Return pixel, order, met_plate and replicate of each path, for `n_branches` paths per beam ray."""
+    return paths.pixel, paths.order, paths.met_plate, paths.path // (s.n_rays * n_branches // s.n_replicates)
 
 
 @kernel
@@ -53,20 +53,23 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area)
 
 
 @kernel
-def _add(value, k, i, order, met_plate, replicate, pixel, sums, plate_sums):
-    """Add the contribution of path `i` to detector `k` and scattering order `order`."""
+def _add(value, k, i, order, paths, sums):
+    """Add the contribution of path `i` to detector `k` and scattering order `order`.
+
+    `paths`: pixel, order, met_plate, replicate [n]; `sums`: `Tally.sums`, `Tally.plate_sums`.
+    """
+    pixel, _, met_plate, replicate = paths
+    by_order, plate = sums
     r, p = replicate[i], pixel[i]
-    sums[min(order, sums.shape[0]) - 1, r, k, p] += value
+    by_order[min(order, by_order.shape[0]) - 1, r, k, p] += value
     if met_plate[i]:
-        plate_sums[r, k, p] += value
+        plate[r, k, p] += value
 
 
 @kernel
-def _score(
-    k, share, cosine, point, normal, pixel, order, met_plate, replicate, offset, plate_z, weight, is_open, shapes,
-    rims, sums, plate_sums,
-):  # fmt: skip
+def _score(k, share, cosine, point, normal, paths, offset, plate_z, weight, is_open, shapes, rims, sums):
     """Add P = n . Phi - (masked part), times the share of cosine atoms, for each scattering point."""
+    pixel, order, _, _ = paths
     for i in range(point.shape[0]):
         if cosine[i] == 0.0:
             continue
@@ -77,8 +80,7 @@ def _score(
         value = normal[i, 0] * fx + normal[i, 1] * fy + normal[i, 2] * fz
         if not is_open[i]:
             value -= weight[i]
-        value *= share * cosine[i]
-        _add(value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
+        _add(value * share * cosine[i], k, i, order[i] + 1, paths, sums)
 
 
 @kernel
@@ -89,25 +91,23 @@ def _balance(density, n_hits, square, cosine, area):
 
 @kernel
 def _score_lobes(
-    k, share, n_hits, table, material, incoming, point, normal, pixel, order, met_plate, replicate, direction, is_open,
-    plate_z, shapes, area, sums, plate_sums,
-):  # fmt: skip
+    k, share, n_hits, table, material, incoming, point, normal, paths, direction, is_open, plate_z, shapes, area, sums
+):
     """Add the contribution of the lobes at each scattering point to the point aimed at."""
+    order = paths[1]
     for i in range(point.shape[0]):
         if is_open[i]:
             density = lobe_density(table, material[i], incoming[i], normal[i], direction[i])
             r = (plate_z - point[i, 2]) / direction[i, 2]
             square, flat = area_factors(k, r * r, direction[i, 2], shapes)
             value = _balance(density, n_hits, square, flat, area[k]) if density > 0.0 else 0.0
-            _add(share * value, k, i, order[i] + 1, met_plate, replicate, pixel, sums, plate_sums)
+            _add(share * value, k, i, order[i] + 1, paths, sums)
 
 
 @kernel
-def _score_hits(
-    share, n_hits, density, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z, shapes,
-    area, sums, plate_sums,
-):  # fmt: skip
+def _score_hits(share, n_hits, density, origin, direction, paths, surface, offset, plate_z, shapes, area, sums):
     """Add the atoms of lobes that hit a detector."""
+    pixel, order, _, _ = paths
     for i in range(origin.shape[0]):
         if density[i] > 0.0 and surface[i] == MISS:
             p = pixel[i]
@@ -115,18 +115,18 @@ def _score_hits(
             if k >= 0:
                 square, flat = area_factors(k, r * r, direction[i, 2], shapes)
                 value = _balance(density[i], n_hits, square, flat, area[k])
-                _add(share * n_hits * value, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
+                _add(share * n_hits * value, k, i, order[i], paths, sums)
 
 
 @kernel
 def _subtract_masked(
-    share, n_hits, density, normal, origin, direction, pixel, order, met_plate, replicate, surface, offset, plate_z,
-    shapes, area, sums, plate_sums,
-):  # fmt: skip
+    share, n_hits, density, normal, origin, direction, paths, surface, offset, plate_z, shapes, area, sums
+):
     """Subtract the masked part of wide detectors, which `_score` leaves out: blocked cosine atoms flying towards them.
 
     The mirror image of an atom's direction at its surface estimates the parts of the detectors below the horizon.
     """
+    pixel, order, _, _ = paths
     for i in range(origin.shape[0]):
         if density[i] != 0.0:
             continue
@@ -146,7 +146,7 @@ def _subtract_masked(
                 if is_inside(x, y, dx, dy, dz, k, shapes):
                     square, flat = area_factors(k, r * r, dz, shapes)
                     if is_masked and _aimed_weight(n_hits, square, cosine, flat, area[k]) == 0.0:
-                        _add(-sign * share, k, i, order[i], met_plate, replicate, pixel, sums, plate_sums)
+                        _add(-sign * share, k, i, order[i], paths, sums)
                     is_masked = True  # where detectors overlap, the first one counts
 
 
@@ -156,7 +156,7 @@ def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hit
         hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
     point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
-    path_data = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
+    path_data, sums = _path_data(e.sampling, paths, n_branches), (tally.sums, tally.plate_sums)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
     if e.laws is not None:
@@ -170,13 +170,13 @@ def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hit
         todo = np.flatnonzero(is_open)
         is_open[todo] = ~e.intersector.is_occluded(origin[todo], direction[todo], skip[todo])
         _score(
-            k, 1.0 / n_branches, cosine, point, normal, *path_data, offset, plate_z, weight, is_open, table.shapes,
-            table.rims, tally.sums, tally.plate_sums,
+            k, 1.0 / n_branches, cosine, point, normal, path_data, offset, plate_z, weight, is_open, table.shapes,
+            table.rims, sums,
         )  # fmt: skip
         if e.laws is not None:
             _score_lobes(
-                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, *path_data, direction,
-                is_open, plate_z, table.shapes, table.area, tally.sums, tally.plate_sums,
+                k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, path_data, direction,
+                is_open, plate_z, table.shapes, table.area, sums,
             )  # fmt: skip
 
 
@@ -184,9 +184,9 @@ def add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, paths
     """Add the estimates by re-emitted atoms after `event` events: hits of lobes, and the masked part."""
     n_branches, table = e.sampling.n_branches, e.apertures
     weight = 1.0 / n_branches, n_branches if event == 1 else 1
-    path_data = paths.pixel, paths.order, paths.met_plate, _replicate(e.sampling, paths.path, n_branches)
-    flight = paths.origin, paths.direction, *path_data, surface
+    path_data, sums = _path_data(e.sampling, paths, n_branches), (tally.sums, tally.plate_sums)
+    flight = paths.origin, paths.direction, path_data, surface
     plate = offset, e.instrument.sample_distance, table.shapes, table.area
-    _subtract_masked(*weight, paths.density, paths.normal, *flight, *plate, tally.sums, tally.plate_sums)
+    _subtract_masked(*weight, paths.density, paths.normal, *flight, *plate, sums)
     if e.laws is not None:
-        _score_hits(*weight, paths.density, *flight, *plate, tally.sums, tally.plate_sums)
+        _score_hits(*weight, paths.density, *flight, *plate, sums)
