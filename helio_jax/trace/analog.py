@@ -71,15 +71,17 @@ def _emit_all(event, point, normal, surface, restart, pixel, path, ids, seed, n_
 
 @kernel
 def _advance(
-    event, is_last, face, u, v, origin, direction, pixel, path, skip, o32, d32, facets, spheres, restart, middle,
-    inverse_size, offset, plate_z, shapes, ids, seed, fates, hits, points, normals, surfaces,
-    targets,
-):  # fmt: skip
+    event, is_last, found, atoms, o32, d32, geometry, offset, plate_z, shapes, ids, seed, fates, hits, scattered
+):
     """Tally the atoms that end, re-emit the others in place; return the number re-emitted.
 
-    `points`, `normals`, `surfaces` of the scattering points and `targets`, the two random numbers of each path's next
-    aperture point, are written too unless they have length 0.
+    `found`: triangle and barycentric u, v. `atoms`: origin, direction, pixel, path, skip. `scattered`: points, normals
+    and surfaces of the scattering, and two random numbers of each path's next aperture point; length 0 if not needed.
     """
+    face, u, v = found
+    origin, direction, pixel, path, skip = atoms
+    facets, spheres, restart, middle, inverse_size = geometry
+    points, normals, surfaces, targets = scattered
     point, normal = np.empty((_CHUNK, 3)), np.empty((_CHUNK, 3))
     surface, is_back = np.empty(_CHUNK, np.int64), np.empty(_CHUNK, np.bool_)
     m = 0
@@ -128,30 +130,28 @@ def trace_fused(
         GuardError: a ray is not finite or not of unit direction.
     """
     s, sample = e.sampling, e.intersector
-    origin, direction, pixel, path, skip = _emit_all(
+    atoms = _emit_all(
         event, hits.point, hits.normal, hits.surface, sample.restart, paths.pixel, paths.path, ids, s.seed,
         s.n_branches if event == 0 else 1, s.bounces, s.per_replicate,
     )  # fmt: skip
-    o32, d32 = sample.scaled(origin, direction)
-    n = len(origin)
+    o32, d32 = sample.scaled(*atoms[:2])
+    n = len(o32)
     kept = n if e.is_expected else 0
-    points, normals, targets = np.empty((kept, 3)), np.empty((kept, 3)), np.empty((kept, 2))
-    surfaces = np.empty(kept, np.int32)
+    scattered = np.empty((kept, 3)), np.empty((kept, 3)), np.empty(kept, np.int32), np.empty((kept, 2))
+    geometry = sample.facets, sample.spheres, sample.restart, sample.center, 1.0 / sample.half_size
     for flight in range(event + 1, e.max_events + 1):
-        face, u, v = sample.shoot(o32[:n], d32[:n])
+        found = sample.shoot(o32[:n], d32[:n])
         n = _advance(
-            flight, flight >= e.max_events, face, u, v, origin, direction, pixel, path, skip, o32, d32, sample.facets,
-            sample.spheres, sample.restart, sample.center, 1.0 / sample.half_size, offset,
-            e.instrument.sample_distance, e.apertures.shapes, ids, s.seed, tally.fates, tally.hits, points, normals,
-            surfaces, targets,
+            flight, flight >= e.max_events, found, atoms, o32, d32, geometry, offset, e.instrument.sample_distance,
+            e.apertures.shapes, ids, s.seed, tally.fates, tally.hits, scattered,
         )  # fmt: skip
         if n == 0:
             break
         if e.is_expected:
-            reached = Hits(points[:n], normals[:n], surfaces[:n], np.zeros(n, bool))
-            add_next_event(
-                e, flight, ids, tally, reached, _cosine_paths(flight, pixel[:n], path[:n], targets[:n]), offset
-            )
+            points, normals, surfaces, targets = (a[:n] for a in scattered)
+            reached = Hits(points, normals, surfaces, np.zeros(n, bool))
+            _, _, pixel, path, _ = (a[:n] for a in atoms)
+            add_next_event(e, flight, ids, tally, reached, _cosine_paths(flight, pixel, path, targets), offset)
 
 
 def _cosine_paths(event: int, pixel: np.ndarray, path: np.ndarray, target: np.ndarray) -> Paths:
