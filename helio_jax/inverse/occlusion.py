@@ -5,6 +5,8 @@ first, angles and offsets make the far side of a hill come down to the substrate
 the first time, such edges are cut; afterwards each is joined again if its misfit allows.
 """
 
+from typing import Any
+
 import numpy as np
 
 from helio_jax.forward.surface import Surface, along
@@ -17,7 +19,7 @@ STEEP = 1.0
 
 
 def find_occlusion_edges(
-    signal: np.ndarray, variance: np.ndarray, surface: Surface, shift: tuple[float, float], axis: int
+    signal: np.ndarray, variance: np.ndarray, surface: Surface, shift: Any, axis: int
 ) -> np.ndarray:
     """Find edges along an axis (0: y, 1: x) that may be occlusion edges: depth jumps behind a rim, along the beam.
 

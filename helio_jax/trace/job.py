@@ -77,6 +77,10 @@ class Job:
                 **{name: package_version(name) for name in _LIBRARIES},
             },
         }
+        if isinstance(scene.scan, PositionList):
+            about["the scan's positions"] = _hash(scene.scan.read(scene.base_dir), LAW_STEP)
+        if (plate := scene.read_plate()) is not None:
+            about["the plate's surface"] = _hash_body(plate)
         return cls(scene.with_base_dir(scene.base_dir.resolve()), settings, about)
 
     @functools.cached_property

@@ -250,8 +250,8 @@ class ScanResult:
             is_above = np.sqrt(variance) > settings.target_error * total
             about["n_above_target"] = int(np.sum(np.any(is_above, axis=0)))
         about["materials"] = {name: law.kind for name, law in scene.used_materials.items()}
-        if view.about:
-            about["view"] = view.about
+        if view.description:
+            about["view"] = view.description
         images: dict[str, Any] = {}
         for name, array_name, factor in (
             ("by_order", "by_order", scale),
@@ -279,13 +279,7 @@ class ScanResult:
             n_rays=scale if is_expected else float(settings.rays),
             noise="expected" if is_expected else "poisson",
             name=f"{scene.name}, {view.label}" if len(self.job.views) > 1 else scene.name,
-            provenance={
-                "trace": settings.model_dump(mode="json"),
-                "n_negative": n_negative,
-                **missed,
-                "materials": {name: law.kind for name, law in scene.used_materials.items()},
-                **({"view": view.description} if view.description else {}),
-            },
+            provenance=about,
         )
 
 
