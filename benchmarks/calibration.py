@@ -22,10 +22,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.toml import write_instrument  # noqa: E402
 from helio_jax.instrument import Instrument, Uncertainty  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.compare import compare  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_instrument, load_scene  # noqa: E402
 

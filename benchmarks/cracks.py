@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, write  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.hdf5 import read_height, read_stack  # noqa: E402
 from helio_jax.measure.cracks import Crack, find_cracks  # noqa: E402
 from helio_jax.measure.line_paths import trace_lines  # noqa: E402
@@ -27,6 +26,7 @@ from helio_jax.measure.lines import ORDER, LineSettings, contrast_of, find_lines
 from helio_jax.measure.regions import inside_polygon, parse_region  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 
 SALT = ROOT / "scenes" / "measured_salt.toml"

@@ -27,19 +27,24 @@ from pydantic import TypeAdapter
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+
 from benchmarks import rows  # noqa: E402
 from benchmarks.alignment import INSTRUMENT, POINTS, SCANS, Surface, bumps, pyramids, rough  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.alignment.align import find_motions  # noqa: E402
 from helio_jax.alignment.resample import resample  # noqa: E402
 from helio_jax.alignment.rigid import Rigid  # noqa: E402
 from helio_jax.arrays import pitch  # noqa: E402
-from helio_jax.calibration.self_calibration import SelfCalibration, effective_instrument  # noqa: E402
-from helio_jax.calibration.self_calibration import apply as apply_calibration  # noqa: E402
+from helio_jax.calibration.self_calibration import (  # noqa: E402
+    SelfCalibration,
+    apply_calibration,
+    effective_instrument,
+)
 from helio_jax.errors import GuardError  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.formats.points import read_points  # noqa: E402
-from helio_jax.forward.beam_frame import unit_normal  # noqa: E402
+from helio_jax.forward.form_factor import substrate_signal  # noqa: E402
+from helio_jax.forward.optics import Optics  # noqa: E402
+from helio_jax.forward.surface import unit_normal  # noqa: E402
 from helio_jax.measure.facets import Facet, FacetSettings, find_facets  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
@@ -48,6 +53,7 @@ from helio_jax.scene.scattering import CosineLaw, Law  # noqa: E402
 from helio_jax.scene.surfaces import surface_body  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.measure import reconstructed_area  # noqa: E402
 from helio_jax.workflows.scene_file import load_instrument  # noqa: E402
 
@@ -122,7 +128,7 @@ def record(sample: Sample, n: int, rays: int, seed: int, drifts: tuple = DRIFTS,
     grid = np.arange(-1.2 * FIELD_UM, 1.2 * FIELD_UM, fine) + 0.37 * fine
     mesh_x, mesh_y = np.meshgrid(grid, grid)
     pixel_x, pixel_y = (a.ravel() for a in np.meshgrid(axis, axis))
-    flat = float(pipeline.flat_signal(instrument)[0])
+    flat = float(substrate_signal(Optics.of(instrument))[0])
     scans, multiples, motions = [], [], []
     time = np.linspace(-1.0, 1.0, n)[:, None]
     for k, (gain, drift) in enumerate(zip(GAINS, drifts, strict=True)):
@@ -152,11 +158,11 @@ def calibrated(known: Recorded, stage: str, method: str) -> MicrographStack:
     motions = find_motions(known.scans).motions if stage == "full" else known.motions
     stack = resample(known.scans, motions, "reference")
     if stage in ("full", "motions"):
-        return pipeline.calibrate_turned(stack, keeps_multiple=method == "refine")
+        return pipeline.calibrate_rotated(stack, keeps_multiple=method == "refine")
     polar = math.degrees(math.atan2(3120.0, 3000.0))
     found = SelfCalibration(np.array(GAINS), np.full(5, SHARE), np.array(DRIFTS), polar, 0.0, 1.0, 0.0, 0.0)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
-    done = apply_calibration(stack, found, pipeline.flat_signal(instrument), instrument)
+    done = apply_calibration(stack, found, substrate_signal(Optics.of(instrument)), instrument)
     if stage == "multiple":
         done = done.replace(counts=done.counts - resample(known.multiple, motions, "reference").counts)
     return done
@@ -236,7 +242,7 @@ def measured(shared: Path, method: str) -> MicrographStack:
     instrument = load_instrument(INSTRUMENT)
     scans = MicrographSet(tuple(import_micrographs(shared / "data" / f"{name}.mat", instrument) for name in SCANS))
     found = find_motions(scans, read_points(POINTS))
-    return pipeline.calibrate_turned(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
+    return pipeline.calibrate_rotated(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
 
 
 def main() -> None:
@@ -279,7 +285,7 @@ def main() -> None:
             stacks[which] = stack
             rec = reconstructed(stack, method, args.refine)
             found = facets_of(rec, max(15, round(60 * (args.size / 101) ** 2)))
-            found["calibration"] = stack.provenance["self_calibrate"]
+            found["calibration"] = stack.provenance.get("self_calibrate")
             text, is_reached = summary(found)
             if sample is not None:
                 found |= against_truth(rec, sample)

@@ -24,8 +24,8 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
 from benchmarks.calibration import read_by  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 from helio_jax.workflows.truth import load_truth, true_surface  # noqa: E402
 

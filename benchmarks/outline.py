@@ -20,9 +20,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import rows  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.compare import raster_of  # noqa: E402
 from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 

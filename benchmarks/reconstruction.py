@@ -27,7 +27,6 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.error_bars import coverage_row, efficiency_row  # noqa: E402
 from benchmarks.rows import with_origin  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.forward.form_factor import SpotGeometry  # noqa: E402
 from helio_jax.forward.masking import hidden_form_factor  # noqa: E402
@@ -37,6 +36,7 @@ from helio_jax.inverse.problem import Refiner  # noqa: E402
 from helio_jax.inverse.residuals import Prediction, Surface  # noqa: E402
 from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
+from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.corrections import make_predictor  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 from helio_jax.workflows.truth import true_height  # noqa: E402

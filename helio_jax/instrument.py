@@ -15,6 +15,10 @@ from helio_jax.detector import Aperture, Cone, Detector
 from helio_jax.errors import SceneError
 from helio_jax.settings import Settings, Unit
 
+POLAR_STD_DEG = 5.0
+"""Prior standard deviation of the apertures' polar angles where rotated scans calibrate the instrument and its file
+states none: they see the sample from somewhere between its base and its top [deg]."""
+
 
 class Effusive(Settings):
     """Effusive beam: atoms that leave the pinhole with a cos^n distribution about the plate normal."""
@@ -189,6 +193,11 @@ class Instrument(Settings):
         """Distance D from the plate to the sample's plane z = 0 [um]."""
         d = self.plate.sample_distance_um
         return self.plate.working_distance_um if d is None else d
+
+    @property
+    def polar_std_deg(self) -> float:
+        """Prior standard deviation of the polar angles for a calibration: the stated one, else `POLAR_STD_DEG`."""
+        return self.uncertainty.polar_deg or POLAR_STD_DEG
 
     @property
     def detector_names(self) -> tuple[str, ...]:

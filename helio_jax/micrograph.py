@@ -1,4 +1,8 @@
-"""Micrographs, simulated or measured. Conventions: arrays.py."""
+"""Micrographs, simulated or measured: a noun that flows between the stages. Conventions: arrays.py.
+
+`Calibration` and `ScanAlignment` state what was done to a stack, as far as later steps depend on it; `provenance` is
+history, and no step depends on it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -6,9 +10,51 @@ from typing import Any, Literal
 
 import numpy as np
 
-from helio_jax.arrays import check_axis, set_float_arrays
+from helio_jax.arrays import as_float_array, as_json, check_axis, set_float_arrays
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibration of a measured stack to units of the beam, and its uncertainty (frozen, checked when made).
+
+    Attributes:
+        method: "border" (the signal of the flat border is known) or "constant_albedo" (aligned scans, one albedo).
+        priors: settings of the fit (table [reconstruct.refine]) that state how uncertain the calibration is; a setting
+            that the user gives wins. Numbers or lists of numbers.
+        without_multiple: whether predicted multiple scattering was subtracted from the counts.
+    """
+
+    method: Literal["border", "constant_albedo"]
+    priors: Mapping[str, Any] = field(default_factory=dict)
+    without_multiple: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in ("border", "constant_albedo"):
+            raise InputFileError(f"calibration.method must be border or constant_albedo, got {self.method!r}")
+        if not isinstance(self.priors, Mapping) or not isinstance(self.without_multiple, bool):
+            raise InputFileError("calibration.priors must be a table, calibration.without_multiple true or false")
+        object.__setattr__(self, "priors", as_json(self.priors))
+        for name, value in self.priors.items():
+            as_float_array(f"calibration.priors.{name}", value, (None,) * np.ndim(value), InputFileError)
+
+
+@dataclass(frozen=True)
+class ScanAlignment:
+    """States that the images of a stack are scans of a rotated sample, brought onto one raster (checked when made).
+
+    Attributes:
+        time_planes: for each image a, b, c [detector, 3]: a x + b y + c is the time at which its own scan recorded the
+            point (x, y), -1 for the first line of the scan to 1 for the last one; None: not known.
+    """
+
+    time_planes: tuple[tuple[float, float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.time_planes is not None:
+            planes = as_float_array("alignment.time_planes", self.time_planes, (None, 3), InputFileError)
+            object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
 @dataclass(frozen=True)
@@ -36,7 +82,10 @@ class MicrographStack:
         noise: "expected" (noise-free expectation), "poisson" (counts) or "measured".
         unit: unit of the counts ("counts", "A").
         name: short name of the scan.
-        provenance: scene, files, versions, seed, ray counters (JSON-compatible).
+        calibration: how measured counts were brought into units of the beam; None: they were not.
+        alignment: set where the images are aligned scans of a rotated sample.
+        materials: kind of scattering law by name of the material, of a simulated sample.
+        provenance: history: scene, files, versions, seed, ray counters (JSON-compatible).
     """
 
     counts: np.ndarray
@@ -59,6 +108,9 @@ class MicrographStack:
     noise: Literal["expected", "poisson", "measured"] = "expected"
     unit: str = "counts"
     name: str = "scan"
+    calibration: Calibration | None = None
+    alignment: ScanAlignment | None = None
+    materials: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -82,6 +134,9 @@ class MicrographStack:
         object.__setattr__(self, "is_observed", observed)
         if self.variance is not None and not np.all(self.variance[observed] >= 0):
             raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
+        planes = None if self.alignment is None else self.alignment.time_planes
+        if planes is not None and len(planes) != shape[0]:
+            raise error(f"alignment.time_planes must hold one plane for each of {shape[0]} images, got {len(planes)}")
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -108,11 +163,10 @@ class MicrographStack:
     @property
     def scan_time(self) -> np.ndarray | None:
         """Recording time of every pixel within its scan, -1 to 1 [detector, y, x]; known for aligned scans only."""
-        coefficients = self.provenance.get("scan_time")
-        if coefficients is None:
+        if self.alignment is None or self.alignment.time_planes is None:
             return None
         x, y = np.meshgrid(self.x, self.y)
-        return np.stack([a * x + b * y + c for a, b, c in coefficients])
+        return np.stack([a * x + b * y + c for a, b, c in self.alignment.time_planes])
 
     def count_fractions(self) -> dict[str, float]:
         """Compute the fractions of all counts (background excluded) from multiple scattering and from the plate.

@@ -6,7 +6,7 @@ by -h tan t at oblique incidence. Overhangs and shadowed regions appear as depth
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Reconstruction:
         raster_x, raster_y: beam positions [um].
         instrument: of the scan that was reconstructed.
         method: "linear", "nearfield" or "refine".
+        border: "flat": heights count from the substrate at the image's border; "free": their common level is unknown.
         normals: unit surface normals, up [y, x, 3].
         albedo: relative reflectivity, substrate = 1 [y, x].
         height_std: standard deviation of each height [y, x], um, or None if the method gives none.
@@ -43,7 +44,7 @@ class Reconstruction:
         residuals: (data - model) / standard deviation [detector, y, x].
         gain, offset: fitted or assumed, data = gain * model + offset [detector].
         status: one sentence on how the method ended.
-        provenance: JSON-compatible.
+        provenance: history, on which no step depends (JSON-compatible).
     """
 
     height: np.ndarray
@@ -60,6 +61,7 @@ class Reconstruction:
     residuals: np.ndarray | None = None
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
+    border: Literal["flat", "free"] = "flat"
     status: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

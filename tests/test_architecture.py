@@ -2,7 +2,7 @@
 
 Each level may import only from levels below; stages of one level are blind to one another:
 commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward, trace, formats > scene >
-nouns > settings, arrays, kernel, errors.
+nouns > settings, arrays, kernel, block_fit, errors.
 """
 
 import ast
@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors"},
-    {"arrays", "settings", "kernel"},
+    {"arrays", "settings", "kernel", "robust", "block_fit"},
     {"detector"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},
@@ -223,6 +223,31 @@ def test_truth_stays_out_of_inverse():
     for path in (ROOT / "inverse").rglob("*.py"):
         assert truth_imports(path.read_text(encoding="utf-8")) == [], path
     assert truth_imports("def f():\n    from helio_jax.scores.settings import TruthSettings")
+
+
+def provenance_reads(source: str) -> list[int]:
+    """Return the lines that use `x.provenance` other than by copying it whole: `{**p}`, `dict(p)`, `provenance=p`."""
+    tree, copied = ast.parse(source), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Dict):
+            copied |= {id(value) for key, value in zip(node.keys, node.values, strict=True) if key is None}
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dict":
+            copied |= {id(value) for value in node.args}
+        elif isinstance(node, ast.keyword) and node.arg == "provenance":
+            copied.add(id(node.value))
+    attributes = [n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and n.attr == "provenance"]
+    return [node.lineno for node in attributes if id(node) not in copied]
+
+
+def test_provenance_is_history():
+    """No step depends on it: only files, pictures and commands read its keys. A typed record on the noun steers."""
+    for path in FILES:
+        place = path.relative_to(ROOT)
+        if place.parts[0] not in ("formats", "figures", "commands"):
+            assert provenance_reads(path.read_text(encoding="utf-8")) == [], f"{place}: add a field to the noun instead"
+    for read in ("s.provenance['a']", "s.provenance.get('a')", "'a' in s.provenance", "p = s.provenance"):
+        assert provenance_reads(read) == [1]
+    assert provenance_reads("f({**s.provenance, 'a': 1}, dict(s.provenance), provenance=s.provenance)") == []
 
 
 def loaded_by(code: str) -> set[str]:

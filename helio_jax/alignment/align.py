@@ -1,8 +1,9 @@
-"""Align turned scans of one sample and bring them onto one raster: a set of scans -> one stack, ready for the heights.
+"""Align scans of a rotated sample and bring them onto one raster: a set of scans -> one stack, ready for the heights.
 
-The rotation of each scan is known roughly (the stage's), its shift is not, for the axis of rotation does not go through
-the field's centre. Both are found from control points (points.py) or automatically (autoalign.py); both refuse with a
-reason when the scans do not fix them. Rigid only: no stretching, no drift within a scan.
+The rotation of each scan is known roughly (the stage's), its shift is not: the axis of rotation misses the centre of
+the field. Both are found from control points (control_points.py) or automatically (automatic.py, for smooth samples
+albedo_prior.py); an alignment that the scans do not determine is refused with its reason. Rigid motions only: no
+stretching, no drift within a scan.
 """
 
 import math
@@ -13,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from helio_jax.alignment.albedo_prior import OneAlbedo, align_one_albedo
+from helio_jax.alignment.albedo_prior import AlbedoAlignment, align_with_albedo_prior
 from helio_jax.alignment.automatic import Aligner, Match
 from helio_jax.alignment.control_points import Picks, PointFit, fit_points, rms
 from helio_jax.alignment.resample import resample
@@ -25,14 +26,14 @@ from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.settings import Settings
 
 MIN_VIEWS = 4
-"""Scans for the automatic way: a view is a combination of three others."""
+"""Scans for the automatic alignment: a view is a combination of three others."""
 
 
 class AlignSettings(Settings):
-    """How scans are aligned, and when the result is refused."""
+    """How scans are aligned, and limits beyond which the result is refused."""
 
     field: Literal["union", "reference"] = "union"
-    """Raster of the result: all that any scan recorded, or the first scan's own."""
+    """Raster of the result: the union of all fields, or the first scan's own."""
     max_shift_um: float | None = Field(default=None, gt=0.0, le=1e7)
     """Automatic: largest shift of the field's centre [um]; default: a quarter of the first scan's shorter side."""
     max_rotation_deg: float = Field(default=3.0, gt=0.0, le=20.0)
@@ -40,66 +41,58 @@ class AlignSettings(Settings):
     min_correlation: float = Field(default=0.2, gt=0.0, lt=1.0)
     """Automatic: least correlation of a scan's fine structure with what the others predict (linear photometry)."""
     min_margin: float = Field(default=0.15, ge=0.0, lt=1.0)
-    """Automatic: by how much of its height that correlation must stand above the next peak, 5 or more pixels away."""
+    """Automatic: fraction of its height by which that correlation must exceed the next peak, 5 or more pixels away."""
     max_std_px: float = Field(default=0.5, gt=0.0, le=10.0)
     """Automatic: largest standard deviation of a pixel's place [pixels]."""
     min_restoring: float = Field(default=0.08, ge=0.0, lt=1.0)
-    """Automatic: share of a common displacement of all fields that one fit of each must take back to be relied on.
+    """Automatic: least observability of a common displacement of all fields (`Aligner.common_shift_observability`).
 
-    The model's own error per view, some hundredths of a pixel, over this is the scans' joint error. Traced crystals,
-    pyramids, rough surfaces have 0.2 to 0.65, balls and soft hills, whose errors are 1 to 5 pixels, 0.06 or less: below
-    it the motions are fitted with one albedo instead (onealbedo.py)."""
+    The joint error of the scans is the model's error per view, some hundredths of a pixel, over this number. Traced
+    crystals, pyramids and rough surfaces have 0.2 to 0.65; balls and soft hills, whose errors are 1 to 5 pixels, 0.06
+    or less: below the limit the motions are fitted with a constant-albedo prior instead (albedo_prior.py)."""
     max_albedo_spread: float = Field(default=0.1, gt=0.0, le=1.0)
-    """Automatic: largest robust deviation of the albedo where only one albedo tells the motions."""
+    """Automatic: largest robust standard deviation of the albedo where only its constancy determines the motions."""
     max_left_out_px: float = Field(default=3.0, gt=0.0, le=100.0)
     """Control points: largest root mean square of the leave-one-out errors [pixels]."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Rigid motions of all scans, and how well they are known.
+    """Rigid motions of all scans and their uncertainty.
 
     Attributes:
         names: of the scans.
         motions: from the common frame, which is the first scan's, to each scan.
         std_um: standard deviation of a pixel's place per axis, for each scan [um].
         matches: automatic: of each scan.
-        restoring: automatic: share of a common displacement of all fields that is taken back (`Aligner.restoring`).
-        one_albedo: automatic: the fit with one albedo, where `restoring` was too little.
+        common_shift_observability: automatic: see `Aligner.common_shift_observability`.
+        albedo_prior: automatic: the fit with a constant-albedo prior, where that observability is too small.
         points: control points: their fit.
-        problems: why the result should not be trusted; empty when it may be.
+        problems: reasons to refuse the result; empty where there is none.
     """
 
     names: tuple[str, ...]
     motions: tuple[Rigid, ...]
     std_um: tuple[float, ...]
     matches: tuple[Match, ...] | None = None
-    restoring: float | None = None
-    one_albedo: OneAlbedo | None = None
+    common_shift_observability: float | None = None
+    albedo_prior: AlbedoAlignment | None = None
     points: PointFit | None = None
     problems: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible record."""
-        out: dict[str, Any] = {
-            "scans": [
-                {
-                    "name": name,
-                    "rotation_deg": math.degrees(math.remainder(m.rotation, math.tau)),
-                    "shift_um": list(m.shift),
-                    "std_um": std,
-                }
-                for name, m, std in zip(self.names, self.motions, self.std_um, strict=True)
-            ],
-            "problems": list(self.problems),
-        }
-        if self.restoring is not None:
-            out["restoring"] = self.restoring
-        if self.one_albedo is not None:
-            names = ("albedo_spread", "share", "polar_deg")
-            out["one_albedo"] = {name: getattr(self.one_albedo, name) for name in names}
+        """Make a JSON-compatible record."""
+        scans: list[dict[str, Any]] = [
+            {"name": name, "rotation_deg": m.rotation_deg, "shift_um": list(m.shift), "std_um": std}
+            for name, m, std in zip(self.names, self.motions, self.std_um, strict=True)
+        ]
+        out: dict[str, Any] = {"scans": scans, "problems": list(self.problems)}
+        if self.common_shift_observability is not None:
+            out["restoring"] = self.common_shift_observability
+        if (a := self.albedo_prior) is not None:
+            out["one_albedo"] = {"albedo_spread": a.albedo_spread, "share": a.background, "polar_deg": a.polar_deg}
         if self.matches is not None:
-            for scan, match in zip(out["scans"], self.matches, strict=True):
+            for scan, match in zip(scans, self.matches, strict=True):
                 scan["match"] = asdict(match)
         if self.points is not None:
             out["points"] = {
@@ -122,16 +115,15 @@ def align_scans(
 
     Args:
         scans: two or more, normal incidence, `sample_rotation` known to a few degrees.
-        picks: control points; default: the automatic way, which needs four or more scans.
+        picks: control points; default: automatic alignment, which needs four or more scans.
         settings: limits and field.
         source: name of the control points' file, for messages.
 
     Returns:
-        One stack, whose detectors are every scan's apertures turned back (`provenance["align"]` tells the motions),
-        and the alignment.
+        One stack, whose detectors are the apertures of every scan, rotated back, and the alignment.
 
     Raises:
-        GuardError: the scans do not fix the alignment, or oblique incidence, where heights move pixels.
+        GuardError: the scans do not determine the alignment, or oblique incidence, where heights move pixels.
         InputFileError: too few scans, equal names, different instruments, or unusable control points.
     """
     alignment = find_motions(scans, picks, settings, source)
@@ -152,13 +144,13 @@ def find_motions(
     settings: AlignSettings = AlignSettings(),
     source: str = "the control points",
 ) -> Alignment:
-    """Find the motions, with what speaks against them in `problems`. See `align_scans`."""
+    """Find the motions; reasons to refuse them are in `problems`. See `align_scans`."""
     _check(scans, is_auto=picks is None)
     return _automatic(scans, settings) if picks is None else _from_points(scans, picks, settings, source)
 
 
 def _check(scans: MicrographSet, is_auto: bool) -> None:
-    """Refuse sets that no rigid motion aligns."""
+    """Refuse sets that rigid motions cannot align."""
     first, *others = scans.stacks
     names = [s.name for s in scans.stacks]
     if not others or (is_auto and len(names) < MIN_VIEWS):
@@ -170,8 +162,8 @@ def _check(scans: MicrographSet, is_auto: bool) -> None:
     for stack in scans.stacks:
         if stack.instrument.beam.incidence_deg:
             raise GuardError(
-                f"scan {stack.name!r} has an incidence of {stack.instrument.beam.incidence_deg:g} deg: turned scans "
-                "can be aligned rigidly only at 0 deg, for elsewhere every height moves its pixel by another amount"
+                f"scan {stack.name!r} has an incidence of {stack.instrument.beam.incidence_deg:g} deg: rotated scans "
+                "can be aligned rigidly only at 0 deg; at oblique incidence heights move pixels"
             )
         if stack.instrument.sample_distance != first.instrument.sample_distance:
             raise InputFileError(
@@ -188,35 +180,35 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
         [View.of(s) for s in scans.stacks], rotations, float(reach), math.radians(settings.max_rotation_deg)
     )
     aligner.start_on_edges()
-    start, restoring = list(aligner.motions), aligner.restoring()
-    if restoring >= settings.min_restoring:
+    start, observability = list(aligner.motions), aligner.common_shift_observability()
+    if observability >= settings.min_restoring:
         aligner.run()
-        restoring = aligner.restoring()
-    one, problems = None, []
-    if not restoring >= settings.min_restoring:
-        one = align_one_albedo(scans.stacks, start)
-        aligner.motions = list(one.motions)
-        if not one.albedo_spread <= settings.max_albedo_spread:
+        observability = aligner.common_shift_observability()
+    joint, problems = None, []
+    if not observability >= settings.min_restoring:
+        joint = align_with_albedo_prior(scans.stacks, start)
+        aligner.motions = list(joint.motions)
+        if not joint.albedo_spread <= settings.max_albedo_spread:
             problems.append(
-                f"the scans together: a common displacement of their fields shows only in the albedo (share taken back "
-                f"by the photometric fit {restoring:.3f}, limit {settings.min_restoring:g}), and its robust deviation "
-                f"must be <= {settings.max_albedo_spread:g}, got {one.albedo_spread:.3f}"
+                "the scans together: only a constant albedo determines a common displacement of their fields "
+                f"(observability by photometry {observability:.3f}, min_restoring {settings.min_restoring:g}), and "
+                f"its robust deviation must be <= {settings.max_albedo_spread:g}, got {joint.albedo_spread:.3f}"
             )
-    matches = tuple(aligner.judge(k) for k in range(len(scans.stacks)))
-    if one is not None:
-        matches = tuple(replace(m, std_um=std) for m, std in zip(matches, one.std_um, strict=True))
+    matches = tuple(aligner.match(k) for k in range(len(scans.stacks)))
+    if joint is not None:
+        matches = tuple(replace(m, std_um=std) for m, std in zip(matches, joint.std_um, strict=True))
     errors = _stage_errors([m.rotation for m in aligner.motions], rotations)
     for k, (stack, match, motion) in enumerate(zip(scans.stacks, matches, aligner.motions, strict=True)):
-        turned = math.degrees(abs(errors[k]))
+        stage_error = math.degrees(abs(errors[k]))
         moved = math.dist(motion.apply(aligner.frame.center), aligner.views[k].center)
         checks = [
             (not match.std_um <= settings.max_std_px * aligner.frame.step, "standard deviation of its place",
              f"{match.std_um / aligner.frame.step:.2f} px", f"<= {settings.max_std_px:g} px"),
-            (turned > settings.max_rotation_deg, "error of the stage's rotation",
-             f"{turned:.2f} deg", f"<= {settings.max_rotation_deg:g} deg"),
+            (stage_error > settings.max_rotation_deg, "error of the stage's rotation",
+             f"{stage_error:.2f} deg", f"<= {settings.max_rotation_deg:g} deg"),
             (moved > reach, "shift of its centre", f"{moved:.0f} um", f"<= {reach:g} um"),
         ]  # fmt: skip
-        if one is None:  # smooth samples have no fine structure to correlate
+        if joint is None:  # smooth samples have no fine structure to correlate
             checks += [
                 (match.correlation < settings.min_correlation, "correlation with the prediction from the other scans",
                  f"{match.correlation:.2f}", f">= {settings.min_correlation:g}"),
@@ -228,23 +220,14 @@ def _automatic(scans: MicrographSet, settings: AlignSettings) -> Alignment:
             f"scan {stack.name!r}: {what} must be {limit}, got {got}" for bad, what, got, limit in checks if bad
         ]
     stds = (0.0, *(m.std_um for m in matches[1:]))
-    names = tuple(s.name for s in scans.stacks)
-    return Alignment(
-        names,
-        tuple(aligner.motions),
-        stds,
-        matches=matches,
-        restoring=restoring,
-        one_albedo=one,
-        problems=tuple(problems),
-    )
+    names, motions = tuple(s.name for s in scans.stacks), tuple(aligner.motions)
+    return Alignment(names, motions, stds, matches, observability, joint, problems=tuple(problems))
 
 
 def _stage_errors(found: list[float], nominal: list[float]) -> np.ndarray:
-    """Return the errors of the stage's rotations [rad], the least ones that explain what was found.
+    """Compute the least errors of the stage's rotations [rad] that explain the rotations found.
 
-    Only differences between scans are seen: the first scan's stage may be as wrong as any other's, so what all have in
-    common is chosen such that the largest error is smallest.
+    Only differences between scans are known: the error that all have in common makes the largest one smallest.
     """
     apart = np.array([math.remainder(a - b, math.tau) for a, b in zip(found, nominal, strict=True)])
     return apart - 0.5 * (apart.max() + apart.min())
@@ -275,7 +258,7 @@ def _from_points(scans: MicrographSet, picks: Picks, settings: AlignSettings, so
 
 
 def _check_in_field(scans: MicrographSet, picks: Mapping, source: str) -> None:
-    """Refuse points outside their scan: another unit, or another file's."""
+    """Refuse points outside their scan: they have another unit or belong to another file."""
     for stack in scans.stacks:
         for point, (x, y) in picks.get(stack.name, {}).items():
             for axis, value, own in (("x", x, stack.x), ("y", y, stack.y)):
@@ -284,21 +267,3 @@ def _check_in_field(scans: MicrographSet, picks: Mapping, source: str) -> None:
                         f"{source}: point {point!r} of {stack.name!r} has {axis} = {value:g} um, outside the scan "
                         f"({own[0]:g} to {own[-1]:g} um): give beam positions in um"
                     )
-
-
-def describe(stack: MicrographStack) -> list[str]:
-    """Return lines that tell the motions of an aligned stack."""
-    record, lines = stack.provenance["align"], []
-    for scan in record["scans"]:
-        x, y = scan["shift_um"]
-        error = f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown"
-        lines.append(
-            f"  {scan['name']}: turned by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um, {error}"
-        )
-    if "points" in record:
-        found = record["points"]
-        rest, left_out = found["residual_rms_um"], found["left_out_rms_um"]
-        lines.append(f"  points: residual {rest:.1f} um, leave-one-out {left_out:.1f} um (rms)")
-    share = float(np.mean(stack.is_observed.sum(0) >= 3))
-    n, ny, nx = stack.shape
-    return [*lines, f"{n} images on {nx} x {ny} pixels; {share:.0%} of them in 3 or more"]

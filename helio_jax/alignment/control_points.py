@@ -1,8 +1,8 @@
-"""Alignment of turned scans from control points: the same points of the sample picked in several pictures.
+"""Alignment of rotated scans from control points: the same points of the sample picked in several pictures.
 
 Every point has an unknown place in the common frame and every view an unknown rigid motion; all are fitted together
-(generalised Procrustes), so a point need not be visible in every view. The picks alone say how good they are:
-residuals, and the leave-one-out error, which is the distance of a pick from where all other picks put it.
+(generalised Procrustes), so a point need not be visible in every view. The accuracy follows from the picks: residuals,
+and the leave-one-out error, the distance of a pick from its place predicted by all others.
 """
 
 import math
@@ -17,20 +17,20 @@ from helio_jax.errors import InputFileError
 Picks = Mapping[str, Mapping[str, tuple[float, float]]]
 """Control points: {view: {point: (x, y) [um]}}, beam positions of that view."""
 MIN_POINTS = 3
-"""Points per view: two fix a rigid motion, a third one checks it."""
-_ROUNDS = 200
-_STEADY_UM = 1e-7
+"""Points per view: two determine a rigid motion, a third one tests it."""
+_MAX_ITERATIONS = 200
+_CONVERGED_UM = 1e-7
 
 
 @dataclass(frozen=True)
 class PointFit:
-    """What control points say.
+    """Result of the fit.
 
     Attributes:
-        motions: of each view, in the order of the names that were given.
+        motions: of each view, in the order of the given names.
         places: of every point in the common frame [um].
-        residuals: distance of each pick from where the fit sees it [um]: {view: {point: distance}}.
-        left_out: the same for a fit that was not shown this pick, the leave-one-out error [um].
+        residuals: distance of each pick from its fitted place [um]: {view: {point: distance}}.
+        left_out: the same for a fit without this pick, the leave-one-out error [um].
         std_um: standard deviation of one coordinate of a pick, from the residuals and the degrees of freedom [um].
     """
 
@@ -67,13 +67,13 @@ def fit_points(picks: Picks, views: tuple[str, ...], source: str = "the control 
 
 
 def rms(errors: Mapping[str, Mapping[str, float]]) -> float:
-    """Return the root mean square of all finite distances."""
+    """Compute the root mean square of all finite distances."""
     values = np.array([e for named in errors.values() for e in named.values()])
     return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2))) if np.isfinite(values).any() else math.nan
 
 
 def _shared(picks: Picks, views: tuple[str, ...], source: str) -> dict[str, dict[str, np.ndarray]]:
-    """Return the picks of points that two or more views have, after checking that they suffice."""
+    """Select the points that two or more views share, and check that they suffice."""
     if unknown := sorted(set(picks) - set(views)):
         raise InputFileError(f"{source}: view {unknown[0]!r} is none of the scans ({', '.join(views)}): rename it")
     count: dict[str, int] = {}
@@ -96,7 +96,7 @@ def _shared(picks: Picks, views: tuple[str, ...], source: str) -> dict[str, dict
 def _solve(
     shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...], source: str
 ) -> tuple[tuple[Rigid, ...], dict]:
-    """Alternate between places and motions, started from the view that shares most points; first view fixed."""
+    """Alternate between places and motions, starting from the view that shares most points; first view fixed."""
     motions: dict[str, Rigid] = {views[0]: Rigid(0.0, (0.0, 0.0))}
     places = dict(shared[views[0]])
     while len(motions) < len(views):
@@ -111,7 +111,7 @@ def _solve(
         motions[view] = _fitted(places, shared[view], common)
         back = motions[view].inverse()
         places |= {p: back.apply(at) for p, at in shared[view].items() if p not in places}
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         seen: dict[str, list[np.ndarray]] = {}
         for view in views:
             back = motions[view].inverse()
@@ -123,7 +123,7 @@ def _solve(
         new = {v: fitted[v].after(first.inverse()) for v in views}
         change = max(abs(new[v].rotation - motions[v].rotation) * 1e3 + _gap(new[v], motions[v]) for v in views)
         motions, places = new, {p: first.apply(at) for p, at in places.items()}
-        if change < _STEADY_UM:
+        if change < _CONVERGED_UM:
             break
     return tuple(motions[v] for v in views), places
 
@@ -137,7 +137,7 @@ def _fitted(places: dict[str, np.ndarray], picked: dict[str, np.ndarray], names:
 
 
 def _left_out(shared: dict[str, dict[str, np.ndarray]], views: tuple[str, ...], view: str, point: str) -> float:
-    """Return how far a pick is from where all others put it; NaN where they do not fix it."""
+    """Compute the distance of a pick from its place predicted by all others; NaN where they do not determine it."""
     rest = {v: {p: at for p, at in named.items() if (v, p) != (view, point)} for v, named in shared.items()}
     if len(rest[view]) < 2 or sum(point in named for named in rest.values()) < 1:
         return math.nan

@@ -1,7 +1,7 @@
 """Normalised cross-correlation of two pictures of which parts are missing, for every shift at once (FFT).
 
-Both pictures are centred and scaled anew over the overlap of each shift, so gain, offset and missing borders do not
-bias the peak. Source: Padfield, IEEE Trans. Image Process. 21 (2012) 2706, eqs. 5-13.
+Both pictures are centred and scaled over the overlap of each shift, so gain, offset and missing borders do not bias the
+peak. Source: Padfield, IEEE Trans. Image Process. 21 (2012) 2706, eqs. 5-13.
 """
 
 from typing import NamedTuple
@@ -11,10 +11,10 @@ from scipy import fft
 
 
 class Peaks(NamedTuple):
-    """The best shift and its rival.
+    """The best shift and the next best one.
 
     Attributes:
-        shift: (rows, columns) by which the moving picture must be read further on.
+        shift: (rows, columns) from a point of the fixed picture to the same point of the moving one.
         height: correlation there.
         rival: highest correlation farther than `apart` pixels from it.
     """
@@ -27,13 +27,13 @@ class Peaks(NamedTuple):
 def correlate_masked(
     fixed: np.ndarray, is_fixed: np.ndarray, moving: np.ndarray, is_moving: np.ndarray, reach: int, overlap: float = 0.3
 ) -> np.ndarray:
-    """Return the correlation of fixed(r) with moving(r + u) for shifts u up to `reach` pixels each way.
+    """Correlate fixed(r) with moving(r + u) for shifts u up to `reach` pixels each way.
 
     Args:
         fixed, moving: pictures of one shape [y, x].
         is_fixed, is_moving: True where they are known.
         reach: largest shift per axis [pixels].
-        overlap: share of the largest overlap below which a shift is not considered.
+        overlap: fraction of the largest overlap below which a shift is not considered.
 
     Returns:
         Correlations [2 reach + 1, 2 reach + 1], index (reach, reach) being no shift; -1 where not considered.
@@ -61,7 +61,7 @@ def correlate_masked(
 
 
 def find_peak(ncc: np.ndarray, apart: float) -> Peaks:
-    """Return the highest correlation, where it is, and the highest one farther than `apart` pixels from it."""
+    """Find the highest correlation, its shift, and the highest one farther than `apart` pixels from it."""
     reach = ncc.shape[0] // 2
     row, column = np.unravel_index(np.argmax(ncc), ncc.shape)
     rows, columns = np.indices(ncc.shape)

@@ -1,10 +1,13 @@
-"""Micrographs turned, mirrored, binned, and their images given to other detectors: what a raw array may need.
+"""The eight orientations of a raw array and the order of its images: candidates, their symmetries, turned stacks.
 
-A file need not say which way its arrays lie. There are eight ways: mirrored (x -> -x) or not, then turned
+Files may not state the orientation of their arrays. There are eight: mirrored (x -> -x) or not, then turned
 counter-clockwise by 0, 90, 180 or 270 degrees, all images together, about the beam position (0, 0); pictures are drawn
-origin lower (arrays.py). Heights and geometry are not known here.
+origin lower (arrays.py). A candidate is an orientation with an order of the images. Where an orientation maps the
+instrument onto itself, several candidates are equivalent: the sample is turned or mirrored as a whole, and no fit can
+prefer one. Does not know heights.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +19,8 @@ from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 
+MAX_PERMUTED = 4
+"""Up to so many detectors all orders of the images are tried; with more only shifts and reversals along the ring."""
 _PER_DETECTOR = ("counts", "variance", "is_observed", "effuse", "plate", "masked")
 """Fields [detector, y, x] of a stack."""
 _SAME = 1e-3
@@ -36,22 +41,22 @@ class Turn:
 
     @property
     def matrix(self) -> np.ndarray:
-        """What maps old positions (x, y) to new ones [2, 2]."""
+        """Matrix from old positions (x, y) to new ones [2, 2]."""
         c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[self.turn_deg // 90]
         return np.array([[c, -s], [s, c]]) @ np.diag([-1 if self.mirror else 1, 1])
 
     def after(self, first: "Turn") -> "Turn":
-        """Return the orientation that `first` and then this one amount to."""
+        """Compose: `first`, then this orientation."""
         wanted = self.matrix @ first.matrix
         return next(t for t in ALL_TURNS if np.array_equal(t.matrix, wanted))
 
     def image(self, array: np.ndarray) -> np.ndarray:
-        """Return images [..., y, x] mirrored and turned."""
+        """Mirror and turn images [..., y, x]."""
         array = array[..., ::-1] if self.mirror else array
         return np.ascontiguousarray(np.rot90(array, -(self.turn_deg // 90), axes=(-2, -1)))  # rows go up: other sense
 
     def axes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the beam positions of the turned raster, increasing."""
+        """Compute the beam positions of the turned raster, increasing."""
         out = []
         for row in self.matrix:
             axis, sign = (x, row[0]) if row[0] else (y, row[1])
@@ -67,14 +72,14 @@ ALL_TURNS = tuple(Turn(turn, mirror) for mirror in (False, True) for turn in (0,
 
 
 def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> MicrographStack:
-    """Return a stack with all images mirrored and turned alike and dealt to the detectors anew.
+    """Mirror and turn all images of a stack alike, and assign them to the detectors.
 
-    The instrument stays. `sample_rotation` stays, too: this corrects how an array is read, not how the sample stood.
+    The instrument and `sample_rotation` stay: this corrects how an array is read, not how the sample stood.
 
     Args:
         stack: a raster scan.
         turn: the orientation.
-        order: for each detector of the instrument the image, counted from 0, that becomes its own.
+        order: for each detector of the instrument the number of its image, from 0.
 
     Raises:
         InputFileError: a list of positions, which has no array to turn.
@@ -102,10 +107,10 @@ def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> Mi
 
 
 def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
-    """Return a raster averaged over squares of pixels so that no side is longer than `max_pixels`.
+    """Average a raster over squares of pixels so that no side is longer than `max_pixels`.
 
-    Counts become means per pixel, variances those of the means; a square counts as observed where half of it is. Rows
-    and columns that fill no square are left out. Orders, masks and parts of the counts are not kept.
+    Counts become means per pixel, variances those of the means; a square is observed where half of its pixels are. Rows
+    and columns that fill no square are dropped, as are orders, masks and parts of the counts.
     """
     n = math.ceil(max(stack.shape[1:]) / max_pixels)
     n = max(1, min(n, *(side // 3 for side in stack.shape[1:])))
@@ -121,28 +126,24 @@ def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
     background = stack.background
     if background is not None and background.ndim == 3:
         background = of(background)
-    return MicrographStack(
+    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed"))
+    return stack.replace(
         counts=of(stack.counts),
         x=stack.x[: columns * n].reshape(columns, n).mean(1),
         y=stack.y[: rows * n].reshape(rows, n).mean(1),
-        instrument=stack.instrument,
         variance=None if stack.variance is None else of(stack.variance) / (known * n * n),
         is_observed=share >= 0.5,
         background=background,
-        n_rays=stack.n_rays,
-        fast_axis=stack.fast_axis,
-        noise=stack.noise,
-        unit=stack.unit,
-        name=stack.name,
-        provenance=stack.provenance,
+        **dropped,
     )
 
 
 def instrument_symmetries(instrument: Instrument) -> tuple[tuple[Turn, tuple[int, ...]], ...]:
-    """Return which orientations map beam and apertures onto themselves, and the detectors onto which ones.
+    """Find the orientations that map beam and apertures onto themselves.
 
-    Each is an orientation and, for each detector, the number of the one that it falls upon; the first changes nothing.
-    Pictures of a sample and of the turned sample are then one set of images in two orders: no fit can tell them apart.
+    Each entry is an orientation and, for each detector, the number of the detector onto which it is mapped; the first
+    entry is the identity. The images of a sample and of the turned sample are then equal but for their order, so no fit
+    can distinguish them.
     """
     shift, apertures = np.array(instrument.beam_shift), instrument.apertures()
     features = np.array([_features(a, np.eye(2), instrument.working_distance) for a in apertures])
@@ -159,7 +160,80 @@ def instrument_symmetries(instrument: Instrument) -> tuple[tuple[Turn, tuple[int
 
 
 def _features(aperture: Aperture, matrix: np.ndarray, distance: float) -> np.ndarray:
-    """Return the turned centre and the shape (matrix root of the ellipse) of an aperture, over the distance."""
+    """Compute centre and shape (matrix root of the ellipse) of a turned aperture, over the distance."""
     c, s = math.cos(aperture.rotation), math.sin(aperture.rotation)
     turn = matrix @ np.array([[c, -s], [s, c]])
     return np.concatenate([matrix @ aperture.center, (turn @ np.diag(aperture.semi_axes) @ turn.T).ravel()]) / distance
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An orientation and an order of the images.
+
+    Attributes:
+        turn: orientation of all images.
+        order: for each detector the number of its image, from 0.
+    """
+
+    turn: Turn
+    order: tuple[int, ...]
+
+    @property
+    def change(self) -> tuple[bool, int, int]:
+        """Amount of change, to choose between ties: mirror, number of images reassigned, turn."""
+        return self.turn.mirror, sum(i != k for i, k in enumerate(self.order)), self.turn.turn_deg
+
+    def followed_by(self, turn: Turn, onto: tuple[int, ...]) -> "Candidate":
+        """Turn the candidate again as a whole; the image of detector k goes to detector `onto[k]`."""
+        order = [0] * len(self.order)
+        for k, target in enumerate(onto):
+            order[target] = self.order[k]
+        return Candidate(turn.after(self.turn), tuple(order))
+
+    @property
+    def reversed(self) -> "Candidate":
+        """The candidate with all slopes reversed: turned by 180 deg, every image kept."""
+        return Candidate(Turn(180).after(self.turn), self.order)
+
+    def names(self, instrument: Instrument) -> tuple[str, ...]:
+        """List the detector of each image of the file."""
+        return tuple(instrument.detector_names[self.order.index(i)] for i in range(len(self.order)))
+
+    def as_dict(self, instrument: Instrument) -> dict[str, Any]:
+        """Make a JSON-compatible record, by the names of the settings that state it."""
+        names = list(self.names(instrument))
+        return {"turn_deg": self.turn.turn_deg, "mirror": self.turn.mirror, "detectors": names}
+
+
+def orders_tried(instrument: Instrument) -> tuple[list[tuple[int, ...]], bool]:
+    """List the orders of the images to try, and whether these are all."""
+    n = len(instrument.detector)
+    if n <= MAX_PERMUTED:
+        return list(itertools.permutations(range(n))), True
+    return _ring_orders(instrument), False
+
+
+def _ring_orders(instrument: Instrument) -> list[tuple[int, ...]]:
+    """List the orders that shift or reverse the detectors around the ring, by azimuth."""
+    azimuths = [math.atan2(a.center[1], a.center[0]) for a in instrument.apertures()]
+    ring = sorted(range(len(azimuths)), key=lambda k: azimuths[k])
+    n, out = len(ring), []
+    for step, start in itertools.product((1, -1), range(n)):
+        order = [0] * n
+        for place, k in enumerate(ring):
+            order[k] = ring[(start + step * place) % n]
+        out.append(tuple(order))
+    return out
+
+
+def group_ties(candidates: list[Candidate], instrument: Instrument) -> list[tuple[Candidate, ...]]:
+    """Group the candidates that the symmetries of the instrument map onto one another, order kept."""
+    symmetries = instrument_symmetries(instrument)
+    left, groups = dict.fromkeys(candidates), []
+    while left:
+        first = next(iter(left))
+        same = {first.followed_by(*s) for s in symmetries}
+        ties = tuple(c for c in left if c in same)
+        groups.append(ties)
+        left = dict.fromkeys(c for c in left if c not in same)
+    return groups

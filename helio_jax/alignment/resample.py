@@ -1,8 +1,8 @@
-"""Pictures read at other places, and several turned scans brought onto one raster: a stack ready for the heights.
+"""Interpolation of images, and resampling of several rotated scans onto one raster: a stack ready for the heights.
 
-Cubic interpolation. The variance stays honest where neighbours come to share noise: a pixel keeps the variance of the
-raw ones, scaled by the ratio of the pixels' areas, so that the information in a region is what was recorded there; and
-what the picture would change by within the alignment's own error is added.
+Cubic splines. Interpolated neighbours share noise, so a pixel keeps the variance of the raw pixels times the ratio of
+the pixels' areas: the information of a region is that of its readings. The change of the image within the error of the
+alignment is added to the variance.
 """
 
 import math
@@ -15,22 +15,22 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector, Instrument
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
 
 
 def smooth(image: np.ndarray, is_known: np.ndarray, sigma: float) -> np.ndarray:
-    """Return a picture smoothed by a Gaussian [pixels] over its known pixels; unknown ones are filled from these."""
+    """Smooth an image by a Gaussian [pixels] over its known pixels; unknown pixels are filled from these."""
     weight = ndimage.gaussian_filter(is_known.astype(float), max(sigma, 1e-9))
     total = ndimage.gaussian_filter(np.where(is_known, image, 0.0), max(sigma, 1e-9))
     level = float(np.mean(image[is_known])) if is_known.any() else 0.0
     return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), level)
 
 
-class Readable(NamedTuple):
-    """A picture made ready to be read anywhere (cubic splines).
+class SplineImage(NamedTuple):
+    """An image as cubic splines, to be interpolated anywhere.
 
     Attributes:
         coefficients: of the splines [y, x].
@@ -44,13 +44,13 @@ class Readable(NamedTuple):
     y: np.ndarray
 
     @classmethod
-    def of(cls, image: np.ndarray, known: np.ndarray, x: np.ndarray, y: np.ndarray) -> "Readable":
-        """Prepare a picture; unknown pixels are filled from those around them, and not read."""
+    def of(cls, image: np.ndarray, known: np.ndarray, x: np.ndarray, y: np.ndarray) -> "SplineImage":
+        """Compute the splines; unknown pixels are filled from their neighbours and stay unknown."""
         filled = image if known.all() else np.where(known, image, smooth(image, known, 1.0))
         return cls(np.asarray(ndimage.spline_filter(filled, order=3, mode="nearest")), known, x, y)
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return values at points [..., 2], um, and True where all pixels around a point are known."""
+        """Interpolate at points [..., 2], um; also True where all pixels around a point are known."""
         at = np.stack([(points[..., 1] - self.y[0]) / pitch(self.y), (points[..., 0] - self.x[0]) / pitch(self.x)])
         values = ndimage.map_coordinates(self.coefficients, at, order=3, mode="nearest", prefilter=False)
         margin = 1e-6
@@ -64,12 +64,12 @@ class Readable(NamedTuple):
 def common_raster(
     stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...], field: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the beam positions x, y of the common frame, of the first scan's pitch and phase.
+    """Compute the beam positions x, y of the common frame, with the first scan's pitch and phase.
 
     Args:
         stacks: the scans.
         motions: of each.
-        field: "reference": the first scan's own raster; "union": all that any scan recorded.
+        field: "reference": the first scan's own raster; "union": the union of all fields.
 
     Raises:
         GuardError: the union needs more than 4 million pixels.
@@ -95,8 +95,8 @@ def common_raster(
     return axes[0], axes[1]
 
 
-def turned_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> Instrument:
-    """Return the instrument whose apertures are those of all scans, each turned back by its sample's rotation."""
+def rotated_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> Instrument:
+    """Combine the apertures of all scans in one instrument, each rotated back by its sample's rotation."""
     detectors = []
     for stack, motion in zip(stacks, motions, strict=True):
         back = Rigid(-motion.rotation, (0.0, 0.0))
@@ -115,18 +115,20 @@ def turned_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     return stacks[0].instrument.model_copy(update={"detector": tuple(detectors)})
 
 
-def scan_times(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> list[list[float]]:
-    """Return, for every image, a, b, c of its scan's time a x + b y + c at points of the common frame, -1 to 1.
+def scan_times(
+    stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]
+) -> tuple[tuple[float, float, float], ...]:
+    """Compute `ScanAlignment.time_planes`: for every image the time of its scan at points of the common frame.
 
-    Time counts along the slow axis; which end is the earlier is not told, nor needed for a smooth drift.
+    Time runs along the slow axis. Files do not state its sense, which a smooth drift does not need.
     """
-    told = []
+    planes = []
     for stack, motion in zip(stacks, motions, strict=True):
         axis, slow = (1, stack.y) if stack.fast_axis == "x" else (0, stack.x)
         half, middle = max(0.5 * float(np.ptp(slow)), pitch(slow)), 0.5 * float(slow[0] + slow[-1])
         a, b = motion.matrix[axis] / half
-        told += [[float(a), float(b), (motion.shift[axis] - middle) / half]] * len(stack.instrument.detector)
-    return told
+        planes += [(float(a), float(b), (motion.shift[axis] - middle) / half)] * len(stack.instrument.detector)
+    return tuple(planes)
 
 
 def resample(
@@ -135,7 +137,7 @@ def resample(
     field: str = "union",
     position_std: tuple[float, ...] | None = None,
 ) -> MicrographStack:
-    """Bring all scans onto one raster of the common frame.
+    """Resample all scans onto one raster of the common frame.
 
     Args:
         scans: normal incidence.
@@ -158,39 +160,31 @@ def resample(
         blur = 0.5 * math.sqrt(max(1.0 / ratio - 1.0, 0.0))  # finer scans are averaged over a pixel, about
         for k, (image, known) in enumerate(zip(stack.counts, stack.is_observed, strict=True)):
             finer = smooth(image, known, blur) if blur > 0.1 else image
-            value, is_seen = Readable.of(finer, known, stack.x, stack.y).at(places)
+            value, is_seen = SplineImage.of(finer, known, stack.x, stack.y).at(places)
             counts.append(np.where(is_seen, value, np.nan))
             observed.append(is_seen)
             if has_variance:
-                raw = Readable.of(stack.variance[k], known, stack.x, stack.y).at(places)[0]  # type: ignore[index]
+                raw = SplineImage.of(stack.variance[k], known, stack.x, stack.y).at(places)[0]  # type: ignore[index]
                 down, along = np.gradient(value, y, x)
                 own = np.maximum(raw, float(np.min(stack.variance[k][known]))) * ratio  # type: ignore[index]
                 variance.append(np.where(is_seen, own + (down**2 + along**2) * std**2, np.nan))
             if has_background:
-                level = stack.background[k]  # type: ignore[index]
-                flat = np.full(points.shape[:2], level) if np.ndim(level) == 0 else level
-                background.append(
-                    flat if np.ndim(level) == 0 else Readable.of(level, known, stack.x, stack.y).at(places)[0]
-                )
-    same = {s.n_rays for s in scans.stacks}
+                level = np.broadcast_to(stack.background[k], image.shape)  # type: ignore[index]
+                background.append(SplineImage.of(level, known, stack.x, stack.y).at(places)[0])
     first = scans.stacks[0]
-    return MicrographStack(
+    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "calibration"))
+    return first.replace(
         counts=np.stack(counts),
         x=x,
         y=y,
-        instrument=turned_instrument(scans.stacks, motions),
+        instrument=rotated_instrument(scans.stacks, motions),
         variance=np.stack(variance) if has_variance else None,
         is_observed=np.stack(observed),
         background=np.stack(background) if has_background else None,
-        n_rays=first.n_rays if len(same) == 1 else None,
+        n_rays=first.n_rays if len({s.n_rays for s in scans.stacks}) == 1 else None,
         dwell=first.dwell if len({s.dwell for s in scans.stacks}) == 1 else None,
-        fast_axis=first.fast_axis,
-        sample_rotation=first.sample_rotation,
-        noise=first.noise,
-        unit=first.unit,
         name=f"{first.name} and {len(scans.stacks) - 1} more",
-        provenance={
-            "scans": [dict(s.provenance) for s in scans.stacks],
-            "scan_time": scan_times(scans.stacks, motions),
-        },
+        alignment=ScanAlignment(scan_times(scans.stacks, motions)),
+        provenance={"scans": [dict(s.provenance) for s in scans.stacks]},
+        **dropped,
     )

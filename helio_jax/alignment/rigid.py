@@ -1,8 +1,8 @@
-"""Rigid motions between scans of one sample that was turned between them: a rotation and a shift, no scale.
+"""Rigid motions between scans of a sample that was rotated between them: a rotation and a shift, no scale.
 
-Convention: a view's `Rigid` takes a point of the common frame (um) to the beam position of that view where the same
-point of the sample is seen, s = R(rotation) r + shift. A sample turned by +a therefore has the rotation +a, and in the
-common frame its apertures are turned by -a (DESIGN.md section 1). Normal incidence only: there a height moves no pixel.
+Convention: the `Rigid` of a view takes a point of the common frame [um] to the beam position of that view that shows
+the same point of the sample, s = R(rotation) r + shift. A sample rotated by +a has the rotation +a, and in the common
+frame its apertures are rotated by -a (docs/conventions.md). Normal incidence only, where heights move no pixel.
 """
 
 import math
@@ -24,29 +24,34 @@ class Rigid:
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.array([[c, -s], [s, c]])
 
+    @property
+    def rotation_deg(self) -> float:
+        """The rotation, -180 to 180 [deg]."""
+        return math.degrees(math.remainder(self.rotation, math.tau))
+
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return the images of points [..., 2]."""
+        """Move points [..., 2]."""
         return np.asarray(points) @ self.matrix.T + np.asarray(self.shift)
 
     def inverse(self) -> "Rigid":
-        """Return the motion that undoes this one."""
+        """Compute the inverse motion."""
         back = -np.asarray(self.shift) @ self.matrix  # -R^T t
         return Rigid(-self.rotation, (float(back[0]), float(back[1])))
 
     def after(self, first: "Rigid") -> "Rigid":
-        """Return the motion that does `first`, then this one."""
+        """Compose: `first`, then this motion."""
         x, y = self.apply(np.asarray(first.shift))
         return Rigid(self.rotation + first.rotation, (float(x), float(y)))
 
 
-def about(center: np.ndarray, rotation: float, move: np.ndarray) -> Rigid:
-    """Return the turn by `rotation` about `center`, then the shift by `move` (x, y) [um]."""
+def rotation_about(center: np.ndarray, rotation: float, move: np.ndarray) -> Rigid:
+    """Rotate by `rotation` [rad] about `center`, then shift by `move` (x, y) [um]."""
     shift = np.asarray(center) + np.asarray(move) - Rigid(rotation, (0.0, 0.0)).apply(np.asarray(center))
     return Rigid(rotation, (float(shift[0]), float(shift[1])))
 
 
 def fit_rigid(source: np.ndarray, target: np.ndarray) -> Rigid:
-    """Return the rigid motion that takes points to points with the least sum of squared distances; no reflection.
+    """Fit the rigid motion from points to points by least squares; no reflection.
 
     Args:
         source, target: two or more points [n, 2], um, not all in one place.
@@ -60,5 +65,5 @@ def fit_rigid(source: np.ndarray, target: np.ndarray) -> Rigid:
 
 
 def separation(a: Rigid, b: Rigid, points: np.ndarray) -> float:
-    """Return the root mean square distance of where two motions take points [n, 2], um."""
+    """Compute the rms distance between the images of points [n, 2] under two motions [um]."""
     return float(np.sqrt(np.mean(np.sum((a.apply(points) - b.apply(points)) ** 2, -1))))

@@ -1,4 +1,4 @@
-"""Pictures of turned scans as the automatic alignment sees them: read in the common frame at any motion.
+"""Pictures of rotated scans for the automatic alignment, resampled in the common frame at any motion.
 
 A view is one scan; its pictures (one per detector) are centred and scaled, so gains and offsets do not matter.
 """
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
-from helio_jax.alignment.resample import Readable, smooth
+from helio_jax.alignment.resample import SplineImage, smooth
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch, robust_std
 from helio_jax.micrograph import MicrographStack
@@ -35,7 +35,7 @@ class Frame:
 
     @classmethod
     def around_view(cls, view: "View", margin_um: float) -> "Frame":
-        """Return the raster of a scan widened by a margin; square pixels of the finer of its pitches."""
+        """Make the raster of a scan and a margin; square pixels of the finer of its pitches."""
         step = min(pitch(view.x), pitch(view.y))
         n = int(np.ceil(margin_um / step))
         axes = [np.arange(-n, round(np.ptp(a) / step) + n + 1) * step + a[0] for a in (view.x, view.y)]
@@ -62,7 +62,7 @@ class View:
     known: np.ndarray
     x: np.ndarray
     y: np.ndarray
-    _kept: dict[tuple[float, float], list[Readable]] = field(default_factory=dict)
+    _kept: dict[tuple[float, float], list[SplineImage]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, stack: MicrographStack) -> "View":
@@ -79,35 +79,35 @@ class View:
         """Middle of the field [2], um."""
         return np.array([self.x.mean(), self.y.mean()])
 
-    def readable(self, sigma_um: float, band: float) -> list[Readable]:
-        """Return the pictures smoothed by a Gaussian of `sigma_um` less one `band` times as wide.
+    def band_passed(self, sigma_um: float, band: float) -> list[SplineImage]:
+        """Smooth the pictures by a Gaussian of `sigma_um` less one `band` times as wide.
 
-        So slow shades, drift and the soft ends of cast shadows are no landmarks.
+        This removes slow shades, drift and the soft ends of masked areas.
         """
         if (sigma_um, band) not in self._kept:
             sigma = sigma_um / min(pitch(self.x), pitch(self.y))
             self._kept[sigma_um, band] = [
-                Readable.of(smooth(p, k, sigma) - smooth(p, k, band * sigma), k, self.x, self.y)
+                SplineImage.of(smooth(p, k, sigma) - smooth(p, k, band * sigma), k, self.x, self.y)
                 for p, k in zip(self.pictures, self.known, strict=True)
             ]
         return self._kept[sigma_um, band]
 
-    def edges(self) -> Readable:
-        """Return the strength of the edges of all detectors."""
+    def edges(self) -> SplineImage:
+        """Compute the strength of the edges of all detectors."""
         edges = sum(np.sqrt(ndimage.gaussian_gradient_magnitude(p, _EDGE_SIGMA)) for p in self.pictures)
         known = ndimage.binary_erosion(self.known.all(0), iterations=2 * round(_EDGE_SIGMA))
-        return Readable.of(np.asarray(edges), np.asarray(known), self.x, self.y)
+        return SplineImage.of(np.asarray(edges), np.asarray(known), self.x, self.y)
 
 
-def read(pictures: list[Readable], motion: Rigid, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return pictures of a view in the common frame [picture, y, x], and where they are known."""
+def resample_images(images: list[SplineImage], motion: Rigid, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Resample images of a view in the common frame [image, y, x]; also where they are known."""
     places = motion.apply(frame.points)
-    out = [picture.at(places) for picture in pictures]
+    out = [image.at(places) for image in images]
     return np.stack([v for v, _ in out]), np.stack([k for _, k in out])
 
 
 def _despiked(image: np.ndarray) -> np.ndarray:
-    """Replace pixels that stand out of the median of their neighbourhood by five robust deviations or more."""
-    middle = ndimage.median_filter(image, 3, mode="nearest")
-    away = np.abs(image - middle)
-    return np.where(away > _SPIKE * max(float(robust_std(away)), 1e-12), middle, image)
+    """Replace pixels that differ from the median of their neighbourhood by five robust standard deviations or more."""
+    median = ndimage.median_filter(image, 3, mode="nearest")
+    difference = np.abs(image - median)
+    return np.where(difference > _SPIKE * max(float(robust_std(difference)), 1e-12), median, image)

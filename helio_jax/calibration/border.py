@@ -1,11 +1,10 @@
-"""First calibration of a measured scan: spikes, noise, slow drift, background and gain, with how far to trust them.
+"""First calibration of a measured scan on its flat border: spikes, noise, slow drift, background and gain.
 
 Measured stack (counts with unknown background and gain) -> the same stack in units of the beam, ready for a fit.
-The drift is taken from the flat border; the gain from the border, whose expected signal is known; the background from
-the darkest pixels: there the sample hides the whole aperture, and what is left above the background is multiple
-scattering, of which a share of the flat's signal is assumed. All of that is a first estimate and fixes nothing: the
-stack carries prior deviations (provenance, `calibrate.priors`) with which gain, offset, drift and the scan lines stay
-unknowns of the fit. Needs a flat border and a spot that is masked in each image.
+Drift and gain are estimated on the border, whose expected signal is known; the background from the darkest pixels:
+there the sample masks the whole aperture, and the counts above the background are multiple scattering, an assumed
+fraction of the substrate's signal. These are first estimates: `Calibration.priors` leave gain, offset, drift and
+offsets of scan lines as unknowns to the fit. Needs a flat border and a masked spot in each image.
 """
 
 import numpy as np
@@ -14,46 +13,42 @@ from pydantic import Field
 from helio_jax.arrays import border_mask, robust_std
 from helio_jax.calibration.noise_model import estimate_noise, find_spikes, line_noise
 from helio_jax.errors import GuardError
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import Calibration, MicrographStack
 from helio_jax.settings import Settings
+
+_PRIORS = {"gain_std": 0.3, "offset_std": 0.3, "max_rounds": 6}
+_DRIFT_PRIORS = {"drift_std": 0.2}
+"""Priors of the fit: relative standard deviation of the gain, standard deviations of background and residual drift over
+the substrate's signal, and its iterations: with an unknown instrument heights converge more slowly."""
 
 
 class CalibrateSettings(Settings):
-    """How drift, background and gain are first estimated: `helio calibrate --set KEY=VALUE`."""
+    """First estimate of drift, background and gain: `helio calibrate --set KEY=VALUE`."""
 
     border_fraction: float = Field(default=0.08, gt=0.0, lt=0.5)
     """Width of the flat border, as a fraction of the image on each side."""
     drift_degree: int = Field(default=3, ge=0, le=9)
     """Degree of the polynomial in scan time (along the slow axis) that describes the drift."""
     dark_quantile: float = Field(default=0.002, ge=0.0, le=0.2)
-    """Quantile of each image that is taken as a wholly masked spot."""
+    """Quantile of each image that is taken for a wholly masked spot."""
     masked_share: float = Field(default=0.27, ge=0.0, lt=0.9)
-    """Multiple scattering in such a spot, as a share of the flat's signal (0.27 in the simulated sphere A)."""
+    """Multiple scattering in such a spot, as a fraction of the substrate's signal (0.27 in the simulated sphere A)."""
     drift: bool = True
-    """Whether drift is taken off and left as an unknown of the fit."""
+    """Whether drift is subtracted and left as an unknown of the fit."""
     noise_model: bool = True
-    """Whether the variance follows the counts (a + b counts, from the data); else it stays as imported."""
+    """Whether the variance is a + b counts, estimated from the data; else it stays as imported."""
     spike_limit: float = Field(default=6.0, ge=0.0, le=100.0)
-    """A pixel that exceeds all its neighbours by so many standard deviations is a spike, unobserved; 0: none is."""
+    """A pixel that exceeds all its neighbours by so many standard deviations counts as unobserved; 0: no such test."""
     lines: bool = True
     """Whether offsets of single scan lines are unknowns of the fit."""
-    gain_std: float = Field(default=0.3, gt=0.0, le=1.0)
-    """Prior deviation of the gain, relative, handed on to the fit."""
-    offset_std: float = Field(default=0.3, gt=0.0, le=1.0)
-    """Prior deviation of the background, relative to the flat's signal, handed on to the fit."""
-    drift_std: float = Field(default=0.2, gt=0.0, le=1.0)
-    """Prior deviation of what drift is left, relative to the flat's signal, handed on to the fit."""
-
-    fit_rounds: int = Field(default=6, ge=1, le=50)
-    """Rounds of the fit, handed on to it: with an unknown instrument heights settle more slowly."""
 
 
 def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
-    """Return the drift of an image whose rows are scanned one after another, mean zero [y, x].
+    """Estimate the drift of an image whose rows are scanned one after another, mean zero [y, x].
 
     A polynomial in the row (time) and a slope along the row, fitted robustly to the frame's pixels. (A parabola along
-    the row fits the frame of the measured sphere A with 9 to 18 % of the flat's signal, but hardly anything in the
-    whole image against its simulation: it would be read into the sample.)
+    the row would fit the frame of the measured sphere A with 9 to 18 % of the substrate's signal, but is absent from
+    the whole image compared with its simulation.)
     """
     time, along = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in image.shape), indexing="ij")
     basis = np.concatenate([np.polynomial.legendre.legvander(time, degree), along[..., None]], -1)
@@ -67,7 +62,7 @@ def _drift(image: np.ndarray, frame: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _steady(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettings) -> np.ndarray:
-    """Return the counts without drift [detector, y, x], NaN where not observed."""
+    """Subtract the drift from the counts [detector, y, x]; NaN where not observed."""
     counts = np.where(stack.is_observed, stack.counts, np.nan)
     if not settings.drift:
         return counts
@@ -77,7 +72,7 @@ def _steady(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettin
 
 
 def _without_faults(stack: MicrographStack, settings: CalibrateSettings) -> tuple[MicrographStack, dict]:
-    """Return the stack with the noise of its counts and without spikes, and what was found."""
+    """Estimate the variance of the counts and mark spikes as unobserved; also return a record of both."""
     model = estimate_noise(stack)
     record = {"noise_constant": model.constant.tolist(), "noise_per_count": model.per_count.tolist()}
     spread = model.variance(stack.counts)
@@ -94,11 +89,11 @@ def _without_faults(stack: MicrographStack, settings: CalibrateSettings) -> tupl
 def calibrate_on_border(
     stack: MicrographStack, flat_signal: np.ndarray, settings: CalibrateSettings
 ) -> MicrographStack:
-    """Return the stack in units of the beam, with first estimates of background and slow drift taken off.
+    """Scale a stack to units of the beam and subtract first estimates of background and slow drift.
 
     Args:
         stack: measured counts.
-        flat_signal: detection probability of the flat reference plane [detector].
+        flat_signal: detection probability of the substrate [detector].
         settings: border, drift, background, priors.
 
     Raises:
@@ -106,7 +101,7 @@ def calibrate_on_border(
     """
     frame = border_mask(stack.shape[1:], settings.border_fraction)
     stack, record = _without_faults(stack, settings)
-    assert stack.variance is not None  # estimated, if it was not known
+    assert stack.variance is not None  # `_without_faults` estimates it
     steady = _steady(stack, frame, settings)
     flat = np.nanmedian(steady[:, frame], axis=1)
     darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)
@@ -123,10 +118,9 @@ def calibrate_on_border(
     of_lines = line_noise(stack, steady, frame)
     lines = float(np.sqrt(np.mean((of_lines / (flat - background)) ** 2)))
     record["line_noise"] = of_lines.tolist()
-    priors = {"gain_std": settings.gain_std, "offset_std": settings.offset_std, "max_rounds": settings.fit_rounds}
-    priors |= {"drift_std": settings.drift_std} if settings.drift else {}
+    priors = _PRIORS | (_DRIFT_PRIORS if settings.drift else {})
     priors |= {"line_std": lines} if settings.lines and lines > 0 else {}
-    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": flat.tolist(), "priors": priors}
+    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": flat.tolist()}
     record |= {"snr": ((flat - background) / pixel_std).tolist(), "pixel_std": pixel_std.tolist()}
     record["settings"] = settings.model_dump(mode="json")
     return stack.replace(
@@ -135,5 +129,6 @@ def calibrate_on_border(
         background=None,
         n_rays=1.0,
         unit="detected per beam atom",
+        calibration=Calibration("border", priors),
         provenance={**stack.provenance, "calibrate": record},
     )

@@ -1,7 +1,7 @@
 """Turn expected counts into noisy ones, as an experiment would have recorded them. Settings table `[noise]`.
 
 Flow: simulated `MicrographStack` (noise "expected") -> the same stack with Poisson counts (noise "poisson"), or with
-all that a measured file would not tell taken away (noise "measured").
+only what a measured file contains (noise "measured").
 """
 
 from typing import Literal
@@ -48,22 +48,18 @@ class NoiseSettings(Settings):
     fast_axis: Literal["x", "y"] = "x"
     """Axis along which the scan moves fastest, from low to high."""
     as_measured: bool = False
-    """Take away what a measured file would not tell: orders, masks, background, number of atoms."""
+    """Remove what a measured file does not contain: orders, masks, background, number of atoms."""
     seed: int = Field(default=1, ge=0, lt=2**63)
     """Seed of the noise."""
 
     def problems(self, n_detectors: int) -> list[tuple[str, str]]:
-        """Return (key, what is wrong) for the per-detector lists and the times."""
+        """Check the per-detector lists and the times; return (key, message) pairs."""
         out = []
         for key, (is_wrong, limit) in _LIMITS.items():
             values = np.atleast_1d(getattr(self, key))
             if values.size not in (1, n_detectors):
-                out.append(
-                    (
-                        key,
-                        f"must be one number or one per detector ({n_detectors}), got {values.size}: correct the list",
-                    )
-                )
+                wanted = f"must be one number or one per detector ({n_detectors})"
+                out.append((key, f"{wanted}, got {values.size}: correct the list"))
             if values.size == 0 or np.any(is_wrong(values)):
                 out.append((key, f"must be {limit}, got {values.tolist()}: choose such values"))
         needs_time = [key for key in ("lag_s", "drift_per_pixel") if np.any(np.atleast_1d(getattr(self, key)))]
@@ -72,12 +68,12 @@ class NoiseSettings(Settings):
         return out
 
     def per_detector(self, key: str, n_detectors: int) -> np.ndarray:
-        """Return a setting for every detector [detector]."""
+        """Broadcast a setting to all detectors [detector]."""
         return np.broadcast_to(np.asarray(getattr(self, key), np.float64), (n_detectors,)).copy()
 
     @property
     def time(self) -> ScanTime:
-        """When pixels are counted; without a dwell time, which nothing then depends on, one second each."""
+        """Times of the pixels; the dwell time is 1 s where none is given, for then nothing depends on it."""
         return ScanTime(self.dwell_s or 1.0, self.move_s, self.flyback_s, self.fast_axis)
 
 
@@ -107,7 +103,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
     seed = settings.seed if seed is None else seed
 
     def recorded(images: np.ndarray) -> np.ndarray:
-        """Return images [..., detector, y, x] with lag and gain."""
+        """Apply lag and gain to images [..., detector, y, x]."""
         lagged = [lagging(images[..., k, :, :], lag[k], settings.time) for k in range(n_detectors)]
         return gain[:, None, None] * np.stack(lagged, -3) if lag.any() else gain[:, None, None] * images
 
@@ -127,10 +123,8 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
     if stack.variance is not None:
         variance += gain[:, None, None] ** 2 * stack.variance
     components = {key: getattr(stack, key) for key in ("by_order", "effuse", "plate")}
-    record = settings.model_dump(mode="json") | {
-        "seed": seed,
-        "law": "poisson(gain * lag(expected) + background + drift)",
-    }
+    law = "poisson(gain * lag(expected) + background + drift)"
+    record = settings.model_dump(mode="json") | {"seed": seed, "law": law}
     noisy = stack.replace(
         counts=counts,
         variance=variance,
@@ -145,9 +139,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
 
 
 def _as_measured(stack: MicrographStack) -> MicrographStack:
-    """Return noisy counts with only what an experiment knows; their variance is then taken from the counts."""
+    """Keep of noisy counts only what an experiment knows; the variance is then that of the counts."""
     unknown = ("background", "by_order", "effuse", "plate", "masked", "shadowed", "n_rays")
-    counts = stack.counts
-    return stack.replace(
-        noise="measured", variance=np.where(stack.is_observed, np.maximum(counts, 1.0), 0.0), **dict.fromkeys(unknown)
-    )
+    variance = np.where(stack.is_observed, np.maximum(stack.counts, 1.0), 0.0)
+    return stack.replace(noise="measured", variance=variance, **dict.fromkeys(unknown))

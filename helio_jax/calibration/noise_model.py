@@ -1,8 +1,8 @@
-"""What the detectors add to a measured image by themselves: noise, spikes, jumps from scan line to scan line.
+"""Noise model of a measured scan, estimated from its images: pixel noise, spikes, offsets of scan lines.
 
-All of it is estimated from the images alone, and nothing is repaired: spikes become unobserved pixels, noise becomes
-variance, the lines' jumps a prior deviation for the fit. Images are those of a stack [detector, y, x]; along the fast
-axis of the scan neighbouring pixels follow one another in time.
+Images are not corrected: spikes become unobserved pixels, noise becomes variance, the offsets of lines a prior standard
+deviation of the fit. Images are those of a stack [detector, y, x]; along the fast axis neighbouring pixels follow one
+another in time.
 """
 
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from helio_jax.arrays import nearest_known, robust_std
 from helio_jax.micrograph import MicrographStack
 
 _BINS = 8
-_FEWEST = 50
-"""Bins of the noise model, and pixels that a bin must hold."""
-_FEWEST_IN_LINE = 4
-"""Border pixels of a line, and lines, without which nothing is said of their offsets."""
+_MIN_PIXELS = 50
+"""Bins of the noise model, and least number of pixels in a bin."""
+_MIN_IN_LINE = 4
+"""Least number of border pixels in a line, and of such lines, to estimate their offsets."""
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 
 
@@ -29,19 +29,19 @@ class NoiseModel:
     per_count: np.ndarray
 
     def variance(self, counts: np.ndarray) -> np.ndarray:
-        """Return the variance of every pixel [detector, y, x] from a smoothed image, so that no count sets its own."""
+        """Compute the variance of every pixel [detector, y, x] from a smoothed image, not from single counts."""
         mean = np.stack([median_filter(_filled(image), 5, mode="nearest") for image in counts])
         return self.constant[:, None, None] + self.per_count[:, None, None] * np.maximum(mean, 0.0)
 
 
 def _filled(image: np.ndarray) -> np.ndarray:
-    """Return an image [y, x] whose missing pixels have the value of the nearest one that is there; 0 if none is."""
+    """Fill missing pixels of an image [y, x] by the nearest known one; 0 if there is none."""
     known = np.isfinite(image)
     return image[nearest_known(known)] if known.any() else np.zeros(image.shape)
 
 
 def time_last(stack: MicrographStack) -> np.ndarray:
-    """Return the counts with the fast axis last [detector, line, pixel]; NaN where none was recorded."""
+    """Order the counts with the fast axis last [detector, line, pixel]; NaN where not observed."""
     counts = np.where(stack.is_observed, stack.counts, np.nan)
     return counts if stack.fast_axis == "x" else counts.swapaxes(1, 2)
 
@@ -64,9 +64,9 @@ def _noise_line(image: np.ndarray) -> tuple[float, float]:
     level = (image[:, 2:] + image[:, 1:-1] + image[:, :-2]) / 3.0
     known = np.isfinite(second)
     second, level = second[known], level[known]
-    if second.size < _FEWEST:
+    if second.size < _MIN_PIXELS:
         return float(np.nanvar(image)), 0.0
-    groups = np.array_split(np.argsort(level), min(_BINS, second.size // _FEWEST))
+    groups = np.array_split(np.argsort(level), min(_BINS, second.size // _MIN_PIXELS))
     x = np.array([level[g].mean() for g in groups])
     y = np.array([robust_std(second[g]) ** 2 / 6.0 for g in groups])
     weight = 1.0 / np.maximum(y, 1e-9 * y.max() + 1e-300)
@@ -81,9 +81,9 @@ def _noise_line(image: np.ndarray) -> tuple[float, float]:
 
 
 def find_spikes(stack: MicrographStack, variance: np.ndarray, limit: float) -> np.ndarray:
-    """Return True at single pixels beyond all of their 8 neighbours by more than `limit` deviations [detector, y, x].
+    """Find single pixels that differ from all of their 8 neighbours by more than `limit` deviations [detector, y, x].
 
-    An edge of the image is no spike, nor is a scratch or a particle two pixels wide.
+    Edges, scratches and particles two pixels wide are no spikes.
 
     Args:
         stack: as read.
@@ -99,10 +99,10 @@ def find_spikes(stack: MicrographStack, variance: np.ndarray, limit: float) -> n
 
 
 def line_noise(stack: MicrographStack, steady: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of the offsets of single scan lines [detector], in counts.
+    """Estimate the standard deviation of the offsets of single scan lines [detector], in counts.
 
-    From the means of each line over the flat border, less what the pixels' noise adds to them. Their short memory (the
-    offsets of neighbouring lines resemble one another) counts, slow drift that was taken off does not.
+    From the means of each line over the flat border, less the contribution of the pixels' noise. Correlation between
+    neighbouring lines is included, slow drift, which is subtracted before, is not.
 
     Args:
         stack: with the variance of its pixels.
@@ -115,8 +115,8 @@ def line_noise(stack: MicrographStack, steady: np.ndarray, frame: np.ndarray) ->
     assert stack.variance is not None  # callers estimate it
     out = []
     for k, (image, known) in enumerate(zip(steady, use, strict=True)):
-        enough = n[k] >= _FEWEST_IN_LINE
-        if enough.sum() < _FEWEST_IN_LINE:
+        enough = n[k] >= _MIN_IN_LINE
+        if enough.sum() < _MIN_IN_LINE:
             out.append(0.0)
             continue
         mean = np.sum(np.where(known, image, 0.0), axis - 1)[enough] / n[k][enough]

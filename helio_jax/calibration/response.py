@@ -1,8 +1,8 @@
-"""How a detector follows the beam in scan time: lag of an exponential kind, and slow drift. Scan order, fly-back.
+"""Response of the detectors in scan time: exponential lag and slow drift.
 
 Time runs along the fast axis from the first column (or row), line after line, each in the same direction. A pixel takes
-`move` seconds to reach, uncounted, and `dwell` seconds of counting; each new line begins `flyback` seconds later. While
-it moves and flies back the detector sees the pixel that comes next.
+`move` seconds without counting and `dwell` seconds of counting; each new line begins `flyback` seconds later. During
+`move` and `flyback` the detector sees the next pixel.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class ScanTime:
     fast_axis: str
 
     def in_time(self, images: np.ndarray) -> np.ndarray:
-        """Return images [..., y, x] as lines in the order of time [..., line, pixel]; twice: as they were."""
+        """Order images [..., y, x] as lines in time [..., line, pixel], or back."""
         return images if self.fast_axis == "x" else np.swapaxes(images, -1, -2)
 
     @property
@@ -37,7 +37,7 @@ class ScanTime:
 
 
 def lagging(images: np.ndarray, constant: float, time: ScanTime) -> np.ndarray:
-    """Return what a detector of first order (r' = (signal - r) / constant) counts of a signal, on average.
+    """Compute the mean counts of a first-order detector (r' = (signal - r) / constant) for a signal.
 
     The detector has settled on the first pixel when the scan begins. Valid for any ratio of the times.
 
@@ -55,7 +55,7 @@ def lagging(images: np.ndarray, constant: float, time: ScanTime) -> np.ndarray:
 
     signal = time.in_time(images)
     keep, back, moved = (np.exp(-t / constant) for t in (time.step, time.flyback, time.move))
-    # share of what is left of the old signal when counting begins, averaged over the dwell time
+    # remaining fraction of the old signal, averaged over the dwell time
     averaged = -np.expm1(-time.dwell / constant) * constant / time.dwell * moved
     out = np.empty_like(signal)
     last = signal[..., 0, 0]
@@ -70,7 +70,7 @@ def lagging(images: np.ndarray, constant: float, time: ScanTime) -> np.ndarray:
 
 
 def slow_drift(shape: tuple[int, ...], constant: float, time: ScanTime, seed: list[int]) -> np.ndarray:
-    """Return a random drift of mean 0 and standard deviation 1 for images [..., y, x], each with its own.
+    """Draw a random drift of mean 0 and standard deviation 1 for each of the images [..., y, x].
 
     Normal, correlated in time as exp(-t / constant) (an Ornstein-Uhlenbeck process, Phys. Rev. 36 (1930) 823), which is
     sampled exactly at the middle of every pixel's dwell time.

@@ -28,8 +28,9 @@ def info(
         for place, field in entry["fields"].items():
             shape = " x ".join(map(str, field.get("shape", ()))) or "scalar"
             print(f"  {place:<24} {shape:<18} {field.get('unit', ''):<10} {field.get('long_name', '')}".rstrip())
-        for key in ("instrument", "provenance"):
-            print(f"  {key}:")
+        for key in ("instrument", "calibration", "alignment", "materials", "provenance"):
+            if entry.get(key):
+                print(f"  {key}:")
             for name, value in (entry.get(key) or {}).items():
                 print(f"    {name}: {textwrap.shorten(json.dumps(value), 300, placeholder=' ... (--json: all)')}")
 

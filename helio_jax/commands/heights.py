@@ -174,8 +174,8 @@ def _print_instrument(found: dict[str, Any]) -> None:
     if found.get("inflation", 1.0) > 1.0:
         print(
             "  the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars "
-            f"are inflated by {found['inflation']:.1f} (plus up to {found.get('common_mode_um', 0.0):.0f} um for the resulting "
-            "height error)"
+            f"are inflated by {found['inflation']:.1f} (plus up to {found.get('common_mode_um', 0.0):.0f} um for the "
+            "resulting height error)"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())

@@ -37,7 +37,7 @@ def import_files(
     ],
     output: H5File,
     instrument: Annotated[
-        Path | None, typer.Option(help="Instrument or scene file: what the file lacks."), Reads(names_files=True)
+        Path | None, typer.Option(help="Instrument or scene file, for files that lack it."), Reads(names_files=True)
     ] = None,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
@@ -83,7 +83,7 @@ def compare(
     rays: Rays = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a scene in the instrument that measured, and say how far simulation and experiment agree."""
+    """Simulate a scene in the instrument that measured, and compare it with the measurement."""
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows.compare import compare as compare_with_scene
 
@@ -111,20 +111,19 @@ def _read_set(path: Path) -> Any:
 @app.command()
 def align(
     scans: Annotated[
-        Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import)."), Reads()
+        Path, typer.Argument(help="Scans of one sample, rotated between them (.h5 of helio import)."), Reads()
     ],
     output: H5File,
     points: Annotated[Path | None, typer.Option(help="Control points (CSV: view,point,x_um,y_um)."), Reads()] = None,
-    auto: Annotated[bool, typer.Option("--auto", help="Without points: predict, correlate, repeat.")] = False,
+    auto: Annotated[bool, typer.Option("--auto", help="Without points: predict each scan from the others.")] = False,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE: field, max_shift_um, ... (repeat).")
     ] = None,
     figure: Annotated[Path | None, typer.Option(help="Overlays as a picture (.png, .pdf, .svg)."), FIGURE] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Align scans of a turned sample and bring them onto one raster, ready for reconstruct."""
+    """Align scans of a rotated sample and bring them onto one raster, ready for reconstruct."""
     from helio_jax import write
-    from helio_jax.alignment.align import describe
     from helio_jax.errors import SceneError
     from helio_jax.workflows import pipeline
 
@@ -139,17 +138,31 @@ def align(
     if as_json:
         print(json.dumps(stack.provenance["align"]))
         return
-    print("\n".join(describe(stack)))
+    _print_alignment(stack)
     print(f"written to {output}")
+
+
+def _print_alignment(stack: Any) -> None:
+    """Print the motions of an aligned stack, and how many pixels three or more of its images show."""
+    record = stack.provenance["align"]
+    for scan in record["scans"]:
+        x, y = scan["shift_um"]
+        error = f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown"
+        print(f"  {scan['name']}: rotated by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um, {error}")
+    if "points" in record:
+        residual, left_out = record["points"]["residual_rms_um"], record["points"]["left_out_rms_um"]
+        print(f"  points: residual {residual:.1f} um, leave-one-out {left_out:.1f} um (rms)")
+    n, ny, nx = stack.shape
+    print(f"{n} images on {nx} x {ny} pixels; {(stack.is_observed.sum(0) >= 3).mean():.0%} of them in 3 or more")
 
 
 @app.command()
 def pick(
     scans: Annotated[
-        Path, typer.Argument(help="Scans of one sample, turned between them (.h5 of helio import)."), Reads()
+        Path, typer.Argument(help="Scans of one sample, rotated between them (.h5 of helio import)."), Reads()
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Control points (CSV); goes on with what is there."), Writes()
+        Path, typer.Option("--output", "-o", help="Control points (CSV); those in the file are kept."), Writes()
     ],
 ) -> None:
     """Open a window to click the same points in all scans; every click is saved."""
@@ -167,9 +180,9 @@ def calibrate(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="File to write (.h5)."), replace(HDF5, beside=(".png",))
     ],
-    drift: Annotated[bool, typer.Option(help="Take slow drift off, and leave it to the fit.")] = True,
+    drift: Annotated[bool, typer.Option(help="Subtract slow drift, and leave its residual to the fit.")] = True,
     lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
-    noise_model: Annotated[bool, typer.Option(help="Let the variance follow the counts.")] = True,
+    noise_model: Annotated[bool, typer.Option(help="Estimate the variance as a + b counts.")] = True,
     spike_limit: Annotated[float | None, typer.Option(help="Standard deviations of a spike; 0: none.")] = None,
     masked_share: Annotated[float | None, typer.Option(help="Multiple scattering in the darkest spot / flat.")] = None,
     settings: Annotated[
@@ -177,15 +190,17 @@ def calibrate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate background, gain, drift and noise of a measured scan; the fit goes on from these estimates."""
+    """Estimate background, gain, drift and noise of a measured scan; the fit starts from these estimates."""
     from helio_jax.workflows.pipeline import calibrate_file
 
     own = {"drift": drift, "lines": lines, "noise_model": noise_model}
     given = set_options(settings, **own, spike_limit=spike_limit, masked_share=masked_share)
     found = calibrate_file(stack, output, **given)
-    record = found.provenance["calibrate"]
+    assert found.calibration is not None  # just made
+    record, priors = found.provenance["calibrate"], found.calibration.priors
     if as_json:
-        print(json.dumps(record | {"detectors": found.instrument.detector_names}))
+        about = {"priors": dict(priors), "detectors": found.instrument.detector_names}
+        print(json.dumps({**record, **about}))
         return
     heads = ("background", 11), ("flat", 9), ("noise", 8), ("SNR", 7), ("lines", 8), ("a + b counts", 17), ("spikes", 8)
     print(f"  {'detector':<12}" + "".join(f"{head:>{width}}" for head, width in heads))
@@ -201,7 +216,7 @@ def calibrate(
             f"  {name:<12}{background:>11.0f}{flat - background:>9.0f}{noise:>8.1f}{snr:>7.2f}{lines_:>8.1f}"
             f"{law:>17}{spikes:>8}"
         )
-    print(f"flat: signal above the background, whose prior deviation is {record['priors']['offset_std']:.0%} of it")
+    print(f"flat: signal above the background; prior standard deviation of the background: {priors['offset_std']:.0%}")
     print(f"{output}\n{output.with_suffix('.png')}")
 
 
@@ -221,15 +236,15 @@ def orient(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find by quick fits how a file's arrays lie and which image is which detector's, and put them right."""
+    """Find by quick fits the orientation of a file's arrays and the detector of each image, and correct them."""
     from helio_jax import write
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows.orient import OrientSettings, find_orientation
 
     names = None if detectors is None else tuple(name.strip() for name in detectors.split(","))
-    asked = OrientSettings().changed(**set_options(settings, turn_deg=turn, mirror=mirror, detectors=names))
+    how = OrientSettings().changed(**set_options(settings, turn_deg=turn, mirror=mirror, detectors=names))
     with Bar("fitting orientations") as bar:
-        found = find_orientation(read_stack(stack), asked, bar)
+        found = find_orientation(read_stack(stack), how, bar)
     print(json.dumps(found.as_dict()) if as_json else "\n".join(found.summary()))
     write(found.applied(), output)
     if not as_json:

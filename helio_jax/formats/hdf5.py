@@ -26,7 +26,8 @@ from helio_jax.reconstruction import Reconstruction
 if TYPE_CHECKING:
     from helio_jax.formats.nexus import Node, Noun
 
-FORMAT = "1.0"
+FORMAT = "1.1"
+"""1.1: what steers later steps has places of its own; in files of 1.0 it is in the provenance."""
 HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
 """Suffixes of HDF5 files."""
 MAX_BYTES = 4 * safe.GIB
@@ -115,7 +116,7 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
     from helio_jax.formats import nexus
 
     found = _load_in_child(path, nexus.READ_PLACES, max_bytes)
-    return nexus.rebuild(found["filetype"], found["entries"], str(path))
+    return nexus.rebuild(found["filetype"], found["entries"], str(path), found["helio_format"])
 
 
 def read_micrographs(path: str | os.PathLike) -> Micrographs:
@@ -160,7 +161,7 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
 
     Returns:
         file, bytes, kind, format, creator, created; and per entry ("" or "scan_1", ...): fields (shape, unit and
-        long name by path), instrument and provenance.
+        long name by path), instrument, calibration, alignment, materials and provenance.
 
     Raises:
         InputFileError: as `read`.

@@ -8,7 +8,7 @@ Converts between these objects and a flat list of nodes; `hdf5` writes and reads
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack, ScanAlignment
 from helio_jax.reconstruction import REASONS, Reconstruction
 
 Noun = MicrographStack | MicrographSet | Reconstruction
@@ -76,10 +76,13 @@ RECONSTRUCTION_FIELDS = (
     Field("residuals", "residuals", "", "(data - model) / standard deviation"),
     Field("gain", "gain", "", "data = gain * model + offset, per detector"),
     Field("offset", "offset", "", "data = gain * model + offset, per detector"),
+    Field("border", "border", "", "flat: heights count from the substrate at the border; free: their level is unknown"),
     Field("method", "method", "", "how the heights were found"),
     Field("status", "status", "", "how the method ended"),
 )
-COMMON_PLACES = ("instrument/settings", "provenance/data")
+RECORDS = {"calibration": Calibration, "alignment": ScanAlignment, "materials": dict}
+"""Attributes of a stack that are one JSON text each, at a place of their name."""
+COMMON_PLACES = ("instrument/settings", *RECORDS, "provenance/data")
 READ_PLACES = (*COMMON_PLACES, *(f.place for f in (*STACK_FIELDS, *RECONSTRUCTION_FIELDS)))
 """Paths below an entry that the reader needs; everything else in a file is ignored."""
 
@@ -130,6 +133,10 @@ def _stack_nodes(entry: str, nx_class: str, stack: MicrographStack) -> list[Node
         nodes.append(Node(f"{entry}/micrographs/counts_errors", stack.std_error, label))
     if stack.by_order is not None:
         nodes += [Node(f"{entry}/by_order/{a}", same_as=f"{entry}/micrographs/{a}") for a in axes]
+    for name, record in RECORDS.items():
+        if value := getattr(stack, name):
+            text = json.dumps(value if record is dict else asdict(value))
+            nodes.append(_text_node(f"{entry}/{name}", text, f"{name}: what later steps depend on (JSON)"))
     return nodes + _instrument_nodes(entry, stack.instrument) + _provenance_nodes(entry, stack.provenance)
 
 
@@ -194,40 +201,43 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
 
 
-def rebuild(kind: str, entries: dict[str, dict[str, Any]], path: str) -> Noun:
+def rebuild(kind: str, entries: dict[str, dict[str, Any]], path: str, version: str) -> Noun:
     """Construct the object from the values of a file.
 
     Args:
         kind: the file's `filetype`.
         entries: values by path below the entry, for the entry itself ("") and its scans ("scan_1", ...).
         path: the file, for messages.
+        version: the file's `helio_format`.
 
     Raises:
         InputFileError: the kind is unknown, data are missing, or the object's own checks fail.
     """
     top = entries.get("", {})
     if kind == "micrographs":
-        return _make(MicrographStack, STACK_FIELDS, top, f"{path}: /entry")
+        return _make(MicrographStack, STACK_FIELDS, top, f"{path}: /entry", version)
     if kind == "reconstruction":
-        return _make(Reconstruction, RECONSTRUCTION_FIELDS, top, f"{path}: /entry")
+        return _make(Reconstruction, RECONSTRUCTION_FIELDS, top, f"{path}: /entry", version)
     if kind == "micrograph_set":
         names = sorted((n for n in entries if n), key=lambda n: int(n.removeprefix("scan_")))
-        stacks = tuple(_make(MicrographStack, STACK_FIELDS, entries[n], f"{path}: /entry/{n}") for n in names)
+        stacks = tuple(_make(MicrographStack, STACK_FIELDS, entries[n], f"{path}: /entry/{n}", version) for n in names)
         if not stacks:
             raise InputFileError(f"{path}: /entry holds no scan_1, scan_2, ...: the file is incomplete")
-        return MicrographSet(stacks, _provenance(top, f"{path}: /entry"))
+        return MicrographSet(stacks, _json_object(top, "provenance/data", f"{path}: /entry"))
     raise InputFileError(f"{path}: filetype must be one of {', '.join(KINDS.values())}, got {kind!r}")
 
 
-def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: str) -> Any:
+def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: str, version: str) -> Any:
     """Construct one stack or reconstruction from its values."""
     given = {f.name: values[f.place] for f in fields if f.place in values}
     try:
         for name, value in given.items():
             # stored as arrays without axes
             given[name] = float(value) if isinstance(value, np.ndarray) and value.ndim == 0 else value
+        provenance = _json_object(values, "provenance/data", place)
+        given |= _records_in_provenance(noun, provenance) if version == "1.0" else _records(values, place)
         _check_record(noun, given)
-        return noun(**given, instrument=_instrument(values, place), provenance=_provenance(values, place))
+        return noun(**given, instrument=_instrument(values, place), provenance=provenance)
     except InputFileError as e:
         raise InputFileError(str(e) if str(e).startswith(place) else f"{place}: {e}") from None
     except (TypeError, ValueError) as e:
@@ -236,8 +246,8 @@ def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: 
 
 def _check_record(noun: type, given: dict[str, Any]) -> None:
     """Check the texts and numbers that the object does not check itself."""
-    choices = {"fast_axis": ("x", "y"), "noise": ("expected", "poisson", "measured")}
-    for name in ("fast_axis", "noise", "unit", "name", "method", "status"):
+    choices = {"fast_axis": ("x", "y"), "noise": ("expected", "poisson", "measured"), "border": ("flat", "free")}
+    for name in ("fast_axis", "noise", "unit", "name", "border", "method", "status"):
         if name in given and not isinstance(given[name], str):
             raise InputFileError(f"{name} must be a text, got numbers")
         if name in given and name in choices and given[name] not in choices[name]:
@@ -265,12 +275,39 @@ def _instrument(values: dict[str, Any], place: str) -> Instrument:
         raise InputFileError(f"{place}/instrument/settings is not a valid instrument: {e}") from None
 
 
-def _provenance(values: dict[str, Any], place: str) -> dict[str, Any]:
-    """Parse the provenance."""
+def _records(values: dict[str, Any], place: str) -> dict[str, Any]:
+    """Read the records of a stack back from their JSON texts."""
+    return {name: record(**_json_object(values, name, place)) for name, record in RECORDS.items() if name in values}
+
+
+def _records_in_provenance(noun: type, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Find the records and settings that a file of format 1.0 keeps in its provenance."""
+
+    def table(key: str) -> Mapping[str, Any]:
+        found = provenance.get(key, {})
+        if not isinstance(found, Mapping):
+            raise InputFileError(f"provenance/data: {key} must be a JSON object, got {type(found).__name__}")
+        return found
+
+    if noun is Reconstruction:
+        return {"border": table("reconstruct").get("border", "flat")}
+    found: dict[str, Any] = {"materials": table("materials")}
+    if record := table("calibrate"):
+        found["calibration"] = Calibration("border", record.get("priors", {}))
+    elif record := table("self_calibrate"):
+        is_subtracted = record.get("without_multiple", False)
+        found["calibration"] = Calibration("constant_albedo", record.get("priors", {}), is_subtracted)
+    if "align" in provenance or "scan_time" in provenance:
+        found["alignment"] = ScanAlignment(provenance.get("scan_time"))
+    return found
+
+
+def _json_object(values: dict[str, Any], name: str, place: str) -> dict[str, Any]:
+    """Read a JSON object; an empty one where it is missing."""
     try:
-        found = json.loads(values.get("provenance/data", "{}"))
+        found = json.loads(values.get(name, "{}"))
     except (TypeError, ValueError) as e:
-        raise InputFileError(f"{place}/provenance/data is not JSON: {e}") from None
+        raise InputFileError(f"{place}/{name} is not JSON: {e}") from None
     if not isinstance(found, dict):
-        raise InputFileError(f"{place}/provenance/data must be a JSON object, got {type(found).__name__}")
+        raise InputFileError(f"{place}/{name} must be a JSON object, got {type(found).__name__}")
     return found

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from helio_jax.block_fit import eliminate, limit_steps
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from helio_jax.micrograph import MicrographStack
+from helio_jax.robust import cauchy_weight
 
 MIN_IMAGES = 3
 """Images needed per pixel: three unknowns (albedo times normal)."""
@@ -101,7 +103,7 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
         residuals = np.where(observed, (data - model) / sigma, 0.0)
         is_away = observed & (model < _GRAZING * np.linalg.norm(phi, axis=1) * np.linalg.norm(rho_n, axis=-1))
         is_away &= (residuals > 0.0) & ((observed & ~is_away).sum(0) >= MIN_IMAGES)
-        weight = base / (1.0 + (np.minimum(residuals, 0.0) / _DARK_LIMIT) ** 2) * np.where(is_away, _LITTLE, 1.0)
+        weight = base * cauchy_weight(np.minimum(residuals, 0.0), _DARK_LIMIT) * np.where(is_away, _LITTLE, 1.0)
     rho = np.linalg.norm(rho_n, axis=-1)
     ok = is_solvable & (rho > 0)
     normals = np.where(ok[..., None], rho_n / np.where(ok, rho, 1.0)[..., None], np.array([0.0, 0.0, 1.0]))
@@ -132,10 +134,10 @@ def solve_known_albedo(
     Source: own derivation; the same equations as Woodham (1980) with rho given.
     """
     observed = np.isfinite(signal)
-    data, weight = np.where(observed, signal, 0.0), np.where(observed, 1.0 / np.sqrt(variance), 0.0)
+    data = np.where(observed, signal, 0.0)
+    weight = np.where(observed, 1.0 / variance, 0.0).reshape(len(data), -1)
     a, b, _ = slopes_of_normal(start, shift)
     slopes = np.clip(np.stack([a, b], -1), -_SLOPE_STD, _SLOPE_STD)
-    prior = np.eye(2) / _SLOPE_STD**2
     tangents = np.array([[-1.0, 0.0, -shift[0]], [0.0, -1.0, -shift[1]]])
     for _ in range(_NEWTON_STEPS):
         normal = np.stack(normal_of_slopes(slopes[..., 0], slopes[..., 1], shift))
@@ -144,13 +146,10 @@ def solve_known_albedo(
         model = single_scattering(phi, unit)
         along = np.einsum("kiyx,si->skyx", phi, tangents)
         turn = np.einsum("iyx,si->syx", unit, tangents)
-        jacobian = (along - model * turn[:, None]) / length * weight
-        misfit = (data - model) * weight
-        information = np.einsum("skyx,tkyx->yxst", jacobian, jacobian) + prior
-        right = np.einsum("skyx,kyx->yxs", jacobian, misfit) - slopes / _SLOPE_STD**2
-        step = np.linalg.solve(information, right[..., None])[..., 0]
-        limit = 0.5 * np.sqrt(1.0 + (slopes**2).sum(-1, keepdims=True))
-        slopes = slopes + step * np.minimum(
-            1.0, limit / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-12)
-        )
-    return np.moveaxis(slopes, -1, 0), np.linalg.inv(information)
+        by_slope = np.moveaxis((along - model * turn[:, None]) / length, 0, -1)
+        prior = np.eye(2) / _SLOPE_STD**2, -slopes.reshape(-1, 2) / _SLOPE_STD**2
+        n = len(data)
+        found = eliminate((data - model).reshape(n, -1), weight, by_slope.reshape(n, -1, 2), own_prior=prior)
+        steps = found.pixel_steps().reshape(slopes.shape)
+        slopes = slopes + limit_steps(steps, 0.5 * np.sqrt(1.0 + (slopes**2).sum(-1)))
+    return np.moveaxis(slopes, -1, 0), found.covariance.reshape(*slopes.shape, 2)

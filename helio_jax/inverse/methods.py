@@ -265,6 +265,7 @@ def _refined(stack, settings, make_predict, report) -> Reconstruction:
         residuals=fit.residuals,
         gain=fit.gain,
         offset=fit.offset,
+        border=settings.border,
         status=f"{fit.status}; {GEOMETRY_WARNING}" if is_moved else fit.status,
         provenance={
             "stack": dict(stack.provenance),

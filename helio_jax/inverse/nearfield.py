@@ -101,7 +101,7 @@ def photometric_heights(
         settings: method and options.
         predict: masks and multiple scattering of a surface (heights, normals); None: no corrections, no error bars.
     """
-    is_corrected = bool(stack.provenance.get("self_calibrate", {}).get("without_multiple"))
+    is_corrected = stack.calibration is not None and stack.calibration.without_multiple
     iterations = 1 if settings.method == "linear" else settings.rounds
     n_corrections = 0 if is_corrected or settings.method == "linear" else settings.corrections
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
@@ -151,6 +151,7 @@ def photometric_heights(
         is_valid=reason == 0,
         reason=reason,
         residuals=solution.residuals,
+        border=settings.border,
         status=f"solved in {iterations} iteration(s); {few}{note}",
         provenance={"stack": dict(stack.provenance), "reconstruct": settings.model_dump(mode="json")},
     )

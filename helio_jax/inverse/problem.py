@@ -127,7 +127,8 @@ class FitProblem:
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
             signal, variance, optics, stated, raster, s, order, _border_weight(shape, settings), is_held,
-            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median, noise, given,
+            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median,
+            noise, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 

@@ -74,8 +74,8 @@ def floating(
 ) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
-    So are heights whose common-mode errors, by an instrument far from the stated one or by a fit that has not converged,
-    are a large share of all relief, relative to most others.
+    So are heights whose common-mode errors, by an instrument far from the stated one or by a fit that has not
+    converged, are a large share of all relief, relative to most others.
 
     Args:
         height: [y, x], um.

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from helio_jax.arrays import as_json, pitch, line_angle_deg
+from helio_jax.arrays import as_json, line_angle_deg, pitch
 from helio_jax.errors import SceneError
 from helio_jax.measure.crack_profiles import measure_line
 from helio_jax.measure.line_paths import Path, trace_lines

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import as_json, pitch, line_angle_deg
+from helio_jax.arrays import as_json, line_angle_deg, pitch
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.settings import Settings
 

@@ -249,7 +249,6 @@ class ScanResult:
         if settings.target_error is not None:
             is_above = np.sqrt(variance) > settings.target_error * total
             about["n_above_target"] = int(np.sum(np.any(is_above, axis=0)))
-        about["materials"] = {name: law.kind for name, law in scene.used_materials.items()}
         if view.description:
             about["view"] = view.description
         images: dict[str, Any] = {}
@@ -279,6 +278,7 @@ class ScanResult:
             n_rays=scale if is_expected else float(settings.rays),
             noise="expected" if is_expected else "poisson",
             name=f"{scene.name}, {view.label}" if len(self.job.views) > 1 else scene.name,
+            materials={name: law.kind for name, law in scene.used_materials.items()},
             provenance=about,
         )
 

@@ -1,9 +1,9 @@
-"""Simulation versus experiment: a scene simulated in the instrument that measured, and what lies between the two.
+"""Simulation versus experiment: a scene simulated in the instrument that measured, compared with the measurement.
 
-Measured stack and scene file -> the scene's micrographs on the stack's raster, the sample moved to where the data show
-it, brought onto the data by gain, offset and slow drift (scores/agreement), residuals in standard errors, contrast by
-cause, a verdict. `explain` adds one effect at a time and tells what it does to chi-square, to the evidence and to the
-height that the near-field method recovers once the effect is taken away.
+Measured stack and scene file -> the scene's micrographs on the stack's raster, the sample moved to its place in the
+data, fitted to the data by gain, offset and slow drift (scores/agreement), residuals in standard errors, contrast by
+cause, a verdict. `explain` adds one effect at a time and states its change of chi-square, of the evidence, and of the
+height that the near-field method finds with the effect subtracted.
 """
 
 import json
@@ -31,28 +31,28 @@ from helio_jax.workflows.scene_file import SceneFile, load_scene
 from helio_jax.workflows.truth import true_surface
 
 TOP = 0.99
-"""Quantile of the scene's heights from which on pixels are its top."""
-MAX_PASSES, NEAR = 5, 0.05
-"""The sample is moved and simulated anew so often, or until it moves by less than this [pixels]."""
+"""Quantile of the scene's heights above which pixels are its top."""
+MAX_ITERATIONS, CONVERGED = 5, 0.05
+"""The sample is moved and simulated again until it moves by less than this [pixels]."""
 WRITTEN = ("comparison.json", "comparison.png", "effects.png")
 """Files that a comparison writes in its folder; the last one where effects were explained."""
 MAX_LAG = 5.0
-"""Longest response time of a detector that `explain` looks for [pixels]."""
+"""Longest response time of a detector that `explain` tries [pixels]."""
 Progress = Callable[[str], Any]
-"""Called with what is done next."""
+"""Called with the name of the next step."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one effect does.
+    """Result of one effect.
 
     Attributes:
         name: of the effect.
         chi2: per pixel, over all pixels.
         d_chi2: change of the total chi-square against the usual model.
         d_bic: change of the Bayesian information criterion; below -10: strong evidence for the effect.
-        height: recovered by `nearfield` once the effect is taken away from the data [um].
-        note: why there are no numbers.
+        height: found by `nearfield` with the effect subtracted from the data [um].
+        note: reason why there are no numbers.
     """
 
     name: str
@@ -68,12 +68,12 @@ class Comparison:
     """A simulation against a measurement.
 
     Attributes:
-        stack: what was measured.
+        stack: the measurement.
         images: the simulation, sample moved.
-        agreement: how far they agree.
-        contrast: by cause, as a share of the flat's signal [detector].
-        height: that `nearfield` recovers from the data, normalised by the simulation [um].
-        effects: one row each, if asked for.
+        agreement: of both.
+        contrast: by cause, as a fraction of the substrate's signal [detector].
+        height: found by `nearfield` from the data, normalised by the simulation [um].
+        effects: one row each, with `explain`.
     """
 
     stack: MicrographStack
@@ -84,14 +84,14 @@ class Comparison:
     effects: tuple[Row, ...] = field(default=())
 
     def as_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible summary."""
+        """Make a JSON-compatible summary."""
         known = [{k: v for k, v in vars(row).items() if v == v and v != ""} for row in self.effects]
         contrast = {name: [float(v) for v in values] for name, values in self.contrast.items()}
         summary = self.agreement.as_dict() | {"contrast": contrast, "nearfield_height_um": self.height}
         return summary | ({"effects": known} if known else {})
 
     def as_table(self) -> list[tuple[str, str, str]]:
-        """Return label, value and unit of what a reader asks for first."""
+        """List label, value and unit of the main results."""
         a, out = self.agreement, []
         out += [("sample found at x, y", f"{a.shift[0]:.1f}, {a.shift[1]:.1f}", "um from where the scene has it")]
         out += [("height by nearfield, data normalised so", f"{self.height:.1f}", "um")]
@@ -107,7 +107,7 @@ class Comparison:
         return out
 
     def write(self, folder: Path) -> list[Path]:
-        """Write comparison.json and comparison.png, and effects.png if there are any; return their paths."""
+        """Write comparison.json, comparison.png and, with effects, effects.png; return their paths."""
         make_folder(folder)
         out = [folder / name for name in (WRITTEN if self.effects else WRITTEN[:2])]
         with atomic_path(out[0]) as part:
@@ -119,7 +119,7 @@ class Comparison:
 
 
 def raster_of(stack: MicrographStack, scene: SceneFile, shift: tuple[float, float]) -> dict[str, Any]:
-    """Return the settings that make the scene's raster the stack's, the sample moved by `shift` [um]."""
+    """Compute the settings that give the scene the raster of the stack, the sample moved by `shift` [um]."""
     steps = pitch(stack.x), pitch(stack.y)
     stretch = 1.0 / math.cos(math.radians(scene.beam.incidence_deg))
     along = 0 if scene.beam.azimuth_deg % 180.0 == 0.0 else 1
@@ -149,7 +149,7 @@ def _images(path: Path, changes: Mapping[str, Any]) -> Images:
 
 
 def _height(stack: MicrographStack, fit: Agreement, images: Images, lacking: np.ndarray, scene: SceneFile) -> float:
-    """Return how high `nearfield` finds the scene's top in the data, normalised, without what an effect adds [um].
+    """Compute the height of the scene's top by `nearfield` from the normalised data, an effect subtracted [um].
 
     The median over the highest (or deepest) hundredth of the scene's pixels, above the median of all.
     """
@@ -173,14 +173,14 @@ def compare(
     explain: bool = False,
     progress: Progress = lambda text: None,
 ) -> Comparison:
-    """Simulate a scene in the instrument that measured, and say how far both agree.
+    """Simulate a scene in the instrument that measured, and compare it with the measurement.
 
     Args:
         stack: measured micrographs, one scan, with their variance.
         scene_path: the sample (a shape, a CAD mesh, a reconstruction) in its instrument; the raster is the stack's.
-        overrides: settings that win over the scene, dotted keys.
-        explain: add one effect at a time, and tabulate what it does.
-        progress: called with what is done next.
+        overrides: settings that replace those of the scene, dotted keys.
+        explain: add one effect at a time and tabulate its changes.
+        progress: called with the name of the next step.
 
     Raises:
         SceneError: another number of detectors, several views, or a raster that a scene cannot have.
@@ -208,11 +208,11 @@ def compare(
         )
     progress("simulating the scene, looking for the sample")
     shift, reach = (0.0, 0.0), REACH
-    for last in (False,) * (MAX_PASSES - 1) + (True,):  # moved by interpolation first, then simulated there
+    for last in (False,) * (MAX_ITERATIONS - 1) + (True,):  # moved by interpolation first, then simulated there
         here = given | raster_of(data, scene, shift)
         images = _images(path, here)
         found = find_shift(data, images.total, reach=reach)
-        if last or np.hypot(*found) < NEAR * pitch(data.x):
+        if last or np.hypot(*found) < CONVERGED * pitch(data.x):
             break
         shift, reach = (shift[0] + found[0], shift[1] + found[1]), 0.0
     agreement = normalise(data, images.total, own_variance=images.variance, shift=shift)
@@ -223,7 +223,7 @@ def compare(
 
 
 def _explained(usual: Comparison, path: Path, here: Mapping[str, Any], progress: Progress) -> tuple[Row, ...]:
-    """Return a row for every effect, one at a time."""
+    """Compute the rows of the effects."""
     scene, data = load_scene(path, dict(here)), usual.stack
     rows = [_row("the usual model: offset, drift, slope", usual, usual.agreement, usual.height)]
     for effect in EFFECTS:
@@ -242,10 +242,10 @@ def _explained(usual: Comparison, path: Path, here: Mapping[str, Any], progress:
         except HelioError as e:
             rows.append(Row(effect.name, note=str(e)))
             continue
-        said = f"{effect.name}: {terms.lag:.2f} pixels" if terms.lag else effect.name
+        label = f"{effect.name}: {terms.lag:.2f} pixels" if terms.lag else effect.name
         if fit.gain_drift.size:
-            said += f": {' '.join(f'{drift:+.0%}' for drift in fit.gain_drift[:, 0])} to the end"
-        rows.append(_row(said, usual, fit, height))
+            label += f": {' '.join(f'{drift:+.0%}' for drift in fit.gain_drift[:, 0])} to the end"
+        rows.append(_row(label, usual, fit, height))
     return tuple(rows)
 
 
@@ -255,7 +255,7 @@ def _row(name: str, usual: Comparison, fit: Agreement, height: float) -> Row:
 
 
 def _best_lag(data: MicrographStack, probability: np.ndarray) -> float:
-    """Return the response time that explains the data best [pixels]."""
+    """Find the response time that explains the data best [pixels]."""
 
     def misfit(lag: float) -> float:
         return float(np.nansum(normalise(data, probability, Terms(lag=lag)).residuals ** 2))

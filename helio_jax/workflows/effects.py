@@ -1,6 +1,6 @@
-"""What a simulation may lack: effects to be added one at a time when it is compared with a measurement.
+"""Effects that a simulation may lack, added one at a time when it is compared with a measurement.
 
-Each is a change of the scene's settings, of the instrument's response or of what is added up; sizes are typical ones.
+Each changes the scene's settings, the response of the instrument or the sum of the images, by a typical size.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from helio_jax.workflows.scene_file import SceneFile
 class Images:
     """A simulated experiment, as detection probabilities per beam atom, with the variance of their sum.
 
-    All images [detector, y, x] but the sample's true height [y, x], um. `unmasked`: if nothing hid the apertures.
+    All images [detector, y, x] but the sample's true height [y, x], um. `unmasked`: single scattering, nothing masked.
     """
 
     instrument: Instrument
@@ -31,21 +31,20 @@ class Images:
 
     @property
     def total(self) -> np.ndarray:
-        """All that is detected."""
+        """Single and multiple scattering."""
         return self.single + self.multiple
 
 
 @dataclass(frozen=True)
 class Effect:
-    """Something that a simulation may lack.
+    """One effect that a simulation may lack.
 
     Attributes:
-        name: what it is.
-        changes: of the scene's settings, from the scene and a typical length of it; None: it does not apply.
+        name: for the table.
+        changes: settings of the scene, computed from the scene; None: the effect does not apply.
         terms: of the normalisation, instead of the usual ones.
-        total: which of the images' parts are added up.
-        is_geometry: whether heights are to be computed with the changed instrument, instead of taking away what the
-            effect does to the images.
+        total: sum of the images.
+        is_geometry: heights are computed with the changed instrument; otherwise the change of the images is subtracted.
     """
 
     name: str
@@ -59,9 +58,11 @@ def _distance(factor: float) -> Callable[[SceneFile], Mapping[str, Any]]:
     return lambda scene: {"plate.sample_distance_um": factor * scene.sample_distance}
 
 
-def _larger_instrument(scene: SceneFile) -> Mapping[str, Any]:
-    """All distances between plate and sample 4/3 as long, and the apertures as much larger: 4 mm instead of 3."""
-    f = 4.0 / 3.0
+def _plate_for_sample_distance(scene: SceneFile) -> Mapping[str, Any] | None:
+    """Scale plate and apertures as if the plate had been made for the distance at which the sample stands."""
+    f = scene.sample_distance / scene.working_distance
+    if f == 1.0:
+        return None
     out: dict[str, Any] = {
         "plate.working_distance_um": f * scene.working_distance,
         "plate.sample_distance_um": scene.sample_distance + (f - 1.0) * scene.working_distance,
@@ -120,7 +121,7 @@ EFFECTS = (
     Effect(LAG),
     Effect("sample 10 % nearer to the plate", _distance(0.9), is_geometry=True),
     Effect("sample 10 % farther from the plate", _distance(1.1), is_geometry=True),
-    Effect("instrument at 4/3 of its distance", _larger_instrument, is_geometry=True),
+    Effect("plate and apertures scaled to the sample's distance", _plate_for_sample_distance, is_geometry=True),
     Effect("sample tilted by 1 deg about x", _tilt(0)),
     Effect("sample tilted by 1 deg about y", _tilt(1)),
     Effect("moat around the spheres, a tenth of a radius", _moat),
@@ -130,4 +131,4 @@ EFFECTS = (
     Effect("no multiple scattering", total=lambda images: images.single),
     Effect("no masks", total=lambda images: images.unmasked + images.multiple),
 )
-"""What `explain` tries: the first three build up the usual normalisation, the others start from that."""
+"""Effects of `explain`: the first three build up the usual normalisation, the others start from it."""

@@ -236,7 +236,7 @@ def reconstructed_area(rec: Reconstruction, max_std_um: float = 20.0) -> dict[st
     """
     good = rec.is_valid & np.isfinite(rec.height)
     std = rec.height_std
-    if rec.height_samples is not None and good.any() and rec.provenance.get("reconstruct", {}).get("border") == "free":
+    if rec.height_samples is not None and good.any() and rec.border == "free":
         level = np.median(rec.height_samples[:, good], axis=1)
         std = np.sqrt(np.mean((rec.height_samples - level[:, None, None]) ** 2, axis=0))
     known = good if std is None else good & (std <= max_std_um)

@@ -21,6 +21,8 @@ from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
+from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
@@ -28,7 +30,7 @@ from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, evaluate_height
 from helio_jax.trace.scan import Executor, trace_scene
-from helio_jax.workflows.calibrate_rotated import calibrate_turned, flat_signal
+from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import with_provenance
@@ -186,11 +188,11 @@ def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
 
 
 def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
-    """Bring a measured stack into units of the beam by its flat border (`prepare.calibrate`).
+    """Bring a measured stack into units of the beam by its flat border.
 
     Args:
         stack: measured counts.
-        settings: how; default: its defaults.
+        settings: default: the defaults of `CalibrateSettings`.
         changes: settings that replace those, e.g. drift=False.
 
     Raises:
@@ -203,12 +205,12 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
             "calibrated already; calibrate the imported file itself"
         )
     return calibrate_on_border(
-        stack, flat_signal(stack.instrument), (settings or CalibrateSettings()).changed(**changes)
+        stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)
     )
 
 
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
-    """Calibrate the stack of a file into another one, with a picture of before and after beside it (.png)."""
+    """Calibrate the stack of a file into another one, and save a picture of before and after beside it (.png)."""
     picture = Path(output).with_suffix(".png")
     check_outputs([("path", Path(path))], [("output", Path(output)), ("output: the .png beside it", picture)])
     before = read_stack(path)
@@ -219,30 +221,29 @@ def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> Micr
 
 
 _LIMITS = "robust_limits", "jump_limits"
-"""One schedule in two settings of the same length: who gives one of them gives both."""
+"""Two settings of one schedule, of the same length: a user who sets one of them sets both."""
 
 
 def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
-    """Return changes of the settings, those added that the stack's calibration asks for and nobody has given."""
+    """Add the priors of the stack's calibration to changes of the settings, except where the user has set them."""
     given = dict(changes.get("refine", {}))
-    calibration = stack.provenance.get("calibrate") or stack.provenance.get("self_calibrate", {})
-    priors = calibration.get("priors", {})
+    priors = {} if stack.calibration is None else stack.calibration.priors
     taken = settings.refine.model_fields_set | given.keys()
     if taken & set(_LIMITS):
         taken |= set(_LIMITS)
-    asked = {key: value for key, value in priors.items() if key not in taken}
-    if not asked and not given:
+    added = {key: value for key, value in priors.items() if key not in taken}
+    if not added and not given:
         return changes
-    return changes | {"refine": settings.refine.model_dump() | asked | given}
+    return changes | {"refine": settings.refine.model_dump() | added | given}
 
 
 def align(
     scans: MicrographSet, points: str | Path | None = None, **changes: Any
 ) -> tuple[MicrographStack, dict[str, tuple[float, float]]]:
-    """Align turned scans, by control points (a CSV file) or automatically; see `prepare.align`.
+    """Align scans of a rotated sample, by control points (a CSV file) or automatically.
 
     Returns:
-        One stack, and where the control points are in its frame [um] (empty without them).
+        One stack, and the places of the control points in its frame [um] (empty without them).
     """
     picks = read_points(points) if points is not None else None
     stack, found = align_scans(scans, picks, AlignSettings().changed(**changes), str(points or ""))
@@ -281,7 +282,7 @@ def reconstruct(
     settings = settings or ReconstructSettings()
     if one.noise == "measured" and one.n_rays is None:
         is_fit = wanted.get("method", settings.method) == "refine"
-        one = calibrate_turned(one, keeps_multiple=is_fit) if "align" in one.provenance else calibrate(one)
+        one = calibrate(one) if one.alignment is None else calibrate_rotated(one, keeps_multiple=is_fit)
     chosen = settings.changed(**_with_priors(settings, one, wanted))
     refine = chosen.refine
 
@@ -290,7 +291,7 @@ def reconstruct(
         return make_predictor(one, n_rays, refine.substrate_um, **about)
 
     rec = reconstruct_stack(one, chosen, make_predict, report)
-    others = [f"{name} ({kind})" for name, kind in one.provenance.get("materials", {}).items() if kind != "cosine"]
+    others = [f"{name} ({kind})" for name, kind in one.materials.items() if kind != "cosine"]
     if not others:
         return rec
     return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")

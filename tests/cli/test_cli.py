@@ -214,6 +214,6 @@ def test_calibrate_says_what_it_found(finished, tmp_path):
     assert found.returncode == 0, found.stderr
     record = json.loads(found.stdout)
     assert record["background"] == pytest.approx([800.0] * 3, abs=120.0) and len(record["snr"]) == 3
-    assert read(done).provenance["calibrate"]["priors"]["offset_std"] == 0.3
+    assert record["priors"]["offset_std"] == read(done).calibration.priors["offset_std"] == 0.3
     assert done.with_suffix(".png").stat().st_size > 10_000
     assert helio("calibrate", done, "-o", tmp_path / "again.h5").returncode == 2

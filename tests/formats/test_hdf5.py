@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from nexusformat.nexus import nxload
 
-from helio_jax.errors import HelioError, SceneError
+from helio_jax.errors import HelioError, InputFileError, SceneError
 from helio_jax.formats import hdf5
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack, ScanAlignment
 from helio_jax.reconstruction import Reconstruction
 
 SHAPE = (2, 5, 4)
@@ -54,6 +54,9 @@ def make_full_stack(seed: int = 0) -> MicrographStack:
         noise="measured",
         unit="A",
         name="scan µ",
+        calibration=Calibration("constant_albedo", {"gain_std": 0.1, "drift_degrees": (3, 2)}, True),
+        alignment=ScanAlignment(((1 / 3, -0.1, 0.2),) * SHAPE[0]),
+        materials={"flat µ": "cosine"},
         provenance={"seed": 2**63, "nested": {"list": [1, 2.5, None, "µ"], "on": True}},
     )
 
@@ -118,6 +121,7 @@ def nexus_plot(path):
             gain=np.array([0.1, 0.2]),
             offset=np.zeros(2),
             status="converged",
+            border="free",
             provenance={"a": 1},
         ),
     ],
@@ -127,6 +131,61 @@ def test_what_is_written_is_read_back(make, tmp_path):
     record = make()
     hdf5.write(record, tmp_path / "a.h5")
     assert_equal_record(record, hdf5.read(tmp_path / "a.h5"))
+
+
+OLD = {
+    "align": {"scans": []},
+    "scan_time": [[0.0, 0.1, 0.2]] * SHAPE[0],
+    "self_calibrate": {"gain": [1.0], "note": "", "priors": {"drift_degrees": [3, 3]}, "without_multiple": True},
+    "materials": {"gold": "specular"},
+}
+"""What files of format 1.0 keep in the provenance of a stack."""
+
+
+def write_old(record, path, provenance) -> None:
+    """Write a record as format 1.0 had it."""
+    hdf5.write(record.replace(provenance=provenance), path)
+    with h5py.File(path, "a") as file:
+        file.attrs["helio_format"] = b"1.0"
+        for name in set(file["entry"]) & {"calibration", "alignment", "materials", "border"}:
+            del file[f"entry/{name}"]
+
+
+def test_files_of_format_1_0(tmp_path):
+    """Their calibration, alignment and border become records. Catches an old file that is calibrated a second time."""
+    path = tmp_path / "old.h5"
+    write_old(make_full_stack(), path, OLD)
+    found = hdf5.read(path)
+    assert found.calibration == Calibration("constant_albedo", {"drift_degrees": [3, 3]}, True)
+    assert found.alignment == ScanAlignment(((0.0, 0.1, 0.2),) * SHAPE[0]) and found.materials == {"gold": "specular"}
+    assert found.provenance == OLD
+    write_old(make_bare_stack(), path, {"calibrate": {"priors": {"gain_std": 0.3}}})
+    found = hdf5.read(path)
+    assert found.calibration == Calibration("border", {"gain_std": 0.3}) and found.alignment is None
+    write_old(make_bare_stack(), path, {})
+    assert_equal_record(make_bare_stack(), hdf5.read(path))
+    write_old(make_reconstruction(border="free"), path, {"reconstruct": {"border": "free"}})
+    assert hdf5.read(path).border == "free"
+    for wrong in ({"calibrate": [1]}, {"self_calibrate": {"priors": {"gain_std": "x"}}}, {"scan_time": [[1.0]]}):
+        write_old(make_bare_stack(), path, wrong)
+        with pytest.raises(InputFileError, match=r"old\.h5: /entry"):
+            hdf5.read(path)
+
+
+def test_provenance_of_a_new_file_is_history(tmp_path):
+    """Catches a step that depends on the provenance of a file of the present format."""
+    hdf5.write(make_bare_stack().replace(provenance=OLD), tmp_path / "a.h5")
+    found = hdf5.read(tmp_path / "a.h5")
+    assert found.calibration is None and found.alignment is None and found.scan_time is None
+
+
+def test_records_are_checked_when_made():
+    """Catches a calibration of unknown kind, priors that are no numbers, and times of another number of images."""
+    for wrong in (("flat",), ("border", {"gain_std": "x"}), ("border", [1.0]), ("border", {}, 1)):
+        with pytest.raises(InputFileError, match="calibration"):
+            Calibration(*wrong)
+    with pytest.raises(InputFileError, match="time_planes must hold one plane for each of 2 images, got 1"):
+        make_bare_stack().replace(alignment=ScanAlignment(((0.0, 0.0, 0.0),)))
 
 
 def test_default_plot_of_a_stack(tmp_path):
@@ -173,7 +232,7 @@ def test_every_field_says_unit_and_meaning_in_plain_storage(tmp_path):
     with h5py.File(tmp_path / "a.h5") as file:
         check("/", file)
         file.visititems(check)
-        assert file.attrs["helio_format"] == b"1.0" and file.attrs["filetype"] == b"micrographs"
+        assert file.attrs["helio_format"] == b"1.1" and file.attrs["filetype"] == b"micrographs"
     assert len(checked) >= 20
 
 
@@ -181,12 +240,12 @@ def test_describe_tells_shapes_and_origin(tmp_path):
     """Catches a summary that is not JSON, loses the scans of a set, or says a wrong kind or unit."""
     hdf5.write(MicrographSet((make_bare_stack(), make_full_stack())), tmp_path / "a.h5")
     about = json.loads(json.dumps(hdf5.describe(tmp_path / "a.h5")))
-    assert about["kind"] == "micrograph_set" and about["format"] == "1.0" and about["creator"] == "helio_jax"
+    assert about["kind"] == "micrograph_set" and about["format"] == "1.1" and about["creator"] == "helio_jax"
     scan = about["entries"]["scan_2"]
     assert scan["fields"]["micrographs/counts"]["shape"] == list(SHAPE)
     assert scan["fields"]["micrographs/counts"]["unit"] == "A"
     assert scan["instrument"]["detector"][0]["name"] == "vorn µ"
-    assert scan["provenance"]["seed"] == 2**63
+    assert scan["provenance"]["seed"] == 2**63 and scan["calibration"]["priors"]["drift_degrees"] == [3, 2]
 
 
 def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

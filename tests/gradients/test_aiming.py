@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from helio_jax.forward.aiming import aimed_form_factor
+
 from helio_jax.forward.form_factor import SpotGeometry
 from tests.derivatives import adjoint_products, taylor_remainders
 

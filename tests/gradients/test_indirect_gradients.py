@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helio_jax.forward.beam_frame import normal_of_slopes
 
 from helio_jax.forward import radiosity as indirect
-from helio_jax.forward.beam_frame import normal_of_slopes
 from tests.derivatives import adjoint_products, taylor_remainders
 
 

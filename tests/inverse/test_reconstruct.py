@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError
-from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.inverse.fit import status_of
 from helio_jax.inverse.linear import solve_known_albedo, solve_linear

@@ -5,8 +5,8 @@ The quadrature knows no beam frame: it integrates over the part of an ellipse be
 
 import numpy as np
 import pytest
-
 from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
+
 from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.forward.masking import hidden_form_factor, hidden_response
 from helio_jax.instrument import Beam, Detector, Instrument, Plate

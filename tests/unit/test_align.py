@@ -10,9 +10,9 @@ from helio_jax.alignment.automatic import Aligner
 from helio_jax.alignment.control_points import fit_points, rms
 from helio_jax.alignment.correlate import correlate_masked, find_peak
 from helio_jax.alignment.resample import resample
-from helio_jax.alignment.rigid import Rigid, about, fit_rigid, separation
+from helio_jax.alignment.rigid import Rigid, fit_rigid, rotation_about, separation
 from helio_jax.alignment.views import View
-from helio_jax.calibration.self_calibration import SelfCalibrateSettings, effective_instrument, self_calibrate
+from helio_jax.calibration.self_calibration import effective_instrument, self_calibrate
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.figures.pick import Picker
 from helio_jax.formats.points import read_points, write_points
@@ -86,7 +86,7 @@ def test_motions_compose_and_invert():
     np.testing.assert_allclose(m.inverse().apply(m.apply(points)), points, atol=1e-12)
     np.testing.assert_allclose(Rigid(math.pi / 2, (0.0, 0.0)).apply(np.array([1.0, 0.0])), [0.0, 1.0], atol=1e-12)
     center = np.array([10.0, 20.0])
-    np.testing.assert_allclose(about(center, 0.4, np.array([1.0, 2.0])).apply(center), center + [1.0, 2.0])
+    np.testing.assert_allclose(rotation_about(center, 0.4, np.array([1.0, 2.0])).apply(center), center + [1.0, 2.0])
     found = fit_rigid(points, m.apply(points))
     assert separation(found, m, points) < 1e-9 and found.rotation == pytest.approx(0.7)
 
@@ -219,15 +219,15 @@ def test_aligned_stack_has_turned_apertures(found):
 def test_a_soft_hill_does_not_fix_a_common_displacement():
     """Displaced along the detectors, a hill looks like another albedo: at the true motions little returns.
 
-    The crystal brings back more. Catches a restoring taken in the common frame's axes (there displacements of turned
-    scans are no common one, and the hill seems fixed), and one of the best direction instead of the worst.
+    The crystal brings back more. Catches an observability computed in the axes of the common frame (there displacements
+    of rotated scans are no common one, and the hill seems fixed), and one of the best direction instead of the worst.
     """
     shares = []
     for light in (hill_light, crystal_light):
         scans, true = make_scans(light=light)
         aligner = Aligner([View.of(s) for s in scans.stacks], [m.rotation for m in true], 300.0, math.radians(3.0))
         aligner.motions = list(true)
-        shares.append(aligner.restoring())
+        shares.append(aligner.common_shift_observability())
         assert aligner.motions == true
     assert shares[0] < AlignSettings().min_restoring < 1.5 * AlignSettings().min_restoring < shares[1], shares
 
@@ -283,7 +283,7 @@ def test_self_calibration_finds_gains_and_background():
     """
     scans, true = make_scans(counts=2e5, share=0.75)
     stack = resample(scans, tuple(true), "reference")
-    found = self_calibrate(stack, SelfCalibrateSettings(n_pixels=120))
+    found = self_calibrate(stack, n_pixels=120)
     assert found.share == pytest.approx(0.75, abs=0.04)  # in each scan
     assert found.polar_deg == pytest.approx(POLAR, abs=5.0)
     np.testing.assert_allclose(found.gain / found.gain[0], [(0.5 + 0.3 * k) / 0.5 for k in range(5)], rtol=0.03)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from helio_jax.forward.beam_frame import normal_of_slopes
+
 from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.inverse.problem import Refiner
 from helio_jax.inverse.residuals import Surface

@@ -7,7 +7,7 @@ import pytest
 
 from helio_jax.detector import Aperture, Detector, cone_ellipse
 from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.instrument import Beam, Instrument, Plate
+from helio_jax.instrument import POLAR_STD_DEG, Beam, Instrument, Plate, Uncertainty
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:
@@ -123,3 +123,12 @@ def test_directions_are_those_of_the_form_factor(sample_distance):
     small = wide.model_copy(update={"detector": (wide.detector[0].model_copy(update={"half_angle_deg": 0.5}),)})
     phi = np.asarray(SpotGeometry(small).form_factor(np.zeros((1, 1))))[0, :, 0, 0]
     np.testing.assert_allclose(small.directions()[0], phi[:2] / phi[2], atol=2e-4)
+
+
+def test_prior_of_polar_angles_for_a_calibration():
+    """The stated uncertainty, else the default. Catches a calibration that ignores what the instrument file states."""
+    detector = (Detector(name="d", polar_deg=30.0, half_angle_deg=5.0),)
+    plate = Plate(working_distance_um=3000.0)
+    assert Instrument(plate=plate, detector=detector).polar_std_deg == POLAR_STD_DEG
+    stated = Instrument(plate=plate, detector=detector, uncertainty=Uncertainty(polar_deg=2.0))
+    assert stated.polar_std_deg == 2.0

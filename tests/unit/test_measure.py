@@ -197,6 +197,6 @@ def test_reconstructed_area_of_a_free_border_counts_from_the_median(border, shar
         make_rec(lambda x, y: 0.0 * x, n=shape),
         height_std=np.sqrt(np.mean(samples**2, axis=0)),
         height_samples=samples,
-        provenance={"reconstruct": {"border": border}},
+        border=border,
     )
     assert reconstructed_area(rec)["share"] == share

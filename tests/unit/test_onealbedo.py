@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from helio_jax.alignment.albedo_prior import _OUTLIER, _POLAR_STD, _Fit, _redescending, align_one_albedo
+from helio_jax.alignment.albedo_prior import _OUTLIER, _JointFit, _redescending, align_with_albedo_prior
 from helio_jax.alignment.align import align_scans, find_motions
 from helio_jax.alignment.rigid import Rigid, separation
 from helio_jax.errors import GuardError
@@ -73,7 +73,7 @@ def test_a_common_displacement_comes_back(hills):
     start = displaced(true, 3.0 * PITCH)
     start = [m if not k else Rigid(0.0, tuple(rng.uniform(-1, 1, 2) * PITCH)).after(m) for k, m in enumerate(start)]
     assert worst_px(start, true, scans) > 2.5
-    found = align_one_albedo(scans.stacks, start)
+    found = align_with_albedo_prior(scans.stacks, start)
     assert worst_px(found.motions, true, scans) < 0.5
     assert found.std_um[0] == 0.0 and 0.05 * PITCH < min(found.std_um[1:]) <= max(found.std_um) < 0.6 * PITCH
     assert found.albedo_spread < 0.05
@@ -85,24 +85,23 @@ def test_the_step_goes_down_the_misfit(hills):
     Catches any wrong sign or missing factor in a derivative, and a turn of a scan that leaves its detector's direction.
     """
     scans, true = hills
-    fit = _Fit(scans.stacks, displaced(true, 0.7 * PITCH), 1.5, 0.05)
     moves = [(8.0 * (-1) ** k, 5.0 * k - 10) if k else (0.0, 0.0) for k in range(6)]
-    fit.motions = [Rigid(0.0, move).after(m) for move, m in zip(moves, fit.motions, strict=True)]
-    fit.share, fit.gain, fit.more_polar = 0.5, np.linspace(0.5, 1.0, 6), 0.05
-    fit._read()
-    fit._solve_convex()
+    start = displaced(true, 0.7 * PITCH)
+    fit = _JointFit(scans.stacks, [Rigid(0.0, move).after(m) for move, m in zip(moves, start, strict=True)], 1.5, 0.05)
+    fit.state = fit.state._replace(background=0.5, gain=np.linspace(0.5, 1.0, 6), polar_change=0.05)
+    fit._sample_images()
+    fit._solve_normals()
     for _ in range(30):
         fit._step_normals(_redescending)
-    right, kept, pixels = fit._reduced()[1], fit._state(), fit.is_known.sum()
+    right, kept, pixels = fit._normal_equations()[1], fit.state, fit.is_known.sum()
 
     def misfit(step: np.ndarray) -> float:
-        fit._restore(kept)
-        fit._move(step)
-        fit._read()
+        fit.state = fit._moved(kept, step)
+        fit._sample_images()
         for _ in range(30):
             fit._step_normals(_redescending)
         assert fit.is_known.sum() == pixels
-        prior = 0.5 * fit.alike * (fit.more_polar / _POLAR_STD) ** 2
+        prior = 0.5 * fit.n_correlated * (fit.state.polar_change / math.radians(5.0)) ** 2
         return fit._cost() * pixels * 0.5 * _OUTLIER**2 + prior
 
     shifts, turns, others = (0, 6, 9, 10), (8, 14), (15, 18, 20, 21, 22)
@@ -120,9 +119,9 @@ def test_hills_are_aligned_without_a_hand_and_spotty_ones_refused(hills):
     """
     scans, true = hills
     found = find_motions(scans)
-    assert found.one_albedo is not None and found.problems == (), found.problems
+    assert found.albedo_prior is not None and found.problems == (), found.problems
     assert worst_px(found.motions, true, scans) < 0.7
-    assert found.as_dict()["one_albedo"]["albedo_spread"] == found.one_albedo.albedo_spread
+    assert found.as_dict()["one_albedo"]["albedo_spread"] == found.albedo_prior.albedo_spread
     spotted, _ = make_hills(spotty=0.8)
     with pytest.raises(GuardError, match=r"its robust deviation must be <= 0\.1"):
         align_scans(spotted)

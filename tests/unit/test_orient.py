@@ -10,14 +10,22 @@ import pytest
 
 from helio_jax import import_micrographs, read, write
 from helio_jax.__main__ import main
-from helio_jax.alignment.arrangement import Candidate, group_ties, orders_tried
-from helio_jax.alignment.orientation import ALL_TURNS, Turn, bin_stack, instrument_symmetries, turn_stack
+from helio_jax.alignment.orientation import (
+    ALL_TURNS,
+    Candidate,
+    Turn,
+    bin_stack,
+    group_ties,
+    instrument_symmetries,
+    orders_tried,
+    turn_stack,
+)
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.forward.form_factor import SpotGeometry
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.inverse.consistency import misfit
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import Calibration, MicrographStack, ScanAlignment
 from helio_jax.scene.scan import Raster
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.orient import Entry, OrientSettings, Ranking, find_orientation
@@ -311,9 +319,9 @@ def test_what_cannot_be_oriented_is_refused(spheres):
     with pytest.raises(InputFileError, match="list of 9 positions"):
         find_orientation(line)
     with pytest.raises(InputFileError, match="before helio align"):
-        find_orientation(spheres.replace(provenance={"align": {}}))
+        find_orientation(spheres.replace(alignment=ScanAlignment()))
     with pytest.raises(InputFileError, match="before helio calibrate"):  # scaled to the flat of a wrong detector
-        find_orientation(spheres.replace(provenance={"calibrate": {}}))
+        find_orientation(spheres.replace(calibration=Calibration("border")))
     with pytest.raises(SceneError, match="turn_deg"):
         OrientSettings().changed(turn_deg=45)
     with pytest.raises(SceneError, match="min_margins"):

@@ -6,6 +6,7 @@ from helio_jax.commands.app import set_options
 from helio_jax.errors import SceneError
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.measure.spectrum import RippleSettings
+from helio_jax.micrograph import Calibration
 from helio_jax.workflows.calibrate_rotated import _JUMPS
 from helio_jax.workflows.measure import Wanted, _settings
 from helio_jax.workflows.pipeline import _with_priors
@@ -27,7 +28,7 @@ def test_limits_go_together(way):
     class Stack:
         """What is asked of a stack."""
 
-        provenance = {"self_calibrate": {"priors": dict(_JUMPS) | {"max_rounds": 12}}}
+        calibration = Calibration("constant_albedo", dict(_JUMPS) | {"max_rounds": 12})
 
     chosen = settings.changed(**_with_priors(settings, Stack(), changes)).refine  # type: ignore[arg-type]
     assert chosen.robust_limits == own["robust_limits"] and len(chosen.jump_limits) == 3 and chosen.max_rounds == 12

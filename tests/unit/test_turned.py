@@ -10,11 +10,11 @@ from benchmarks.crystal import DRIFTS, FIELD_UM, GAINS, SHARE, Sample, make_samp
 from helio_jax import reconstruct
 from helio_jax.alignment.resample import resample, scan_times
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.calibration.self_calibration import Relief, SelfCalibrateSettings, self_calibrate
+from helio_jax.calibration.self_calibration import Relief, self_calibrate
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector
-from helio_jax.micrograph import MicrographStack
-from helio_jax.workflows import calibrate_rotated as turned
+from helio_jax.micrograph import MicrographStack, ScanAlignment
+from helio_jax.workflows import calibrate_rotated as rotated
 from helio_jax.workflows.scene_file import load_instrument
 
 
@@ -28,7 +28,7 @@ def aligned():
 @pytest.fixture(scope="module")
 def calibrated(aligned):
     """The same with and without its multiple scattering."""
-    return [turned.calibrate_turned(aligned, keeps_multiple=k) for k in (True, False)]
+    return [rotated.calibrate_rotated(aligned, keeps_multiple=k) for k in (True, False)]
 
 
 def test_background_is_found_beside_walls(aligned, calibrated):
@@ -49,7 +49,7 @@ def test_multiple_scattering_stays_for_a_fit(calibrated):
     """
     kept, without = calibrated
     assert kept.provenance["self_calibrate"]["gain"] == without.provenance["self_calibrate"]["gain"]
-    flat = turned.flat_signal(kept.instrument)[:, None, None]
+    flat = rotated.substrate_signal(kept.instrument)[:, None, None]
     taken = np.where(kept.is_observed, (kept.counts - without.counts) / flat, 0.0)
     assert taken.min() > -1e-9 and 0.05 < taken.max() < 1.0
 
@@ -75,8 +75,8 @@ def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
     def refuse(stack):
         raise GuardError("too rough")
 
-    monkeypatch.setattr(turned, "_relief_of", refuse)
-    done = turned.calibrate_turned(aligned).provenance["self_calibrate"]
+    monkeypatch.setattr(rotated, "_relief_of", refuse)
+    done = rotated.calibrate_rotated(aligned).provenance["self_calibrate"]
     assert done["share"] == self_calibrate(aligned).share.tolist()
     assert "not predicted" in done["note"] and "too rough" in done["note"]
 
@@ -98,7 +98,7 @@ def pyramids(drifts=((0.0,),) * 5):
         for k, (x, y) in enumerate(to_aperture[:, :2].tolist())
     )
     instrument = load_instrument(INSTRUMENT).model_copy(update={"detector": detectors})
-    return MicrographStack(reading, axis, axis, instrument, provenance={"scan_time": told})
+    return MicrographStack(reading, axis, axis, instrument, alignment=ScanAlignment(tuple(map(tuple, told))))
 
 
 def test_facets_side_by_side_are_not_taken_for_background():
@@ -106,7 +106,7 @@ def test_facets_side_by_side_are_not_taken_for_background():
 
     Catches readings averaged over the edges of facets: a mean of normals is shorter than one and reads as 0.78.
     """
-    found = self_calibrate(pyramids(), SelfCalibrateSettings(drift_degree=0))
+    found = self_calibrate(pyramids(), drift_degree=0)
     assert found.share == pytest.approx(SHARE, abs=0.02)
     assert found.polar_deg == pytest.approx(46.1, abs=1.5)
     np.testing.assert_allclose(found.gain, GAINS, rtol=0.003)
@@ -122,7 +122,7 @@ def test_drift_of_each_background_is_found():
     found = self_calibrate(stack)
     np.testing.assert_allclose(found.drift, DRIFTS, atol=0.01)
     assert found.share == pytest.approx(SHARE, abs=0.03)
-    steady = self_calibrate(stack, SelfCalibrateSettings(drift_degree=0))
+    steady = self_calibrate(stack, drift_degree=0)
     still = self_calibrate(pyramids())
     time = stack.scan_time
     rest = [(stack.counts - f.background(time)) / f.signal[:, None, None] for f in (found, steady)]
@@ -170,9 +170,8 @@ def test_what_stands_closer_to_the_plate_is_seen_from_there():
     signal = np.maximum(np.sum(normal * ray, -1), 0.0) * size
     reading = np.array(GAINS)[:, None, None] * (signal * (1.0 - SHARE) + SHARE)
     stack = flat.replace(counts=reading)
-    settings = SelfCalibrateSettings(drift_degree=0)
-    near = self_calibrate(stack, settings, Relief(height, np.zeros(stack.shape)))
-    far = self_calibrate(stack, settings)
+    near = self_calibrate(stack, Relief(height, np.zeros(stack.shape)), drift_degree=0)
+    far = self_calibrate(stack, drift_degree=0)
     assert near.share == pytest.approx(SHARE, abs=0.02)
     assert abs(near.polar_deg - 46.1) < 0.6 < 1.0 < abs(far.polar_deg - 46.1)
     assert near.misfit < far.misfit
