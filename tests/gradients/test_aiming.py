@@ -4,14 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helio_jax.forward.aiming import aimed_form_factor
 
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor, form_factor_at
+from helio_jax.forward.optics import Optics
 from tests.derivatives import adjoint_products, taylor_remainders
 
 
+def aimed_form_factor(optics, height, aim, distance=0.0):
+    """Compute the form factors of apertures turned by aim (polar angle, azimuth) [detector, 2]."""
+    return form_factor_at(optics.moved(polar=aim[:, 0], azimuth=aim[:, 1], distance=distance), height)
+
+
 @pytest.fixture(scope="module")
-def problem(geometry):
+def problem(optics):
     """Heights, aims and a direction in both."""
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
@@ -23,24 +28,24 @@ def problem(geometry):
             "height": jnp.asarray(rng.normal(scale=100.0, size=(4, 5))),
             "aim": jnp.asarray(rng.normal(scale=0.1, size=(2, 2))),
         }
-        yield jax.jit(lambda v: {"phi": aimed_form_factor(geometry, v["height"], v["aim"])}), at, way
+        yield jax.jit(lambda v: {"phi": aimed_form_factor(optics, v["height"], v["aim"])}), at, way
 
 
-def test_the_same_as_a_moved_instrument(geometry):
-    """Phi of aimed apertures at a lower height = that of the instrument whose apertures and sample are moved, to 1e-12.
+def test_the_same_as_a_moved_instrument(oblique, optics):
+    """Phi of aimed apertures with a moved sample, or at a lower height, = that of the moved instrument, to 1e-12.
 
     Catches an azimuth that turns the other way, a polar angle seen from elsewhere, a sign of the distance.
     """
     aim, distance = np.radians([[5.0, -3.0], [-4.0, 6.0]]), 150.0
     height = np.linspace(-100.0, 300.0, 7)
-    moved = SpotGeometry(geometry.instrument.moved(aim, distance)).form_factor(height)
+    moved = form_factor(Optics.of(oblique.moved(aim, distance)), height)
     with jax.enable_x64(True):
-        ours = np.asarray(aimed_form_factor(geometry, jnp.asarray(height - distance), jnp.asarray(aim)))
+        ours = np.asarray(aimed_form_factor(optics, jnp.asarray(height), jnp.asarray(aim), distance))
+        lower = np.asarray(aimed_form_factor(optics, jnp.asarray(height - distance), jnp.asarray(aim)))
     assert ours == pytest.approx(moved, rel=1e-9, abs=1e-12)
-    polar = [
-        np.arctan2(np.hypot(*a.center), geometry.instrument.working_distance) for a in geometry.instrument.apertures()
-    ]
-    new = geometry.instrument.moved(aim, 0.0)
+    assert lower == pytest.approx(moved, rel=1e-9, abs=1e-12)
+    polar = [np.arctan2(np.hypot(*a.center), oblique.working_distance) for a in oblique.apertures()]
+    new = oblique.moved(aim, 0.0)
     assert [np.arctan2(np.hypot(*a.center), new.working_distance) for a in new.apertures()] == pytest.approx(
         polar + aim[:, 0]
     )

@@ -7,10 +7,12 @@ import pytest
 from helio_jax.forward.beam_frame import normal_of_slopes
 
 from helio_jax.forward import radiosity as indirect
+from helio_jax.forward.optics import Raster
+from helio_jax.forward.surface import normal_of_slopes
 from tests.derivatives import adjoint_products, taylor_remainders
 
 
-def test_taylor_and_adjoint(geometry, monkeypatch):
+def test_taylor_and_adjoint(optics, monkeypatch):
     """The Taylor remainder falls with slope 2.0 +- 0.05 over 2 decades of step, and <J v, w> = <v, J' w> to 1e-10.
 
     A rough surface with a step of 6 pitches, so that levels, strips cut at levels and the flat outside take part.
@@ -19,17 +21,16 @@ def test_taylor_and_adjoint(geometry, monkeypatch):
     """
     monkeypatch.setattr(indirect, "TOLERANCE", 1e-14)
     rng = np.random.default_rng(3)
-    x, y = 12.0 * np.arange(10), 9.0 * np.arange(9)
+    raster = Raster(12.0 * np.arange(10), 9.0 * np.arange(9))
     height = 4.0 * rng.normal(size=(9, 10)) + 40.0
     height[:, 5:] += 70.0
-    raw = np.stack(normal_of_slopes(*(0.3 * rng.normal(size=(2, 9, 10))), geometry.instrument.beam_shift), -1)
+    raw = np.stack(normal_of_slopes(*(0.3 * rng.normal(size=(2, 9, 10))), optics.beam_shift), -1)
     start = height, raw / np.linalg.norm(raw, axis=-1, keepdims=True)
-    model = indirect.Radiosity(geometry, x, y)
-    plan = model.plan(*start)
+    plan = indirect.plan_radiosity(*start, optics, raster)
     direction = rng.normal(size=height.shape), 0.05 * rng.normal(size=raw.shape)
 
     def value_at(surface):
-        return model.multiple(*surface, plan)
+        return indirect.radiosity(*surface, optics, raster, plan)
 
     with jax.enable_x64(True):
         start, v = (tuple(map(jnp.asarray, arrays)) for arrays in (start, direction))

@@ -1,4 +1,4 @@
-"""Derivatives of the hidden form factor: Taylor remainders, the adjoint, differences in each height, and their cost."""
+"""Derivatives of the masked form factor: Taylor remainders, the adjoint, differences in each height, and their cost."""
 
 import time
 
@@ -7,19 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.forward.masking import hidden_form_factor
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.optics import Raster
+from helio_jax.forward.surface import Surface
 from tests.derivatives import adjoint_products, taylor_remainders
 
 DX, DY = 12.0, 9.0
 
 
-def rough_scene(rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, ...]:
+def masked_of(surface: Surface, optics, **options):
+    """Compute the masked form factors on a raster of pitches DX, DY."""
+    return masked_form_factor(surface, optics, Raster.regular(surface.height.shape, DX, DY), **options)
+
+
+def rough_scene(rng: np.random.Generator, shape: tuple[int, int]) -> Surface:
     """Return random heights [um] and slopes, no two samples of which tie; every eighth aperture is cut in part."""
-    return 8.0 * rng.normal(size=shape), 0.7 * rng.normal(size=shape), 0.7 * rng.normal(size=shape)
+    return Surface(*(size * rng.normal(size=shape) for size in (8.0, 0.7, 0.7)))
 
 
 @pytest.mark.parametrize("width", [0.0, 0.1])
-def test_taylor_and_adjoint(geometry, width):
+def test_taylor_and_adjoint(optics, width):
     """The Taylor remainder falls with slope 2.0 +- 0.05 over 3 decades of step, and <J v, w> = <v, J' w> to 1e-12.
 
     The seed is one of those where no slice crosses the mask's edge within the longest step (0.03 um; at such a kink of
@@ -28,15 +36,15 @@ def test_taylor_and_adjoint(geometry, width):
     """
     rng = np.random.default_rng(4)
     scene = rough_scene(rng, (7, 8))
-    directions = [size * rng.normal(size=(7, 8)) for size in (1.0, 0.05, 0.05)]
+    direction = Surface(*(size * rng.normal(size=(7, 8)) for size in (1.0, 0.05, 0.05)))
     with jax.enable_x64(True):
 
         @jax.jit
         def model(inputs):
-            return hidden_form_factor(*inputs, geometry, DX, DY, width=width)
+            return masked_of(inputs, optics, width=width)
 
-        start, v = (tuple(map(jnp.asarray, arrays)) for arrays in (scene, directions))
-        share = np.asarray(model(start)[:, 2]) / geometry.form_factor(scene[0])[:, 2]
+        start, v = (jax.tree.map(jnp.asarray, arrays) for arrays in (scene, direction))
+        share = np.asarray(model(start)[:, 2]) / form_factor(optics, scene.height)[:, 2]
         steps = 10.0 ** np.arange(-1.5, -4.6, -0.5)
         rest = taylor_remainders(model, start, v, steps)
         forth, to_and_fro = adjoint_products(model, start, v, lambda f: jnp.asarray(rng.normal(size=f.shape)))
@@ -46,10 +54,10 @@ def test_taylor_and_adjoint(geometry, width):
     assert forth == pytest.approx(to_and_fro, rel=1e-12)
 
 
-def test_single_heights(geometry):
+def test_single_heights(optics):
     """A point before a wall: central differences in its height and in that of the wall's edge; 0 for the wall behind.
 
-    The hidden part of a detector grows with the wall and falls with the point. Catches a derivative that goes to the
+    The masked part of a detector grows with the wall and falls with the point. Catches a derivative that goes to the
     wrong sample of the march.
     """
     height = np.zeros((9, 31))
@@ -57,39 +65,39 @@ def test_single_heights(geometry):
     flat = np.zeros_like(height)
 
     @jax.jit
-    def hidden(heights):
-        return hidden_form_factor(heights, flat, flat, geometry, DX, DY)[0, 2, 4, 12]
+    def masked(heights):
+        return masked_of(Surface(heights, flat, flat), optics)[0, 2, 4, 12]
 
     with jax.enable_x64(True):
-        slope = np.asarray(jax.grad(hidden)(jnp.asarray(height)))
+        slope = np.asarray(jax.grad(masked)(jnp.asarray(height)))
         for j in (12, 20):
             step = np.zeros_like(height)
             step[4 if j == 12 else slice(None), j] = 1e-3
-            central = float(hidden(jnp.asarray(height + step)) - hidden(jnp.asarray(height - step))) / 2e-3
+            central = float(masked(jnp.asarray(height + step)) - masked(jnp.asarray(height - step))) / 2e-3
             assert np.sum(slope * step) == pytest.approx(1e-3 * central, rel=1e-6)
     assert slope[4, 12] < 0.0 < slope[:, 20].sum()
     assert not np.any(slope[:, 22:])
 
 
-def test_cost(geometry):
+def test_cost(optics):
     """A gradient costs at most 4 times the value (measured 1.2 to 2.1) and holds at most 3 times as much (1.9).
 
     Catches a march that is differentiated, and slices that are kept for the way back (22 times).
     """
     with jax.enable_x64(True):
-        inputs = tuple(map(jnp.asarray, rough_scene(np.random.default_rng(2), (61, 61))))
+        surface = jax.tree.map(jnp.asarray, rough_scene(np.random.default_rng(2), (61, 61)))
 
-        def total(*arrays):
-            return jnp.sum(hidden_form_factor(*arrays, geometry, DX, DY) ** 2)
+        def total(surface):
+            return jnp.sum(masked_of(surface, optics) ** 2)
 
-        compiled = [jax.jit(f).lower(*inputs).compile() for f in (total, jax.grad(total, (0, 1, 2)))]
+        compiled = [jax.jit(f).lower(surface).compile() for f in (total, jax.grad(total))]
         memory = [function.memory_analysis() for function in compiled]
         held = [m.temp_size_in_bytes + m.argument_size_in_bytes + m.output_size_in_bytes for m in memory]
         seconds = [np.inf, np.inf]
         for _ in range(12):  # in turns: both meet the same other load, the first time they warm up
             for k, function in enumerate(compiled):
                 start = time.perf_counter()
-                jax.block_until_ready(function(*inputs))
+                jax.block_until_ready(function(surface))
                 seconds[k] = min(seconds[k], time.perf_counter() - start)
     assert seconds[1] < 4.0 * seconds[0]
     assert held[1] < 3.0 * held[0]
