@@ -1,16 +1,19 @@
 """How the instrument is fitted: edges cut at first, freed from the first round on, error bars, names of findings."""
 
+import jax
 import numpy as np
 import pytest
 
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.render import LEAST_COS, render_single
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.render import MIN_COS, Corrections, detection_probability
+from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse import fit as refine
 from helio_jax.inverse.instrument_report import _plain
-from helio_jax.inverse.occlusion import shadow_edges
-from helio_jax.inverse.posterior import disagreement
-from helio_jax.inverse.residuals import Prediction, Surface
+from helio_jax.inverse.occlusion import find_occlusion_edges
+from helio_jax.inverse.posterior import birge_ratio
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
 
 
@@ -25,12 +28,14 @@ def test_edges_are_cut_behind_rims_only(way):
     signal = np.ones((3, 20, 30))
     signal[:, :, 10:20] = 2.0
     surface = Surface(height, slope, np.zeros_like(slope))
-    found = shadow_edges(signal, np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 1)
+    found = find_occlusion_edges(signal, np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 1)
     columns = set(np.flatnonzero(found.any(0)))
     right, wrong = (set(range(18, 23)), set(range(6, 12)))[:: 1 if way > 0 else -1]
     assert columns & right and not columns & wrong and found[:, list(columns)].all()
-    assert not shadow_edges(signal, np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 0).any()
-    assert not shadow_edges(np.ones_like(signal), np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 1).any()
+    assert not find_occlusion_edges(signal, np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 0).any()
+    assert not find_occlusion_edges(
+        np.ones_like(signal), np.full(signal.shape, 1e-3), surface, (0.577 * way, 0.0), 1
+    ).any()
 
 
 def test_parameters_have_plain_names():
@@ -43,7 +48,7 @@ def test_parameters_have_plain_names():
         "distance[0]": "distance",
         "drift[1, 3]": "drift left 3",
         "log_gain[0]": "log_gain forward",
-        "unseen[]": "unseen",
+        "occluded[]": "occluded",
         "law[0]": "law",
     }
     assert {name: _plain(name, names) for name in shown} == shown
@@ -60,21 +65,21 @@ def test_unknown_geometry_is_free_from_the_first_round_on(bshem, monkeypatch, po
     class Enough(Exception):
         pass
 
-    def step(self, limit, cut, is_instrument_free):
-        said.append((is_instrument_free, self.torn is not None))
+    def step(problem, state, limit, cut, is_instrument_free, occluded):
+        said.append((is_instrument_free, occluded is not None))
         raise Enough
 
-    monkeypatch.setattr(refine.Refiner, "step", step)
+    monkeypatch.setattr(refine, "step", step)
     instrument = bshem.model_copy(update={"uncertainty": Uncertainty(polar_deg=polar_deg)})
     flat, signal = np.zeros((12, 12)), np.ones((3, 12, 12))
-    predict = lambda *surface: Prediction(0.0 * signal, np.zeros((3, 3, 12, 12)))  # noqa: E731
     start, settings = Surface(flat, flat, flat), ReconstructSettings()
+    problem = FitProblem.of(signal, 1e-4 * signal, instrument, Raster.regular(flat.shape, 30.0), start, settings)
     with pytest.raises(Enough):
-        refine.fit_heights(signal, 1e-4 * signal, SpotGeometry(instrument), 30.0, 30.0, start, settings, predict)
+        refine.fit_heights(problem, start, settings, lambda *surface: Corrections.none(signal.shape))
     assert said == [(is_free, is_free)]
 
 
-def test_disagreement_is_the_birge_ratio():
+def test_birge_ratio():
     """Values drawn as right priors have it give 1; three times as far off gives 3; what data do not tell is left out.
 
     200 combinations: the ratio of right ones has a standard deviation of 0.05; the limit is three of them.
@@ -83,11 +88,11 @@ def test_disagreement_is_the_birge_ratio():
     rng = np.random.default_rng(4)
     left = np.full(200, 0.4)
     values = np.sqrt(1.0 - left) * rng.normal(size=left.size)
-    assert disagreement(values, np.diag(left)) == pytest.approx(1.0, abs=0.15)
-    assert disagreement(3.0 * values, np.diag(left)) == pytest.approx(3.0, rel=0.15)
+    assert birge_ratio(values, np.diag(left)) == pytest.approx(1.0, abs=0.15)
+    assert birge_ratio(3.0 * values, np.diag(left)) == pytest.approx(3.0, rel=0.15)
     with_untold = np.concatenate([3.0 * values, np.zeros(50)]), np.concatenate([left, np.full(50, 0.99)])
-    assert disagreement(with_untold[0], np.diag(with_untold[1])) == pytest.approx(3.0, rel=0.15)
-    assert disagreement(np.zeros(2), np.eye(2)) == 1.0
+    assert birge_ratio(with_untold[0], np.diag(with_untold[1])) == pytest.approx(3.0, rel=0.15)
+    assert birge_ratio(np.zeros(2), np.eye(2)) == 1.0
 
 
 def test_power_of_the_law(bshem):
@@ -95,13 +100,16 @@ def test_power_of_the_law(bshem):
 
     Catches the power taken of the whole form factor (a smaller aperture would count), and of the wrong direction.
     """
-    geometry = SpotGeometry(bshem)
-    phi = geometry.form_factor(np.zeros((1, 2)))
-    away = -phi[0, :, 0, 0] / np.linalg.norm(phi[0, :, 0, 0])
-    normal = np.stack([np.array([0.0, 0.0, 1.0]), away], -1)[:, None]
-    plain, powered = (
-        np.asarray(render_single(np.zeros((1, 2)), normal, 0.0 * phi, geometry, None, m)) for m in (None, 0.3)
-    )
+    optics = Optics.of(bshem)
+    phi = form_factor(optics, np.zeros((1, 2)))
+    steep = 3.0 * np.sign(phi[0, 0, 0, 0])
+    surface = Surface(np.zeros((1, 2)), np.array([[0.0, steep]]), np.zeros((1, 2)))  # the second faces away
+    corrections = Corrections.none((3, 1, 2))
+    with jax.enable_x64(True):
+        plain, powered = (
+            np.asarray(detection_probability(surface, optics, corrections, exponent=m)) for m in (None, 0.3)
+        )
+    assert plain[0, 0, 1] < 0.0
     cos = phi[:, 2, 0, 0] / np.linalg.norm(phi[:, :, 0, 0], axis=1)
     assert np.allclose(powered[:, 0, 0], plain[:, 0, 0] * cos**0.3, rtol=1e-5)
-    assert powered[0, 0, 1] == pytest.approx(plain[0, 0, 1] * LEAST_COS**0.3, rel=1e-5)
+    assert powered[0, 0, 1] == pytest.approx(plain[0, 0, 1] * MIN_COS**0.3, rel=1e-5)

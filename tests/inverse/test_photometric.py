@@ -5,14 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helio_jax.errors import GuardError
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.errors import PredictionError
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import Corrections
 from helio_jax.instrument import Uncertainty
-from helio_jax.inverse.bootstrap import as_at_border, what_is_left_out
+from helio_jax.inverse.bootstrap import rescale_to_border, unmodelled_signal
 from helio_jax.inverse.linear import solve_linear
 from helio_jax.inverse.nearfield import photometric_heights
-from helio_jax.inverse.residuals import Prediction
-from helio_jax.inverse.samples import also_off_by
+from helio_jax.inverse.samples import add_common_mode
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
@@ -26,12 +27,12 @@ N = 25
 
 def nothing(height, normals):
     """Predict no shadow and no multiple scattering."""
-    return Prediction(np.zeros((3, *height.shape)), np.zeros((3, 3, *height.shape)))
+    return Corrections.none((3, *height.shape))
 
 
 def flat_scan(instrument, seed=None, offset=0.0):
     """Return the micrographs of a flat, noisy where a seed is given, with an offset in units of the signal."""
-    counts = N_RAYS * SpotGeometry(instrument).form_factor(np.zeros((N, N)))[:, 2]
+    counts = N_RAYS * form_factor(Optics.of(instrument), np.zeros((N, N)))[:, 2]
     rng = np.random.default_rng(seed)
     read = counts if seed is None else rng.poisson(counts).astype(float)
     axis = 40.0 * np.arange(N)
@@ -42,7 +43,7 @@ def heights(stack, **changes):
     """Return the near-field reconstruction without a prediction of anything."""
     priors = {"gain_std": 1e-9, "offset_std": 1e-9}
     settings = ReconstructSettings.model_validate({"method": "nearfield", "refine": priors} | changes)
-    return photometric_heights(stack, settings, SpotGeometry(stack.instrument), nothing)
+    return photometric_heights(stack, settings, nothing)
 
 
 def test_deviations_are_those_of_repeated_scans(bshem):
@@ -75,7 +76,7 @@ def bump_scan(instrument):
     shift = instrument.beam_shift
     normal = np.stack([-slopes[0], -slopes[1], 1.0 - slopes[0] * shift[0] - slopes[1] * shift[1]])
     normal /= np.linalg.norm(normal, axis=0)
-    counts = N_RAYS * np.einsum("kiyx,iyx->kyx", SpotGeometry(instrument).form_factor(height), normal)
+    counts = N_RAYS * np.einsum("kiyx,iyx->kyx", form_factor(Optics.of(instrument), height), normal)
     return MicrographStack(counts, axis, axis, instrument, variance=1e-6 * counts, n_rays=N_RAYS)
 
 
@@ -96,51 +97,50 @@ def test_calibration_widens_the_error_bars_of_relief(bshem):
         assert np.median(rec.height_std) < 0.5 * rise(rec)[1]
 
 
-def test_what_is_left_out_of_a_bump_is_an_error_bar(bshem):
-    """A prediction that half of one detector is hidden tilts the bump: the error bar is that change, for all as one."""
+def test_unmodelled_signal_of_a_bump_is_an_error_bar(bshem):
+    """A prediction that half of one detector is masked tilts the bump: the error bar is that change, for all as one."""
     stack = bump_scan(bshem)
 
-    def hidden(height, normals):
+    def masked(height, normals):
         out = nothing(height, normals)
-        out.hidden[0, :, 8:17, 8:17] = 0.5 * SpotGeometry(bshem).form_factor(height[8:17, 8:17])[0]
+        out.masked[0, :, 8:17, 8:17] = 0.5 * form_factor(Optics.of(bshem), height[8:17, 8:17])[0]
         return out
 
     settings = ReconstructSettings.model_validate(
         {"method": "nearfield", "refine": {"gain_std": 1e-9}, "corrections": 0}
     )
-    rec = photometric_heights(stack, settings, SpotGeometry(bshem), hidden)
+    rec = photometric_heights(stack, settings, masked)
     assert rec.height_samples is not None and rec.height_std is not None
     wide = rec.height_std > 5.0
     assert wide.sum() > 30
     one = np.linalg.svd(rec.height_samples[:, wide], compute_uv=False)
     assert one[0] ** 2 > 0.98 * np.sum(one**2)
-    corrected = photometric_heights(stack, settings.changed(corrections=1), SpotGeometry(bshem), hidden)
+    corrected = photometric_heights(stack, settings.changed(corrections=1), masked)
     error = corrected.height - rec.height
     assert np.corrcoef(error[wide], rec.height_samples[0][wide])[0, 1] ** 2 > 0.6
 
 
-def test_left_out_is_the_difference_of_two_renderings(bshem):
-    """Albedo times (n . (near - hidden - used) + multiple). Catches a lost albedo, a wrong sign."""
+def test_unmodelled_signal_is_the_difference_of_two_renderings(bshem):
+    """Albedo times (n . (near - masked - used) + multiple). Catches a lost albedo, a wrong sign."""
     stack = bump_scan(bshem)
-    geometry = SpotGeometry(bshem)
-    used, near = geometry.form_factor(np.zeros((N, N))), geometry.form_factor(np.full((N, N), 50.0))
+    used, near = (form_factor(Optics.of(bshem), np.full((N, N), height)) for height in (0.0, 50.0))
     solution = solve_linear(0.7 * stack.counts / N_RAYS, np.full(stack.counts.shape, 1e-8), used)
     rng = np.random.default_rng(1)
-    prediction = Prediction(rng.uniform(0, 1e-3, stack.counts.shape), 0.1 * near)
-    found = what_is_left_out(solution, used, near, prediction)
+    corrections = Corrections(0.1 * near, rng.uniform(0, 1e-3, stack.counts.shape))
+    found = unmodelled_signal(solution, used, near, corrections)
     lit = lambda phi: solution.albedo * np.einsum("kiyx,yxi->kyx", phi, solution.normals)  # noqa: E731
     inner = (..., slice(2, -2), slice(2, -2))
-    wanted = 0.9 * lit(near) - lit(used) + solution.albedo * prediction.multiple
+    wanted = 0.9 * lit(near) - lit(used) + solution.albedo * corrections.multiple
     np.testing.assert_allclose(found[inner], wanted[inner], rtol=0.02)  # the median of a smooth albedo
 
 
 def test_wild_pixels_correct_little(bshem):
     """A pixel with ten times the albedo counts as its neighbours, and a bright prediction as 30 % of a facing facet."""
     stack = bump_scan(bshem)
-    phi = SpotGeometry(bshem).form_factor(np.zeros((N, N)))
+    phi = form_factor(Optics.of(bshem), np.zeros((N, N)))
     solution = solve_linear(stack.counts / N_RAYS, np.full(stack.counts.shape, 1e-8), phi)
     solution.albedo[12, 12] *= 10.0
-    found = what_is_left_out(solution, phi, phi, Prediction(np.ones(stack.counts.shape), 0.0 * phi))
+    found = unmodelled_signal(solution, phi, phi, Corrections(0.0 * phi, np.ones(stack.counts.shape)))
     np.testing.assert_allclose(found[:, 12, 12], 0.3 * np.linalg.norm(phi[..., 12, 12], axis=1), rtol=0.1)
 
 
@@ -148,14 +148,14 @@ def test_data_are_brought_to_the_flat_only_where_there_is_one(bshem):
     """The border's medians become the told ones; with a free border the data stay as they are."""
     told = flat_scan(bshem, 3).counts
     drawn = told * np.array([1.1, 0.9, 1.0])[:, None, None]
-    np.testing.assert_allclose(as_at_border(drawn, told, ReconstructSettings()), told)
-    assert as_at_border(drawn, told, ReconstructSettings(border="free")) is drawn
+    np.testing.assert_allclose(rescale_to_border(drawn, told, ReconstructSettings()), told)
+    assert rescale_to_border(drawn, told, ReconstructSettings(border="free")) is drawn
 
 
 def test_an_error_of_all_heights_has_deviation_one():
     """Its mean square is the error's, in however few samples."""
     error = np.arange(12.0).reshape(3, 4)
-    np.testing.assert_allclose(np.sqrt(np.mean(also_off_by(np.zeros((3, 3, 4)), error, 5) ** 2, axis=0)), error)
+    np.testing.assert_allclose(np.sqrt(np.mean(add_common_mode(np.zeros((3, 3, 4)), error, 5) ** 2, axis=0)), error)
 
 
 def test_one_correction_nears_the_sphere():
@@ -178,13 +178,12 @@ def test_what_cannot_be_predicted_is_said(bshem):
     """Heights as without corrections, no error bars, and the status says why."""
 
     def fails(height, normals):
-        raise GuardError("too rough")
+        raise PredictionError("too rough")
 
     stack = bump_scan(bshem)
-    geometry = SpotGeometry(bshem)
-    rec = photometric_heights(stack, ReconstructSettings(method="nearfield"), geometry, fails)
-    plain = photometric_heights(stack, ReconstructSettings(method="nearfield"), geometry)
+    rec = photometric_heights(stack, ReconstructSettings(method="nearfield"), fails)
+    plain = photometric_heights(stack, ReconstructSettings(method="nearfield"))
     np.testing.assert_array_equal(rec.height, plain.height)
     assert rec.height_std is None and "too rough" in rec.status and plain.height_std is None
-    linear = photometric_heights(stack, ReconstructSettings(method="linear"), geometry, fails)
+    linear = photometric_heights(stack, ReconstructSettings(method="linear"), fails)
     assert linear.height_std is None and "no error bars" in linear.status

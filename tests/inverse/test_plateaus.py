@@ -1,16 +1,17 @@
 """Plateaus: found in images made up for the purpose, put to the level a made-up misfit asks for, and a real trench."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 import pytest
 
-from helio_jax.errors import GuardError
+from helio_jax.errors import PredictionError
+from helio_jax.forward.surface import Surface
 from helio_jax.inverse import methods as solve
 from helio_jax.inverse.levels import GAIN, Levels, at_level, search_levels
 from helio_jax.inverse.regions import find_plateaus, joined, unexplained
-from helio_jax.inverse.residuals import Surface
+from helio_jax.inverse.residuals import NAMES, Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
@@ -92,7 +93,7 @@ def test_a_level_that_cannot_be_predicted_is_passed_over():
     def misfit(surface):
         level = surface.height[INSIDE].mean()
         if level > 0.0:
-            raise GuardError("too steep")
+            raise PredictionError("too steep")
         return 1e4 + 0.3 * (level + 120.0) ** 2, surface
 
     ground = Surface(*np.zeros((3, *SHAPE)))
@@ -129,7 +130,7 @@ def test_the_wall_that_the_beam_sees(way, axis, level):
     slopes = found.slope_x, found.slope_y
     np.testing.assert_allclose(slopes[1 - axis][INSIDE], np.where(wall < abs(level), 1.0 / shift, 0.0))
     assert not slopes[axis][INSIDE].any()
-    for field, before in zip(found, ground, strict=True):
+    for field, before in zip(*map(jax.tree.leaves, (found, ground)), strict=True):
         np.testing.assert_array_equal(field[~INSIDE], before[~INSIDE])
     undercut = at_level(INSIDE, ground, level, 5.0, (4.0, 4.0), None)
     assert np.all(undercut.height[INSIDE] == 5.0 + level) and not undercut.slope_x[INSIDE].any()
@@ -176,7 +177,7 @@ class _Fit:
 
     surface: Surface
     residuals: np.ndarray
-    values: Mapping[str, np.ndarray]
+    parameters: Parameters
     status: str = "first"
     is_interrupted: bool = False
 
@@ -190,35 +191,34 @@ def test_a_plateau_that_cannot_be_fitted_is_flagged(bshem, monkeypatch):
     axis_y, axis_x = (20.0 * (np.arange(n) - 0.5 * (n - 1)) for n in SHAPE)
     stack = MicrographStack(1e6 * signal, axis_x, axis_y, bshem, variance=1e12 * variance, n_rays=1e6)
     start = Surface(*np.zeros((3, *SHAPE)))
-    fits = iter([_Fit(start, np.random.default_rng(1).normal(size=(3, *SHAPE)) + 3.0 * INSIDE, {})])
+    none = Parameters(**{name: np.zeros(0) for name in NAMES})
+    fits = iter([_Fit(start, np.random.default_rng(1).normal(size=(3, *SHAPE)) + 3.0 * INSIDE, none)])
 
     def fit_heights(*args, **kwargs):
         for fit in fits:
             return fit
-        raise GuardError("too steep")
+        raise PredictionError("too steep")
 
     monkeypatch.setattr("helio_jax.inverse.fit.fit_heights", fit_heights)
     monkeypatch.setattr(solve, "search_levels", lambda region, surface, *args: Levels(surface, [1], []))
-    fit, is_undecided = solve._with_plateaus(
-        stack, ReconstructSettings(), None, lambda n: None, None, start, start, None
-    )
+    fit, is_undecided = solve._with_plateaus(stack, ReconstructSettings(), lambda n: None, None, start, start)
     assert "too steep" in fit.status and fit.status.startswith("first")
     assert np.mean(is_undecided == INSIDE) > 0.99
 
 
-def test_a_start_too_rough_to_predict_is_calmed():
-    """Half-way to the calmer surface as often as needed, three times at most; then the error is the caller's."""
+def test_a_start_too_rough_to_predict_is_smoothed():
+    """Half-way to the smoothed surface as often as needed, three times at most; then the error is the caller's."""
 
     def work(surface, limit):
         if surface.height.max() > limit:
-            raise GuardError("too rough")
+            raise PredictionError("too rough")
         return surface.height.max()
 
-    rough, calm = (Surface(*np.full((3, *SHAPE), value)) for value in (9.0, 1.0))
-    found, surface = solve._retreating(lambda surface: work(surface, 4.0), rough, calm)
+    rough, smooth = (Surface(*np.full((3, *SHAPE), value)) for value in (9.0, 1.0))
+    found, surface = solve._with_backtracking(lambda surface: work(surface, 4.0), rough, smooth)
     assert found == surface.height.max() == 3.0
-    with pytest.raises(GuardError):
-        solve._retreating(lambda surface: work(surface, 1.5), rough, calm)
+    with pytest.raises(PredictionError):
+        solve._with_backtracking(lambda surface: work(surface, 1.5), rough, smooth)
 
 
 @pytest.mark.slow

@@ -8,10 +8,13 @@ from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.inverse.fit import status_of
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import Corrections
+from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
+from helio_jax.inverse.convergence import status_of
 from helio_jax.inverse.linear import solve_known_albedo, solve_linear
-from helio_jax.inverse.residuals import Prediction
+from helio_jax.inverse.problem import linearised_in_normal
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
@@ -28,7 +31,7 @@ def bump_stack(instrument, amplitude=60.0, n=48):
     a, b = -height * (gx - 200) / 250.0**2, -height * (gy - 300) / 250.0**2
     normal = np.stack(normal_of_slopes(a, b, instrument.beam_shift), -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    counts = 1e6 * np.einsum("kiyx,yxi->kyx", SpotGeometry(instrument).form_factor(height), normal)
+    counts = 1e6 * np.einsum("kiyx,yxi->kyx", form_factor(Optics.of(instrument), height), normal)
     stack = MicrographStack(counts, axis, axis, instrument, variance=np.maximum(counts, 1.0), n_rays=1e6)
     return stack, height, normal
 
@@ -56,7 +59,7 @@ def test_solve_linear_is_exact_and_marks_few_images(bshem):
     stack, height, normal = bump_stack(bshem)
     signal = stack.counts / stack.n_rays
     signal[0, :5] = np.nan
-    phi = SpotGeometry(bshem).form_factor(height)
+    phi = form_factor(Optics.of(bshem), height)
     solved = solve_linear(signal, np.full(signal.shape, 1e-8), phi)
     assert np.allclose(solved.normals[5:], normal[5:], atol=1e-9)
     assert np.all(solved.normals[:5] == [0, 0, 1]) and np.all(solved.weight[:5] == 0)
@@ -138,21 +141,22 @@ def test_known_albedo_solution_is_exact_even_with_two_images(bshem):
     signal = stack.counts / stack.n_rays
     signal[0, :10] = np.nan
     flat = np.broadcast_to([0.0, 0.0, 1.0], normal.shape)
-    phi = SpotGeometry(bshem).form_factor(height)
+    phi = form_factor(Optics.of(bshem), height)
     slopes, covariance = solve_known_albedo(signal, np.full(signal.shape, 1e-14), phi, flat, bshem.beam_shift)
     a, b, _ = slopes_of_normal(normal, bshem.beam_shift)
     assert np.allclose(slopes, [a, b], atol=1e-4)
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
-def test_prediction_about_a_normal_changes_nothing_there():
+def test_corrections_about_a_normal_change_nothing_there():
     """The linear model of the own normal is exact at that normal and darkens a facet that turns towards level."""
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(4, 5, 3)) + [0, 0, 2]
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    was = Prediction(rng.uniform(0, 1, (3, 4, 5)), rng.normal(size=(3, 3, 4, 5)))
-    near = was.about(normals)
-    value = lambda p, n: p.multiple - np.einsum("kiyx,yxi->kyx", p.hidden, n)  # noqa: E731
+    multiple = rng.uniform(0, 1, (3, 4, 5))
+    was = Corrections(rng.normal(size=(3, 3, 4, 5)), multiple)
+    near = Corrections(*linearised_in_normal(was, normals))
+    value = lambda c, n: c.multiple - np.einsum("kiyx,yxi->kyx", c.masked, n)  # noqa: E731
     assert np.allclose(value(near, normals), value(was, normals))
     level = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
     is_steep = normals[..., 2] < 0.9

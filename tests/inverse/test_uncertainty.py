@@ -1,5 +1,6 @@
 """Error bars: against dense algebra, against repeated noise, and where nothing fixes a height."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
 
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.surface import Surface
 from helio_jax.inverse.posterior import (
     Linearised,
     ModelError,
@@ -15,14 +18,13 @@ from helio_jax.inverse.posterior import (
     linearise,
     sample_posterior,
 )
-from helio_jax.inverse.problem import Refiner
+from helio_jax.inverse.problem import FitProblem, FitState, freeze
 from helio_jax.inverse.quality import floating, regions
-from helio_jax.inverse.residuals import Surface
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.workflows import pipeline
 
 
-def random_problem(shape=(4, 5), n_parameters=3, n_plateaus=2, seed=0) -> Linearised:
+def random_problem(shape=(4, 5), n_parameters=3, n_common=2, seed=0) -> Linearised:
     rng = np.random.default_rng(seed)
     n = 3 * shape[0] * shape[1]
     matrix = sparse.random(5 * n, n, density=0.1, random_state=1, format="csr") + sparse.vstack(
@@ -31,9 +33,9 @@ def random_problem(shape=(4, 5), n_parameters=3, n_plateaus=2, seed=0) -> Linear
     instrument = matrix @ rng.normal(size=(n, n_parameters)) + 0.1 * rng.normal(size=(5 * n, n_parameters))
     rows = sparse.vstack([matrix, sparse.csr_matrix((n_parameters, n))], format="csr")
     names = tuple(f"p[{i}]" for i in range(n_parameters))
-    far = 0.3 * rng.normal(size=(5 * n + n_parameters, n_plateaus))
-    plateau = rng.normal(size=(n, n_plateaus))
-    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), far, plateau, names, shape)
+    common = 0.3 * rng.normal(size=(5 * n + n_parameters, n_common))
+    weights = rng.normal(size=(n, n_common))
+    return Linearised(rows, np.vstack([instrument, np.eye(n_parameters)]), common, weights, names, shape)
 
 
 def test_samples_have_the_dense_covariance():
@@ -47,7 +49,7 @@ def test_samples_have_the_dense_covariance():
     assert np.allclose(found.height_std.ravel(), np.sqrt(np.diag(exact)), rtol=0.025)
     sampled = np.cov(found.samples.reshape(20_000, -1).T)
     assert np.abs(sampled - exact).max() < 5 * exact.max() / np.sqrt(20_000)
-    dense = linear.surface.toarray() + linear.far @ linear.plateau.T
+    dense = linear.surface.toarray() + linear.common @ linear.weights.T
     fixed = np.linalg.inv(dense.T @ dense)[::3, ::3]
     assert (np.sqrt(np.diag(exact) / np.diag(fixed)) > 1.05).any()
 
@@ -56,17 +58,17 @@ def test_response_is_what_a_forced_parameter_does():
     """Minimising with one parameter forced to 1 and the others held moves the heights by `response`, exactly."""
     linear = random_problem()
     found = sample_posterior(linear, 1)
-    dense = linear.surface.toarray() + linear.far @ linear.plateau.T
+    dense = linear.surface.toarray() + linear.common @ linear.weights.T
     moved = np.linalg.lstsq(dense, -linear.instrument[:, 1], rcond=None)[0]
     assert np.allclose(found.response[1].ravel(), moved[::3], atol=1e-10)
 
 
 def test_regions_and_floating():
     """A plateau cut off all around floats if its level is uncertain, and not if something fixes it."""
-    intact_x, intact_y = np.ones((12, 11)), np.ones((11, 12))
-    intact_x[4:8, 3] = intact_x[4:8, 7] = 0.0
-    intact_y[3, 4:8] = intact_y[7, 4:8] = 0.0
-    region = regions(intact_x, intact_y)
+    joined_x, joined_y = np.ones((12, 11)), np.ones((11, 12))
+    joined_x[4:8, 3] = joined_x[4:8, 7] = 0.0
+    joined_y[3, 4:8] = joined_y[7, 4:8] = 0.0
+    region = regions(joined_x, joined_y)
     inside = np.zeros((12, 12), bool)
     inside[4:8, 4:8] = True
     assert np.array_equal(region == 1, inside) and np.all(region[~inside] == 0)
@@ -74,11 +76,11 @@ def test_regions_and_floating():
     height = 100.0 * inside
     assert np.array_equal(floating(height, 50.0 * level, region), inside)
     assert not floating(height, 2.0 * level, region).any()
-    bent = np.zeros((1, *height.shape))
-    bent[0, 0] = -0.25 * np.ptp(height)
-    found = floating(height, 2.0 * level, region, bent + 1000.0)  # all heights together are no relief
+    shifted = np.zeros((1, *height.shape))
+    shifted[0, 0] = -0.25 * np.ptp(height)
+    found = floating(height, 2.0 * level, region, shifted + 1000.0)  # all heights together are no relief
     assert found[0].all() and not found[1:].any()
-    assert not floating(height, 2.0 * level, region, 0.7 * bent).any()
+    assert not floating(height, 2.0 * level, region, 0.7 * shifted).any()
 
 
 def test_pulls_of_repeated_noise(bshem):
@@ -107,21 +109,27 @@ def test_pulls_of_repeated_noise(bshem):
     assert jax.config.read("jax_enable_x64") is False
 
 
+def level_fit(instrument, shape):
+    """Return unknowns and fixed terms of a fit to a level surface with 3 % noise."""
+    level = Surface(*np.zeros((3, *shape)))
+    signal = form_factor(Optics.of(instrument), level.height)[:, 2]
+    known = signal, (0.03 * signal) ** 2, instrument, Raster.regular(shape, 30.0), level, ReconstructSettings()
+    problem = FitProblem.of(*known)
+    return freeze(problem, FitState.at(problem, level), 8.0, 4.0)
+
+
 def test_a_pixel_that_nothing_fixes_has_a_large_deviation(bshem):
     """All four edges cut and no datum left: an error bar of millimetres, no singular matrix."""
     shape = (5, 6)
-    geometry = SpotGeometry(bshem)
-    signal = geometry.form_factor(np.zeros(shape))[:, 2]
-    surface, settings = Surface(*np.zeros((3, *shape))), ReconstructSettings()
-    refiner = Refiner(signal, (0.03 * signal) ** 2, geometry, 30.0, 30.0, surface, settings)
     with jax.enable_x64(True):
-        unknowns, lagged = jax.tree.map(jnp.asarray, refiner.lag(8.0, 4.0))
-        cut = {
-            "edge_x": lagged.edge_x.at[2, 2:4].set(0.0),
-            "edge_y": lagged.edge_y.at[1:3, 3].set(0.0),
-            "inverse_sigma": lagged.inverse_sigma.at[:, 2, 3].set(0.0),
-        }
-        found = sample_posterior(linearise(refiner.model, unknowns, lagged._replace(**cut)), 200)
+        unknowns, fixed = jax.tree.map(jnp.asarray, level_fit(bshem, shape))
+        cut = (
+            fixed.edges.inverse_std_x.at[2, 2:4].set(0.0),
+            fixed.edges.inverse_std_y.at[1:3, 3].set(0.0),
+            fixed.inverse_sigma.at[:, 2, 3].set(0.0),
+        )
+        fixed = eqx.tree_at(lambda f: (f.edges.inverse_std_x, f.edges.inverse_std_y, f.inverse_sigma), fixed, cut)
+        found = sample_posterior(linearise(unknowns, fixed), 200)
     assert found.height_std[2, 3] > 1e4
     others = np.ones(shape, bool)
     others[2, 3] = False
@@ -165,14 +173,8 @@ def test_independent_errors_change_nothing(bshem):
     With a length of a third of the raster the heights' deviations must grow: errors that agree do not average.
     """
     shape = (20, 21)
-    geometry = SpotGeometry(bshem)
-    signal = geometry.form_factor(np.zeros(shape))[:, 2]
-    refiner = Refiner(
-        signal, (0.03 * signal) ** 2, geometry, 30.0, 30.0, Surface(*np.zeros((3, *shape))), ReconstructSettings()
-    )
-    with jax.enable_x64(True):
-        linear = linearise(refiner.model, *refiner.lag(8.0, 4.0))
-    share = np.full(signal.shape, 0.5)
+    linear = linearise(*level_fit(bshem, shape))
+    share = np.full((3, *shape), 0.5)
     plain = sample_posterior(linear, 200)
     apart = sample_posterior(linear, 200, error=ModelError(share, (0.0, 0.0)))
     wide = sample_posterior(linear, 200, error=ModelError(share, (7.0, 7.0)))
