@@ -4,11 +4,12 @@ from pathlib import Path
 from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.radiosity import Radiosity, transfer
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.radiosity import plan_radiosity, radiosity, transfer
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
 from helio_jax.trace.denoise import smooth_along_surface
@@ -23,12 +24,12 @@ SIDE = Detector(name="side", polar_deg=40.0, half_angle_deg=10.0)
 
 def row_sums(height: np.ndarray, normals: np.ndarray, pitch_um: float, n_azimuths: int = 32) -> np.ndarray:
     """Return the sum of each pixel's form factors [y, x] under a beam along z."""
-    x, y = (pitch_um * (np.arange(n) - n // 2) for n in height.shape[::-1])
-    instrument = Instrument(plate=Plate(working_distance_um=4000.0), detector=(SIDE,))
-    model = Radiosity(SpotGeometry(instrument), x, y, n_azimuths=n_azimuths)
-    plan = model.plan(height, normals)
+    raster = Raster(*(pitch_um * (np.arange(n) - n // 2) for n in height.shape[::-1]))
+    optics = Optics.of(Instrument(plate=Plate(working_distance_um=4000.0), detector=(SIDE,)))
+    plan = plan_radiosity(height, normals, optics, raster, n_azimuths=n_azimuths)
     with jax.enable_x64(True):
-        weight, _ = transfer(height, normals, model.directions, plan, model.geometry, model.pitch)
+        inputs = jax.tree.map(jnp.asarray, (height, normals, optics, (pitch_um, pitch_um), plan))
+        weight, _ = transfer(*inputs)
     count = np.bincount(plan.strips.receiver.ravel(), np.asarray(weight).ravel(), height.size)
     return count[: height.size].reshape(height.shape)
 
@@ -117,7 +118,9 @@ def test_trench_against_tracer():
     )  # fmt: skip
     assert np.all(np.abs(ours.mean((1, 2)) / traced.mean((1, 2)) - 1.0) < 0.04)
     assert abs(ours.mean() / traced.mean() - 1.0) < 0.02
-    model = Radiosity(SpotGeometry(stack.instrument), stack.x, stack.y, size)
-    plan = model.plan(height, normals)
-    blind = np.asarray(model.multiple(height, normals, plan._replace(visible=np.ones_like(plan.visible))))
+    optics, raster = Optics.of(stack.instrument), Raster.of(stack)
+    plan = plan_radiosity(height, normals, optics, raster, substrate_um=size)
+    with jax.enable_x64(True):
+        plan = plan._replace(visible=np.ones_like(plan.visible))
+        blind = np.asarray(radiosity(height, normals, optics, raster, plan))
     assert blind.mean() > 1.06 * traced.mean()

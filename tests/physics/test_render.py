@@ -4,12 +4,12 @@ The two share no kernel: the tracer follows rays to exact spheres in NumPy and n
 form factor on quads of corner heights in JAX.
 """
 
-import jax
 import numpy as np
 import pytest
 
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.render import render_single
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import single_scattering
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.shapes import Sphere, SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres
@@ -53,14 +53,11 @@ def test_render_is_the_tracers_single_scattering(instrument):
     grid_x, grid_y = (g.ravel() for g in np.meshgrid(x, y))
     tally = trace_pixels(make_experiment(body, instrument, TraceSettings(rays=8)), grid_x, grid_y)
     traced = tally.probability()[0][0].reshape(-1, y.size, x.size)
-    geometry, hidden = SpotGeometry(instrument), np.zeros((3, 3, y.size, x.size))
+    optics = Optics.of(instrument)
     height, normal = cap(instrument, x, y)
-    with jax.enable_x64(True):
-        rendered = np.asarray(render_single(height, normal, hidden, geometry))
-        mirrored = np.asarray(
-            render_single(height.T, normal[[1, 0, 2]].swapaxes(1, 2), hidden.swapaxes(2, 3), geometry)
-        )
-        far = np.asarray(render_single(np.zeros_like(height), normal, hidden, geometry))
+    rendered = single_scattering(form_factor(optics, height), normal)
+    mirrored = single_scattering(form_factor(optics, height.T), normal[[1, 0, 2]].swapaxes(1, 2))
+    far = single_scattering(form_factor(optics, np.zeros_like(height)), normal)
     assert np.abs(rendered / traced - 1.0).max() < 1e-9
     assert np.abs(mirrored.swapaxes(1, 2) / traced - 1.0).max() > 0.03
     assert np.abs(far / traced - 1.0).max() > 0.03

@@ -1,14 +1,17 @@
-"""The hidden part of the form factor: against area quadrature in the lab frame and against the tracer's rays.
+"""The masked part of the form factor: against area quadrature in the lab frame and against the tracer's rays.
 
 The quadrature knows no beam frame: it integrates over the part of an ellipse beyond a line of the plate, in float64.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.forward.masking import hidden_form_factor, hidden_response
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.surface import Surface, normal_of_slopes, slopes_of_normal
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.surfaces import first_hit_spheres, surface_body
 from helio_jax.trace.intersect import Intersector
@@ -16,6 +19,13 @@ from helio_jax.trace.masks import masked_form_factor as hidden_by_rays
 
 PITCH = (12.0, 9.0)
 """Raster pitch dx, dy, um: unequal, so that exchanged axes show."""
+
+
+def masked(surface: Surface, instrument: Instrument, dx: float = PITCH[0], dy: float = PITCH[1], **options):
+    """Compute the masked form factors [detector, 3, y, x] in float64."""
+    with jax.enable_x64(True):
+        raster = Raster.regular(surface.height.shape, dx, dy)
+        return np.asarray(masked_form_factor(surface, Optics.of(instrument), raster, **options))
 
 
 def make_instrument(azimuth_deg: float = 35.0, incidence_deg: float = 25.0) -> Instrument:
@@ -65,7 +75,7 @@ def test_straight_wall(axis, share):
     the wall half a pixel off (1 %), exchanged pitches, a horizon that forgets the point's own height.
     """
     instrument, low, ahead, half = make_instrument(), 30.0, 12, 60
-    geometry, shift = SpotGeometry(instrument), instrument.beam_shift
+    shift = instrument.beam_shift
     aperture, point = instrument.apertures()[axis], instrument.spot_position(low)
     depth = instrument.working_distance - point[2]
     distance = (ahead - 0.5) * PITCH[axis]
@@ -83,8 +93,7 @@ def test_straight_wall(axis, share):
     flat = np.zeros_like(height)
 
     def ours(n_slices):
-        hidden = hidden_form_factor(height, flat, flat, geometry, *PITCH, n_slices=n_slices)
-        return np.asarray(hidden)[axis, :, half, half]
+        return masked(Surface(height, flat, flat), instrument, n_slices=n_slices)[axis, :, half, half]
 
     assert relative_error(ours(12), exact, whole) < {0.0: 1e-300, 1.0: 1e-12}.get(share, 4e-3)
     assert relative_error(ours(192), exact, whole) < 4e-5
@@ -103,7 +112,7 @@ def test_own_horizon(k, turn_deg, incidence):
     frame (> 5 %), a normal of the wrong sign (all or nothing), a march along the wrong azimuth.
     """
     instrument, n = make_instrument(incidence_deg=incidence), 25
-    geometry, shift, depth = SpotGeometry(instrument), instrument.beam_shift, instrument.sample_distance
+    shift, depth = instrument.beam_shift, instrument.sample_distance
     middle = np.asarray(instrument.apertures()[k].center) - instrument.pinhole_center[:2]
     turn = np.arctan2(middle[1], middle[0]) + np.radians(turn_deg)
     uphill = np.array([np.cos(turn), np.sin(turn)])
@@ -114,8 +123,8 @@ def test_own_horizon(k, turn_deg, incidence):
     flat = np.zeros((n, n))
 
     def ours(height, slopes, n_slices=12):
-        hidden = hidden_form_factor(height, flat + slopes[0], flat + slopes[1], geometry, *PITCH, n_slices=n_slices)
-        return np.asarray(hidden)[k, :, n // 2, n // 2]
+        surface = Surface(height, flat + slopes[0], flat + slopes[1])
+        return masked(surface, instrument, n_slices=n_slices)[k, :, n // 2, n // 2]
 
     assert relative_error(ours(flat, slopes), exact, whole) < 4e-3
     assert relative_error(ours(flat, slopes, 192), exact, whole) < 4e-5
@@ -133,11 +142,9 @@ def test_aperture_overhead():
     """
     detector = Detector(name="zenith", center_um=(150.0, 0.0), axes_um=(2000.0, 1400.0), rotation_deg=30.0)
     instrument = Instrument(plate=Plate(working_distance_um=3000.0), detector=(detector,))
-    geometry, flat = SpotGeometry(instrument), np.zeros((2, 2))
-    whole = geometry.form_factor(np.zeros(1))[0, :, 0]
-    halves = [
-        np.asarray(hidden_form_factor(flat, flat + slope, flat, geometry, *PITCH))[0, :, 0, 0] for slope in (1e9, -1e9)
-    ]
+    flat = np.zeros((2, 2))
+    whole = form_factor(Optics.of(instrument), np.zeros(1))[0, :, 0]
+    halves = [masked(Surface(flat, flat + slope, flat), instrument)[0, :, 0, 0] for slope in (1e9, -1e9)]
     assert relative_error(halves[0], beyond_line(instrument, 0, 0.0, np.array([1.0, 0.0]), 0.0), whole) < 1e-2
     assert relative_error(halves[0] + halves[1], whole, whole) < 1e-8
 
@@ -162,21 +169,22 @@ def test_sphere_a_against_rays(bshem):
     rays, _ = hidden_by_rays(Intersector(body), bshem, point, normal.reshape(-1, 3), on_mesh, offset, 400)
     rays = np.moveaxis(rays.reshape(-1, n, n, 3), -1, 1)
     slope_x, slope_y, _ = slopes_of_normal(normal, bshem.beam_shift)
-    on_flat = SpotGeometry(bshem).form_factor(np.zeros(1))[:, 2]
+    on_flat = form_factor(Optics.of(bshem), np.zeros(1))[:, 2]
+    surface = Surface(height, slope_x, slope_y)
 
-    def difference(hidden):
-        return np.einsum("kiyx,yxi->kyx", np.asarray(hidden) - rays, normal) / on_flat[:, None]
+    def difference(found):
+        return np.einsum("kiyx,yxi->kyx", found - rays, normal) / on_flat[:, None]
 
     def rms(error):
         return float(np.sqrt(np.mean(error**2)))
 
-    ours = difference(hidden_form_factor(height, slope_x, slope_y, SpotGeometry(bshem), dx, dy))
+    ours = difference(masked(surface, bshem, dx, dy))
     assert rms(ours) < 2.5e-3
     assert np.sort(np.abs(ours), axis=None)[-11] < 5e-3
     assert np.quantile(np.abs(ours), 0.99) < 1e-3
     beam = bshem.beam.model_copy(update={"azimuth_deg": 180.0})
-    mirrored = SpotGeometry(bshem.model_copy(update={"beam": beam}))
-    assert rms(difference(hidden_form_factor(height, slope_x, slope_y, mirrored, dx, dy))) > 1e-2
+    mirrored = bshem.model_copy(update={"beam": beam})
+    assert rms(difference(masked(surface, mirrored, dx, dy))) > 1e-2
     assert rms(difference(np.zeros_like(rays))) > 1e-2
 
 
@@ -192,10 +200,15 @@ def test_a_ray_beside_a_wall_stays_finite(rise, turns):
         plate=Plate(working_distance_um=4000.0),
         detector=(Detector(name="d", center_um=(2300.0, 0.0), axes_um=(1300.0, 900.0)),),
     )
-    geometry, height = SpotGeometry(instrument), np.zeros((31, 31))
+    height = np.zeros((31, 31))
     height[10:20, 8:24] = rise
     height, flat = np.rot90(height, turns), np.zeros((31, 31))
-    hidden = np.asarray(hidden_form_factor(height, flat, flat, geometry, 20.0, 20.0, n_slices=11))
-    assert np.all(np.isfinite(hidden)) and hidden[0, 2].max() > 0.0
-    change = (height != 0.0).astype(float)
-    assert np.all(np.isfinite(np.asarray(hidden_response(height, flat, flat, geometry, 20.0, 20.0, change))))
+    surface, change = Surface(height, flat, flat), Surface((height != 0.0).astype(float), flat, flat)
+    optics, raster = Optics.of(instrument), Raster.regular(height.shape, 20.0)
+    with jax.enable_x64(True):
+        at, along = ((jax.tree.map(jnp.asarray, s),) for s in (surface, change))
+        found, response = map(
+            np.asarray, jax.jvp(lambda s: masked_form_factor(s, optics, raster, n_slices=11), at, along)
+        )
+    assert np.all(np.isfinite(found)) and found[0, 2].max() > 0.0
+    assert np.all(np.isfinite(response))
