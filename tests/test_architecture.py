@@ -161,7 +161,7 @@ def test_imports_and_size(path):
     ("place", "source"),
     [
         ("inverse/fit.py", "from helio_jax.scores.metrics import Truth"),
-        ("trace/run.py", "from helio_jax.forward.render import render_single"),
+        ("trace/run.py", "from helio_jax.forward.render import render"),
         ("scene/scan.py", "import helio_jax.workflows.pipeline"),
         ("scores/metrics.py", "import h5py"),
         ("measure/facets.py", "import plotly.graph_objects as go"),

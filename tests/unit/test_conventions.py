@@ -12,6 +12,7 @@ from helio_jax.forward.beam_frame import normal_of_slopes, slopes_of_normal
 from pydantic import BaseModel
 
 import helio_jax as hx
+from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS, Reconstruction

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from helio_jax.detector import Aperture, Detector, cone_ellipse
-from helio_jax.forward.form_factor import SpotGeometry
-from helio_jax.instrument import POLAR_STD_DEG, Beam, Instrument, Plate, Uncertainty
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.instrument import Beam, Instrument, Plate
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:
@@ -121,7 +122,7 @@ def test_directions_are_those_of_the_form_factor(sample_distance):
     """
     wide = make_instrument(sample_distance=sample_distance)
     small = wide.model_copy(update={"detector": (wide.detector[0].model_copy(update={"half_angle_deg": 0.5}),)})
-    phi = np.asarray(SpotGeometry(small).form_factor(np.zeros((1, 1))))[0, :, 0, 0]
+    phi = form_factor(Optics.of(small), np.zeros((1, 1)))[0, :, 0, 0]
     np.testing.assert_allclose(small.directions()[0], phi[:2] / phi[2], atol=2e-4)
 
 

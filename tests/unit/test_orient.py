@@ -21,7 +21,8 @@ from helio_jax.alignment.orientation import (
     turn_stack,
 )
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor, substrate_signal
+from helio_jax.forward.optics import Optics
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.inverse.consistency import misfit
 from helio_jax.inverse.settings import ReconstructSettings
@@ -154,8 +155,8 @@ def test_ties_cost_the_same(spheres):
     Catches ties of the wrong permutation or orientation, which cost several per cent more or less.
     """
     candidates = [Candidate(t, o) for t in ALL_TURNS for o in orders_tried(spheres.instrument)[0]]
-    geometry = SpotGeometry(spheres.instrument)
-    cost = lambda c: misfit(turn_stack(spheres, c.turn, c.order), geometry, QUICK)  # noqa: E731
+    optics = Optics.of(spheres.instrument)
+    cost = lambda c: misfit(turn_stack(spheres, c.turn, c.order), optics, QUICK)  # noqa: E731
     groups = group_ties(candidates, spheres.instrument)
     assert len(groups) == 24
     costs = [[cost(c) for c in ties] for ties in groups[:6]]
@@ -228,7 +229,7 @@ def test_flat_is_refused(spheres):
     The limit is 5 standard deviations of the cost's own scatter (2 / degrees of freedom), or 20 %. Catches a winner by
     chance.
     """
-    flat = spheres.n_rays * SpotGeometry(spheres.instrument).form_factor(np.zeros(1))[:, 2]
+    flat = spheres.n_rays * substrate_signal(Optics.of(spheres.instrument))[:, None]
     counts = np.random.default_rng(11).poisson(np.broadcast_to(flat[:, :, None], spheres.shape)).astype(float)
     stack = plain(spheres.instrument, counts, spheres.n_rays).replace(variance=np.maximum(counts, 1.0))
     found = find_orientation(stack, OrientSettings(finalists=2, mirror=False))
@@ -264,7 +265,7 @@ def test_far_plate_leaves_hills_and_hollows_open(spheres):
     height = 5.0 * (np.exp(-((x - 80) ** 2 + y**2) / width**2) + 0.6 * np.exp(-(x**2 + (y - 200) ** 2) / 120.0**2))
     down, along = np.gradient(height, 20.0)
     normal = np.stack([-along, -down, np.ones_like(x)]) / np.sqrt(1 + along**2 + down**2)
-    mean = 1e6 * np.einsum("kiyx,iyx->kyx", SpotGeometry(instrument).form_factor(height), normal)
+    mean = 1e6 * np.einsum("kiyx,iyx->kyx", form_factor(Optics.of(instrument), height), normal)
     counts = np.random.default_rng(5).poisson(mean).astype(float)
     stack = plain(instrument, counts, 1e6).replace(variance=mean)
     found = find_orientation(stack, OrientSettings(finalists=2))

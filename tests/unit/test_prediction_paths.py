@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from helio_jax.forward.form_factor import SpotGeometry
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import Corrections
 from helio_jax.inverse.methods import START_THRIFT, reconstruct_stack
-from helio_jax.inverse.residuals import Prediction
 from helio_jax.inverse.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.corrections import make_predictor
@@ -30,14 +31,14 @@ def test_only_the_start_is_predicted_with_fewer_paths(bshem):
     """Four photometric solutions with a quarter of the paths, the round of the fit with all of them."""
     n_paths = 4 * LEAST_PATHS
     axis = 40.0 * np.arange(8.0)
-    counts = 35e3 * SpotGeometry(bshem).form_factor(np.zeros((8, 8)))[:, 2]
+    counts = 35e3 * form_factor(Optics.of(bshem), np.zeros((8, 8)))[:, 2]
     stack = MicrographStack(counts, axis, axis, bshem, variance=counts, n_rays=35e3)
     used = []
 
     def make_predict(asked):
         def predict(height, normals):
             used.append(asked)
-            return Prediction(np.zeros(counts.shape), np.zeros((3, 3, 8, 8)))
+            return Corrections.none(counts.shape)
 
         return predict
 

@@ -3,11 +3,18 @@
 import numpy as np
 import pytest
 
-from helio_jax.inverse.convergence import SLOWEST, aitken, left_to_go
+from helio_jax.inverse.convergence import SLOWEST, aitken, remaining_error
 from helio_jax.inverse.posterior import Posterior
+from helio_jax.inverse.residuals import NAMES as FIELDS
+from helio_jax.inverse.residuals import Parameters
 
 NAMES = ("log_gain[0]", "aim[0, 0]", "aim[1, 0]")
 SHAPE = (4, 5)
+
+
+def parameters(**values: np.ndarray) -> Parameters:
+    """Return parameters of which only those given are unknown."""
+    return Parameters(**{name: values.get(name, np.zeros(0)) for name in FIELDS})
 
 
 def posterior(n_samples: int = 4000) -> Posterior:
@@ -27,12 +34,12 @@ def test_geometry_that_moved_too_far_adds_what_it_did_to_the_heights():
     tell a deviation to 1.1 %. Catches the gain's share forgotten, one error per pixel, and the factor in the bend.
     """
     before = posterior()
-    after = before.widened({"log_gain": np.zeros(1), "aim": np.array([[3.0], [4.0]])}, ("aim",))
+    after = before.inflated(parameters(log_gain=np.zeros(1), aim=np.array([[3.0], [4.0]])), ("aim",))
     factor = np.sqrt(0.5 * (9.0 / 0.99 + 16.0 / 0.96))
-    assert after.widening == pytest.approx(factor)
+    assert after.inflation == pytest.approx(factor)
     bend = np.sqrt(1.0 - factor**-2) * np.array([-0.5 * 3.0 * 8.0, 3.0 * 10.0, -4.0 * 20.0])
-    assert after.bent is not None
-    assert after.bent[0, [0, 1, 2], [0, 1, 2]] == pytest.approx(bend)
+    assert after.common_modes is not None
+    assert after.common_modes[0, [0, 1, 2], [0, 1, 2]] == pytest.approx(bend)
     assert after.height_std[[0, 1, 2], [0, 1, 2]] == pytest.approx(np.hypot(2.0 * factor, bend), rel=0.05)
     assert after.height_std[3, 4] == pytest.approx(2.0 * factor, rel=0.05)
     agree = np.corrcoef(after.samples[:, 1, 1], after.samples[:, 2, 2])[0, 1]
@@ -44,10 +51,10 @@ def test_geometry_that_moved_too_far_adds_what_it_did_to_the_heights():
 def test_geometry_within_what_is_stated_changes_nothing():
     """Catches the bend added to fits whose instrument file is right: theirs are error bars of the data alone."""
     before = posterior(50)
-    after = before.widened({"log_gain": np.ones(1), "aim": np.array([[0.6], [-0.7]])}, ("aim",))
-    assert after.widening == 1.0 and np.array_equal(after.samples, before.samples)
-    assert after.bent is not None and not after.bent.any()
-    assert before.widened({"log_gain": np.full(1, 9.0)}, ("distance",)) is before
+    after = before.inflated(parameters(log_gain=np.ones(1), aim=np.array([[0.6], [-0.7]])), ("aim",))
+    assert after.inflation == 1.0 and np.array_equal(after.samples, before.samples)
+    assert after.common_modes is not None and not after.common_modes.any()
+    assert before.inflated(parameters(log_gain=np.full(1, 9.0)), ("distance",)) is before
 
 
 def test_gains_that_are_off_by_far_widen_too_and_add_to_geometry():
@@ -55,24 +62,26 @@ def test_gains_that_are_off_by_far_widen_too_and_add_to_geometry():
 
     Catches gains that widen every other fit, for they come out by 1.2 of what is expected as often as by 0.8.
     """
-    values = {"log_gain": np.array([1.8]), "aim": np.array([[3.0], [4.0]])}
-    after = posterior(50).widened(values, ("aim",))
-    assert after.widened(values, ("log_gain",), 2.0) is after
-    further = after.widened(values | {"log_gain": np.array([5.0])}, ("log_gain",), 2.0)
-    alone = posterior(50).widened(values | {"log_gain": np.array([5.0])}, ("log_gain",), 2.0)
-    assert after.widening > 2.0 and alone.widening > 2.0
-    left = 0.01 * after.widening**2
+    values = parameters(log_gain=np.array([1.8]), aim=np.array([[3.0], [4.0]]))
+    after = posterior(50).inflated(values, ("aim",))
+    assert after.inflated(values, ("log_gain",), 2.0) is after
+    further = after.inflated(values.replaced(log_gain=np.array([5.0])), ("log_gain",), 2.0)
+    alone = posterior(50).inflated(values.replaced(log_gain=np.array([5.0])), ("log_gain",), 2.0)
+    assert after.inflation > 2.0 and alone.inflation > 2.0
+    left = 0.01 * after.inflation**2
     factor = 5.0 / np.sqrt(1.0 - left)
-    assert further.widening == pytest.approx(after.widening * factor)
-    assert further.bent is not None and after.bent is not None
-    np.testing.assert_allclose(further.bent[0], factor * after.bent[0])
-    assert abs(further.bent[1, 0, 0]) > 1.0 and further.bent[1, 2, 2] == 0.0  # the third aim does not follow the gain
+    assert further.inflation == pytest.approx(after.inflation * factor)
+    assert further.common_modes is not None and after.common_modes is not None
+    np.testing.assert_allclose(further.common_modes[0], factor * after.common_modes[0])
+    assert (
+        abs(further.common_modes[1, 0, 0]) > 1.0 and further.common_modes[1, 2, 2] == 0.0
+    )  # the third aim does not follow the gain
 
 
 def test_the_bend_follows_the_raster():
     """Catches a bend left on the thinned raster, where findings and heights would no longer have one shape."""
-    after = posterior(50).widened({"aim": np.array([[3.0], [4.0]])}, ("aim",)).on_raster((8, 10), 2)
-    assert after.bent is not None and after.bent.shape == (1, 8, 10)
+    after = posterior(50).inflated(parameters(aim=np.array([[3.0], [4.0]])), ("aim",)).on_raster((8, 10), 2)
+    assert after.common_modes is not None and after.common_modes.shape == (1, 8, 10)
 
 
 @pytest.mark.parametrize("contraction", [0.2, 0.8])
@@ -83,17 +92,17 @@ def test_what_is_left_of_a_fit_that_converges_geometrically(contraction):
     """
     height = 100.0 * (1.0 - contraction ** np.arange(4))
     changes = np.diff(height)
-    assert left_to_go(list(changes), aitken(changes[-2], changes[-1])) * changes[-1] == pytest.approx(
+    assert remaining_error(list(changes), aitken(changes[-2], changes[-1])) * changes[-1] == pytest.approx(
         100.0 - height[-1]
     )
 
 
 def test_what_is_left_of_other_fits():
     """A single round, none left, two that diverge, the last by swinging. Catches infinite and negative error bars."""
-    assert left_to_go([7.0], 1.0) == 1.0
-    assert left_to_go([0.0, 0.0], np.inf) == 1.0
-    assert left_to_go([1.0, 3.0], aitken(1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
-    assert left_to_go([1.0, 3.0], aitken(1.0, -3.0)) == 1.0
+    assert remaining_error([7.0], 1.0) == 1.0
+    assert remaining_error([0.0, 0.0], np.inf) == 1.0
+    assert remaining_error([1.0, 3.0], aitken(1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
+    assert remaining_error([1.0, 3.0], aitken(1.0, -3.0)) == 1.0
 
 
 def test_an_error_of_all_heights_is_added_in_squares():
@@ -101,22 +110,22 @@ def test_an_error_of_all_heights_is_added_in_squares():
     error = np.zeros(SHAPE)
     error[0, 0], error[3, 3] = 6.0, -8.0
     before = posterior()
-    after = before.also_off_by(error)
-    assert after.bent is not None
-    np.testing.assert_allclose(after.bent[0], error)
+    after = before.with_common_mode(error)
+    assert after.common_modes is not None
+    np.testing.assert_allclose(after.common_modes[0], error)
     np.testing.assert_allclose(after.height_std, np.hypot(2.0, error), rtol=0.06)
     both = 6.0 * -8.0 / np.sqrt((36.0 + 4.0) * (64.0 + 4.0))
     assert np.corrcoef(after.samples[:, 0, 0], after.samples[:, 3, 3])[0, 1] == pytest.approx(both, abs=0.05)
-    twice = after.also_off_by(error)
-    assert twice.bent is not None
-    np.testing.assert_allclose(twice.bent, [error, error])
+    twice = after.with_common_mode(error)
+    assert twice.common_modes is not None
+    np.testing.assert_allclose(twice.common_modes, [error, error])
     np.testing.assert_allclose(twice.height_std, np.hypot(2.0, np.sqrt(2.0) * error), rtol=0.06)
 
 
 def test_one_small_change_among_large_ones_is_no_convergence():
     """Off by a whole change where only the last fall is large. Catches the last ratio alone (0.53 changes for 0.35)."""
-    assert left_to_go([81.0, 92.0, 32.0], aitken(1.0, -0.35)) == 1.0
-    assert left_to_go([81.0, 8.1, 0.81], aitken(1.0, -0.1)) == pytest.approx(1.0 / 9.0)
+    assert remaining_error([81.0, 92.0, 32.0], aitken(1.0, -0.35)) == 1.0
+    assert remaining_error([81.0, 8.1, 0.81], aitken(1.0, -0.1)) == pytest.approx(1.0 / 9.0)
 
 
 def test_error_bars_above_a_tilted_plane():
