@@ -15,9 +15,10 @@ from helio_jax.forward.beam_frame import normal_of_slopes
 from scipy.fft import dctn, idct
 
 from helio_jax.arrays import border_mask
+from helio_jax.forward.render import Corrections
+from helio_jax.forward.surface import normal_of_slopes
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.methods import reconstruct_stack
-from helio_jax.inverse.residuals import Prediction
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
@@ -102,7 +103,7 @@ def band_of_modes(shape: tuple[int, int]) -> np.ndarray:
 
 def fit(counts: np.ndarray, variance: np.ndarray, instrument: Instrument, settings: ReconstructSettings, n_rays: float):
     """Reconstruct counts [detector, y, x] by `refine`, told that nothing is masked or multiply scattered."""
-    nothing = Prediction(np.zeros(counts.shape), np.zeros((len(counts), 3, *counts.shape[1:])))
+    nothing = Corrections.none(counts.shape)
     axis = raster(counts.shape[1])
     stack = MicrographStack(counts, axis, axis, instrument, variance=variance, n_rays=n_rays)
     return reconstruct_stack(stack, settings, lambda _: lambda height, normals: nothing)

@@ -17,10 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 
-from helio_jax.forward.beam_frame import slopes_of_normal  # noqa: E402
-
 from benchmarks.rows import Row, row, write  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
+from helio_jax.forward.surface import slopes_of_normal  # noqa: E402
 from helio_jax.inverse.integrate import integrate_slopes  # noqa: E402
 from helio_jax.inverse.linear import signal_of, solve_linear  # noqa: E402
 from helio_jax.scores.metrics import Truth, evaluate_height  # noqa: E402

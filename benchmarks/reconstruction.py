@@ -13,11 +13,13 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,12 +30,15 @@ sys.path.insert(0, str(ROOT))
 from benchmarks.error_bars import coverage_row, efficiency_row  # noqa: E402
 from benchmarks.rows import with_origin  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
-from helio_jax.forward.form_factor import SpotGeometry  # noqa: E402
-from helio_jax.forward.masking import hidden_form_factor  # noqa: E402
+from helio_jax.forward.form_factor import form_factor  # noqa: E402
+from helio_jax.forward.masking import masked_form_factor  # noqa: E402
+from helio_jax.forward.optics import Optics, Raster  # noqa: E402
+from helio_jax.forward.render import Corrections  # noqa: E402
+from helio_jax.forward.surface import Surface  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
 from helio_jax.inverse.methods import reconstruct_stack  # noqa: E402
-from helio_jax.inverse.problem import Refiner  # noqa: E402
-from helio_jax.inverse.residuals import Prediction, Surface  # noqa: E402
+from helio_jax.inverse.problem import FitProblem, FitState, freeze  # noqa: E402
+from helio_jax.inverse.residuals import residuals  # noqa: E402
 from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
@@ -42,6 +47,7 @@ from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 from helio_jax.workflows.truth import true_height  # noqa: E402
 
 Case = dict[str, Any]
+Patch = AbstractContextManager[Any]
 SCENES = ROOT / "scenes"
 
 
@@ -172,25 +178,25 @@ def growth_row(record: Record, seed: int, sizes: tuple[int, ...]) -> None:
 def gradient_row(record: Record, instrument: Instrument, shape: tuple[int, int]) -> None:
     """Row 6: time and memory of the gradient of what is fitted against those of its value, on a bumpy surface."""
     pitch = 30.0
-    x, y = (pitch * (np.arange(n) - (n - 1) / 2) for n in (shape[1], shape[0]))
-    height = 150.0 * np.cos(x / 400.0) * np.cos(y / 500.0)[:, None]
+    optics, raster = Optics.of(instrument), Raster.regular(shape, pitch)
+    height = 150.0 * np.cos(raster.x / 400.0) * np.cos(raster.y / 500.0)[:, None]
     slope_y, slope_x = np.gradient(height, pitch)
-    geometry, settings = SpotGeometry(instrument), ReconstructSettings()
-    signal = geometry.form_factor(height)[:, 2]
+    signal = form_factor(optics, height)[:, 2]
     surface = Surface(height, slope_x, slope_y)
-    refiner = Refiner(signal, (0.03 * signal) ** 2, geometry, pitch, pitch, surface, settings)
+    problem = FitProblem.of(signal, (0.03 * signal) ** 2, instrument, raster, surface, ReconstructSettings())
+    start = freeze(problem, FitState.at(problem, surface), 8.0, 4.0)
     with jax.enable_x64(True):
-        unknowns, lagged = jax.tree.map(jnp.asarray, refiner.lag(8.0, 4.0))
+        unknowns, terms, surface = jax.tree.map(jnp.asarray, (*start, surface))
 
         def cost(u, fixed):
-            return sum(jnp.sum(r**2) for r in refiner.model.residuals(u, fixed).values())
+            return sum(jnp.sum(r**2) for r in residuals(u, fixed).values())
 
         def masked(at: Surface):
-            return jnp.sum(hidden_form_factor(at.height, at.slope_x, at.slope_y, geometry, pitch, pitch) ** 2)
+            return jnp.sum(masked_form_factor(at, optics, raster) ** 2)
 
         for name, value, given in (
-            ("residuals of the fit", cost, (unknowns, lagged)),
-            ("hidden form factor", masked, (surface,)),
+            ("residuals of the fit", cost, (unknowns, terms)),
+            ("masked form factor", masked, (surface,)),
         ):
 
             def measure(value=value, given=given) -> Case:
@@ -232,15 +238,18 @@ def _bytes_held(compiled: Any) -> float:
     return held.argument_size_in_bytes + held.output_size_in_bytes + held.temp_size_in_bytes
 
 
-class FarField(SpotGeometry):
-    """Detection directions and solid angles of the flat, at every height: the near field switched off."""
+@contextmanager
+def far_field():
+    """Take the form factors of the substrate at every height; what is compiled knows one or the other."""
+    spot = Optics.spot
+    eqx.clear_caches()
+    with mock.patch.object(Optics, "spot", lambda self, height: spot(self, 0.0 * height)):
+        yield
+    eqx.clear_caches()
 
-    def position(self, height):
-        return super().position(0.0 * height)
 
-
-def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Prediction], Prediction], **refine: object):
-    """Return the reconstruction and its time in seconds, with what is predicted changed."""
+def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Corrections], Corrections], **refine: object):
+    """Return the reconstruction and its time in seconds, with changed corrections."""
     chosen = settings_of(scene, refine)
 
     def make_predict(n_rays: int):
@@ -252,31 +261,35 @@ def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Predicti
     return rec, time.perf_counter() - start
 
 
-def without_multiple(prediction: Prediction) -> Prediction:
-    return replace(prediction, multiple=0.0 * prediction.multiple)
+def without_multiple(corrections: Corrections) -> Corrections:
+    return replace(corrections, multiple=0.0 * corrections.multiple)
 
 
-def without_masks(prediction: Prediction) -> Prediction:
-    return replace(prediction, hidden=0.0 * prediction.hidden, response=None)
+def without_masks(corrections: Corrections) -> Corrections:
+    return replace(corrections, masked=0.0 * corrections.masked)
+
+
+def levels_without_masks() -> Patch:
+    """Let no mask follow the level of a plateau."""
+    return mock.patch("helio_jax.inverse.problem.region_responses", lambda *_: ())
 
 
 def ablation_row(record: Record, seed: int, size: int) -> None:
     """Row 9: each piece of physics switched off on spheres A and B; the change of the RMS over all pixels."""
     raster = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": 30.0 * 121 / size}
-    off: dict[str, tuple[dict[str, object], Callable[[Prediction], Prediction]]] = {
-        "all physics": ({}, lambda p: p),
-        "no jumps": ({"jump_limits": (1e9,) * 3}, lambda p: p),
-        "no near field": ({}, lambda p: p),
-        "no masks": ({}, without_masks),
-        "no multiple scattering": ({}, without_multiple),
+    off: dict[str, tuple[dict[str, object], Callable[[Corrections], Corrections], Callable[[], Patch]]] = {
+        "all physics": ({}, lambda c: c, nullcontext),
+        "no jumps": ({"jump_limits": (1e9,) * 3}, lambda c: c, nullcontext),
+        "no near field": ({}, lambda c: c, far_field),
+        "no masks": ({}, without_masks, levels_without_masks),
+        "no multiple scattering": ({}, without_multiple, nullcontext),
     }
     for name in ("sphere_a", "sphere_b"):
-        for case, (refine, change) in off.items():
+        for case, (refine, change, patched) in off.items():
 
-            def work(name=name, case=case, refine=refine, change=change) -> Case:
+            def work(name=name, refine=refine, change=change, patched=patched) -> Case:
                 scene, stack = own(name, seed, **raster)
-                geometry = FarField if case == "no near field" else SpotGeometry
-                with mock.patch("helio_jax.inverse.methods.SpotGeometry", geometry):
+                with patched():
                     rec, seconds = changed(scene, stack, change, samples=0, **refine)
                 full = score(scene, stack, rec, seconds)
                 return {key: full[key] for key in ("rms_all", "rms_valid", "height", "seconds")}
