@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -242,10 +241,10 @@ def _bytes_held(compiled: Any) -> float:
 def far_field():
     """Take the form factors of the substrate at every height; what is compiled knows one or the other."""
     spot = Optics.spot
-    eqx.clear_caches()
+    jax.clear_caches()
     with mock.patch.object(Optics, "spot", lambda self, height: spot(self, 0.0 * height)):
         yield
-    eqx.clear_caches()
+    jax.clear_caches()
 
 
 def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Corrections], Corrections], **refine: object):
