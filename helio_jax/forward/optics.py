@@ -206,9 +206,9 @@ class Optics(eqx.Module):
 
 def _turned_beam(shift: Any, incidence: Any, azimuth: Any) -> Any:
     """Compute the beam shift after changes of incidence and azimuth, differentiable at normal incidence, too."""
-    tan = safe_norm(shift[0], shift[1])
+    tan, more = safe_norm(shift[0], shift[1]), jnp.tan(incidence)
     along = jnp.where(tan > 0.0, shift / jnp.where(tan > 0.0, tan, 1.0), jnp.array([1.0, 0.0], shift.dtype))
-    moved = jnp.tan(jnp.arctan(tan) + incidence) * along
+    moved = (shift + more * along) / (1.0 - tan * more)  # the tangent of a sum; keeps d moved / d shift where tan = 0
     cos, sin = jnp.cos(azimuth), jnp.sin(azimuth)
     return jnp.stack([cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]])
 
