@@ -28,9 +28,9 @@ from benchmarks.rows import Row, row, update, write  # noqa: E402
 from helio_jax.formats.parts import Parts  # noqa: E402
 from helio_jax.trace.job import Job  # noqa: E402
 from helio_jax.trace.run import n_cpus  # noqa: E402
-from helio_jax.trace.scan import Crew  # noqa: E402
+from helio_jax.trace.scan import Executor  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
-from helio_jax.workflows.checkpoint import Keeper  # noqa: E402
+from helio_jax.workflows.checkpoint import CheckpointedRun  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 
 MIB = 1024**2

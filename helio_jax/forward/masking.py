@@ -94,7 +94,7 @@ def masked_form_factor(
 ) -> jax.Array:
     """Compute the part of each aperture's vector form factor that lies below a point's horizon [detector, 3, y, x].
 
-    P = n . (Phi - masked), as with `trace.masks.hidden_form_factor`; exactly 0 where the whole aperture is in view.
+    P = n . (Phi - masked), as with `trace.masks.masked_form_factor`; exactly 0 where the whole aperture is in view.
     Valid for heights below the plate. Differentiable in heights (the point's and the masking ones), slopes, optics and
     pitch; where two samples are seen under the same slope, the nearer one takes the derivative.
 
