@@ -42,6 +42,8 @@ from helio_jax.calibration.self_calibration import (  # noqa: E402
 from helio_jax.errors import GuardError  # noqa: E402
 from helio_jax.formats.matlab import import_micrographs  # noqa: E402
 from helio_jax.formats.points import read_points  # noqa: E402
+from helio_jax.forward.form_factor import substrate_signal  # noqa: E402
+from helio_jax.forward.optics import Optics  # noqa: E402
 from helio_jax.forward.surface import unit_normal  # noqa: E402
 from helio_jax.measure.facets import Facet, FacetSettings, find_facets  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402

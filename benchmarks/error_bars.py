@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from helio_jax.forward.surface import normal_of_slopes
 from scipy.fft import dctn, idct
 
 from helio_jax.arrays import border_mask

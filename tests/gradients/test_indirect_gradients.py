@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helio_jax.forward.surface import normal_of_slopes
 
 from helio_jax.forward import radiosity as indirect
 from helio_jax.forward.optics import Raster

@@ -10,7 +10,7 @@ from helio_jax.forward.render import MIN_COS, Corrections, detection_probability
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse import fit as refine
-from helio_jax.inverse.instrument_report import _plain
+from helio_jax.inverse.instrument_report import plain_name
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import birge_ratio
 from helio_jax.inverse.problem import FitProblem
@@ -51,7 +51,7 @@ def test_parameters_have_plain_names():
         "occluded[]": "occluded",
         "law[0]": "law",
     }
-    assert {name: _plain(name, names) for name in shown} == shown
+    assert {name: plain_name(name, names) for name in shown} == shown
 
 
 @pytest.mark.parametrize("polar_deg, is_free", [(0.0, False), (3.0, True)])

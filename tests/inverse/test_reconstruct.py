@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError

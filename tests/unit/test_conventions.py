@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from pydantic import BaseModel
 
 import helio_jax as hx
