@@ -36,9 +36,11 @@ from helio_jax.forward.render import Corrections  # noqa: E402
 from helio_jax.forward.surface import Surface  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
 from helio_jax.inverse.methods import reconstruct_stack  # noqa: E402
-from helio_jax.inverse.problem import FitProblem, FitState, freeze  # noqa: E402
+from helio_jax.inverse.problem import FitProblem  # noqa: E402
 from helio_jax.inverse.residuals import residuals  # noqa: E402
 from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
+from helio_jax.inverse.state import FitState  # noqa: E402
+from helio_jax.inverse.steps import freeze  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.corrections import make_predictor  # noqa: E402

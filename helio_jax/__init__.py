@@ -21,6 +21,8 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   errors              typed errors and their exit codes
   settings            base class of all settings tables
   kernel              how inner loops are compiled (numba)
+  robust              the robust weight
+  block_fit           least squares with per-pixel unknowns eliminated
   detector            apertures in the plate and cones at infinity
   instrument          beam, plate and detectors, and the geometry that follows from them
   micrograph          MicrographStack, MicrographSet
@@ -36,7 +38,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   placement           scale, rotation and position of any sample
   surfaces            triangles and exact spheres of a sample; closed-form first hits
   body                Body: triangles and spheres with material names
-  runout              continuation of a surface beyond its image
+  border              continuation of a surface beyond its image
   scattering          the [material] tables: scattering laws
   mtl                 scattering laws in the .mtl file of an OBJ mesh
   plates              plates from mesh files
@@ -70,14 +72,14 @@ trace/                Scene -> MicrographStack by Monte Carlo (NumPy, numba, Emb
   scan                all units of a scan on threads, processes or a cluster
   follow              single atoms (helio rays)
 forward/              heights and optics -> expected counts, differentiable (JAX); no optimiser
-  beam_frame          slopes and normals in the beam frame
+  optics              Optics, Raster: beam, apertures and beam positions as pytrees; moving them
+  surface             Surface: heights and slopes in the beam frame, normals
   form_factor         vector form factor of an elliptical aperture
-  aiming              form factors of misaimed apertures
   horizon             horizon search along a march over the surface
   masking             masked part of each form factor: the shadow mask of a reconstruction
   radiosity           multiple scattering by radiosity
-  readout             drift and scan-line offsets of the detectors
-  render              single-scattering render model
+  readout             Readout: gain, offset, drift, pedestal, scan lines
+  render              hx.render: the render model; the single-scattering law
 inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   settings            the [reconstruct] table
   methods             entry: runs linear, nearfield or refine
@@ -94,8 +96,12 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   levels              level search of such regions
   occlusion           depth jumps where the surface leaves the beam
   residuals           residuals of the fit as a function of its unknowns
-  problem             state of one fit
-  solver              Levenberg-Marquardt; the only door to optimistix
+  problem             FitProblem: data, priors, all that is constant in a fit
+  state               FitState and its corrections: all that changes
+  responses           how corrections follow common changes of the heights
+  steps               one least-squares step: fixed terms, solve
+  solver              inexact Gauss-Newton; the only door to optimistix
+  fisher              hx.fisher: what an experiment would determine
   fit                 outer iterations of the fit
   convergence         convergence error and status of a fit
   posterior           Laplace posterior of heights and slopes
@@ -120,8 +126,7 @@ alignment/            rotated scans onto one raster; orientation of arrays
   views               scans as the automatic alignment reads them
   correlate           normalised cross-correlation with missing data
   resample            images at other positions; several scans on one raster
-  orientation         rotated, mirrored, binned and reordered images
-  arrangement         orientations and orders that a file leaves open
+  orientation         rotated, mirrored and reordered images; what a file leaves open
 scores/               errors against something known
   settings            the [truth] table
   metrics             scores of a reconstruction against the true surface
@@ -139,10 +144,12 @@ measure/              numbers from height maps
   cracks              list of cracks
   walls               list of vertical edges
   crack_text          cracks and edges as text and CSV
-figures/              the only door to matplotlib and plotly
+figures/              pictures
+  canvas              the only door to matplotlib
+  plot_data           arrays that panel and report share
   panel               micrographs, heights, errors and profiles on one page
   report              HTML report
-  interactive         interactive views
+  interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   before_after        a scan before and after calibration
   overlay             overlay of aligned scans; facet map
@@ -183,6 +190,7 @@ workflows/            what joins the stages
   doctor              checks the installation
 commands/             the command line; no logic of its own
   app                 shared options and messages
+  door                checks outputs against inputs before any work
   simulating          run, simulate, rays, resume, study, spot, plate
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient

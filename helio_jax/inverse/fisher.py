@@ -24,8 +24,9 @@ from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.fit import posterior_at
 from helio_jax.inverse.instrument_report import kind_of, plain_name, prior_stds
 from helio_jax.inverse.posterior import Posterior
-from helio_jax.inverse.problem import FitProblem, FitState, set_corrections, with_responses
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState, set_corrections, with_responses
 
 N_SAMPLES = 256
 """Samples of the posterior: standard deviations are known to 4 %."""

@@ -18,21 +18,12 @@ from helio_jax.inverse.convergence import aitken, contraction_of, remaining_erro
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
-from helio_jax.inverse.problem import (
-    FitProblem,
-    FitState,
-    Predict,
-    edges_of,
-    freeze,
-    levelled,
-    misfit,
-    model_share,
-    step,
-    update_corrections,
-)
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState, Predict, update_corrections
+from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, step
 from helio_jax.robust import cauchy_weight
 
 GEOMETRY = "distance", "tilt", "aim"

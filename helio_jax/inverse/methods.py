@@ -21,7 +21,6 @@ from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
-from helio_jax.inverse.problem import linearised_in_normal, prediction_std
 from helio_jax.inverse.quality import (
     FACET_IMAGES,
     TRUSTED,
@@ -35,6 +34,7 @@ from helio_jax.inverse.quality import (
 )
 from helio_jax.inverse.regions import find_plateaus, joined, unexplained
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
+from helio_jax.inverse.state import linearised_in_normal, prediction_std
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -54,7 +54,7 @@ GEOMETRY_WARNING = (
 
 if TYPE_CHECKING:
     from helio_jax.inverse.fit import Fit, Report
-    from helio_jax.inverse.problem import Predict
+    from helio_jax.inverse.state import Predict
 
 
 def reconstruct_stack(

@@ -13,8 +13,10 @@ import jax
 import numpy as np
 
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.problem import FitProblem, FitState, expected, step
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import Parameters
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import expected, step
 
 
 def noise_bias(problem: FitProblem, state: FitState, n_pairs: int) -> tuple[Surface, Parameters]:

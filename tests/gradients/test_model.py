@@ -14,9 +14,11 @@ from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.posterior import linearise
-from helio_jax.inverse.problem import FitProblem, FitState, freeze, update_corrections
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import NAMES, Unknowns, residuals, surface_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.state import FitState, update_corrections
+from helio_jax.inverse.steps import freeze
 from tests.derivatives import adjoint_products, taylor_remainders
 
 SHAPE, PITCH = (9, 11), 30.0

@@ -13,7 +13,7 @@ from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from helio_jax.inverse.convergence import status_of
 from helio_jax.inverse.linear import solve_known_albedo, solve_linear
-from helio_jax.inverse.problem import linearised_in_normal
+from helio_jax.inverse.state import linearised_in_normal
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene

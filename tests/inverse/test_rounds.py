@@ -13,8 +13,10 @@ from helio_jax.forward.render import Corrections, radiosity_corrections, single_
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.convergence import aitken, remaining_error
 from helio_jax.inverse.fit import fit_heights
-from helio_jax.inverse.problem import FitProblem, FitState, expected, set_corrections, update_corrections
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.state import FitState, set_corrections, update_corrections
+from helio_jax.inverse.steps import expected
 
 SHAPE, PITCH = (24, 20), 30.0
 

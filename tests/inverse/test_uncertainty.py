@@ -18,9 +18,11 @@ from helio_jax.inverse.posterior import (
     linearise,
     sample_posterior,
 )
-from helio_jax.inverse.problem import FitProblem, FitState, freeze
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import floating, regions
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import freeze
 from helio_jax.workflows import pipeline
 
 

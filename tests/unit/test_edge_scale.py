@@ -8,9 +8,11 @@ import pytest
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface, normal_of_slopes
-from helio_jax.inverse.problem import FitProblem, FitState, freeze
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import edge_scale
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import freeze
 
 
 def noise(optics, height, gain, sigma):

@@ -5,8 +5,10 @@ import numpy as np
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.problem import FitProblem, FitState, step
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import step
 
 
 def test_albedo_is_fitted_while_gains_are_held(bshem):

@@ -8,7 +8,7 @@ import pytest
 from helio_jax.detector import Aperture, Detector, cone_ellipse
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics
-from helio_jax.instrument import Beam, Instrument, Plate
+from helio_jax.instrument import POLAR_STD_DEG, Beam, Instrument, Plate, Uncertainty
 
 
 def make_instrument(incidence=30.0, azimuth=0.0, sample_distance=4720.0) -> Instrument:

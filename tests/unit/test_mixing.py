@@ -9,10 +9,12 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse import problem as fit_problem
-from helio_jax.inverse.problem import FitProblem, FitState, freeze, step
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import border_residuals, data_residuals
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.solver import free_parameters
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import freeze, step
 
 
 @pytest.mark.parametrize("border", ["free", "flat"])

@@ -12,8 +12,10 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse import problem as fit_problem
 from helio_jax.inverse import residuals
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
-from helio_jax.inverse.problem import FitProblem, FitState, freeze
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import freeze
 
 SHAPE = (20, 20)
 

@@ -1,0 +1,195 @@
+"""The state of a fit, and its corrections: all that changes, as frozen records and pure functions.
+
+Masks and multiple scattering are predicted on the surface of an outer iteration and held until the next one (`Held`),
+but follow, to first order, the geometry, the own normal, and common changes of the heights (`responses`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.render import Corrections, single_scattering
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.residuals import Parameters
+from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
+from helio_jax.inverse.settings import RefineSettings
+
+Predict = Callable[..., Corrections]
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """Corrections and what follows from them, held fixed until the next outer iteration.
+
+    Attributes:
+        corrections: made for `surface`.
+        surface: heights and slopes.
+        masked: masked form factors as a linear model in the own normal [detector, 3, y, x].
+        multiple: the multiple scattering that goes with it [detector, y, x].
+        sigma: standard deviation of the data, prediction errors included, infinite where not observed [detector, y, x].
+        moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
+        moved: the moves at which they were made [move, detector].
+        responses: how they follow common changes of the heights.
+    """
+
+    corrections: Corrections
+    surface: Surface
+    masked: np.ndarray
+    multiple: np.ndarray
+    sigma: np.ndarray
+    moves: np.ndarray
+    moved: np.ndarray
+    responses: tuple[Response, ...] = ()
+
+
+@dataclass(frozen=True)
+class FitState:
+    """All that changes during a fit.
+
+    Attributes:
+        surface: heights and slopes.
+        parameters: unknowns that are not the surface.
+        residuals: (model - data) / standard deviation [detector, y, x].
+        held: corrections of this outer iteration.
+    """
+
+    surface: Surface
+    parameters: Parameters
+    residuals: np.ndarray
+    held: Held
+
+    @classmethod
+    def at(cls, problem: FitProblem, start: Surface) -> "FitState":
+        """Start at a surface, parameters at their prior means, without corrections."""
+        surface = Surface(*(np.asarray(f) for f in (start.height, start.slope_x, start.slope_y)))
+        held = _held(problem, Corrections.none(problem.signal.shape), surface, problem.prior_means())
+        return cls(surface, problem.prior_means(), np.zeros(problem.signal.shape), held)
+
+    def thinned(self, problem: FitProblem, stride: int) -> "FitState":
+        """Keep every `stride`-th row and column, for `problem`, which is thinned."""
+        thin = (slice(None, None, stride),) * 2
+        h, c = self.held, self.held.corrections
+        held = _held(
+            problem,
+            Corrections(
+                c.masked[:, :, *thin],
+                c.multiple[:, *thin],
+                None if c.occluded is None else c.occluded[:, *thin],
+                None if c.normals is None else c.normals[thin],
+            ),
+            jax.tree.map(lambda f: f[thin], h.surface),
+            self.parameters,
+        )
+        held = replace(
+            held,
+            moves=h.moves[..., *thin],
+            moved=h.moved,
+            responses=tuple(r.thinned(thin, stride) for r in h.responses),
+        )
+        lines = self.parameters.lines[:, ::stride]
+        surface = jax.tree.map(lambda f: f[thin], self.surface)
+        return FitState(surface, self.parameters.replaced(lines=lines), self.residuals[:, *thin], held)
+
+
+def linearised_in_normal(corrections: Corrections, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make masks and multiple scattering a linear model of the own normal, about the corrections' or given ones.
+
+    The slope of multiple scattering is added to the masked form factor and changes nothing at the facet's own normal:
+    it only makes the iterations converge faster beside steep walls, where slope and multiple scattering depend on one
+    another (`responses.normal_slope`).
+
+    Args:
+        corrections: of a surface.
+        normals: its unit normals [y, x, 3].
+    """
+    up = (normals if corrections.normals is None else corrections.normals)[..., 2]
+    slope = normal_slope(corrections.multiple, up)
+    masked = np.array(corrections.masked)
+    masked[:, 2] += slope
+    return masked, corrections.multiple + slope * up
+
+
+def prediction_std(corrections: Corrections, normals: np.ndarray, settings: RefineSettings) -> np.ndarray:
+    """Estimate the standard deviation of masks and multiple scattering [detector, y, x], for unit normals [y, x, 3].
+
+    Two parts of each term: a share of its own size, and its change over half a pixel, for the surface that
+    it was made for is only known from pixel to pixel.
+    """
+    masked = single_scattering(corrections.masked, np.moveaxis(normals, -1, 0))
+    terms = (masked, settings.mask_error), (corrections.multiple, settings.multiple_error)
+    parts = [share * image + 1j * 0.5 * _largest_change(image) for image, share in terms]
+    return np.hypot(*map(np.abs, parts))
+
+
+def _largest_change(image: np.ndarray) -> np.ndarray:
+    """Compute the largest difference of every pixel [detector, y, x] from its neighbours in the row and the column."""
+    high, low = (f(image, size=(1, 3, 3)) for f in (maximum_filter, minimum_filter))
+    return np.maximum(high - image, image - low)
+
+
+def _held(problem: FitProblem, corrections: Corrections, surface: Surface, parameters: Parameters) -> Held:
+    """Derive what a solve needs of corrections made for a surface, without responses."""
+    normals, moved = surface.normals(problem.shift), problem.moves(parameters)
+    masked, multiple = linearised_in_normal(corrections, normals)
+    variance = problem.variance + prediction_std(corrections, normals, problem.settings) ** 2
+    sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
+    moves = np.zeros((len(moved), *corrections.masked.shape))
+    return Held(corrections, surface, masked, multiple, sigma, moves, moved)
+
+
+def set_corrections(problem: FitProblem, state: FitState, corrections: Corrections, surface: Surface) -> FitState:
+    """Take corrections, made on a surface, for all solves until the next ones."""
+    held = _held(problem, corrections, surface, state.parameters)
+    if len(held.moved):
+        optics, fields = problem.optics, (surface.height, surface.slope_x, surface.slope_y)
+        with jax.enable_x64(True):
+            moves = _masked_moves(Surface(*map(jnp.asarray, fields)), optics, problem.raster, held.moved)
+        held = replace(held, moves=np.asarray(moves))
+    return replace(state, held=held)
+
+
+def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
+    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
+    surface, is_known = state.surface, not len(problem.moves(state.parameters))
+    instrument = () if is_known else (problem.fitted_instrument(state.parameters),)
+    corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
+    return with_responses(problem, set_corrections(problem, state, corrections, surface))
+
+
+def with_responses(problem: FitProblem, state: FitState) -> FitState:
+    """Compute how the corrections follow the levels of plateaus and, with a free border, changes of all heights."""
+    surface, raster = state.held.surface, problem.raster
+    optics = moved_optics(problem.optics, problem.moves(state.parameters))
+    responses = region_responses(surface, optics, raster, problem.region)
+    if problem.is_level_free or problem.is_level_held:
+        distance = float(problem.optics.sample_distance)
+        responses += relief_responses(surface, optics, raster, problem.has_enough_images, distance)
+    return replace(state, held=replace(state.held, responses=responses))
+
+
+def moved_optics(optics: Optics, moves: Any) -> Optics:
+    """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
+    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
+
+
+@eqx.filter_jit
+def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
+    """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
+
+    Each aperture depends on its own polar angle and azimuth only, so that one derivative serves all detectors.
+    """
+
+    def masked(step):
+        return masked_form_factor(surface, moved_optics(optics, moved + step[:, None]), raster)
+
+    return jnp.moveaxis(jax.jacfwd(masked)(jnp.zeros(3)), -1, 0)

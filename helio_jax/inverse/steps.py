@@ -1,0 +1,249 @@
+"""One least-squares step of a fit: the terms that it holds fixed, the solve, and what follows from a state.
+
+Unknowns are whitened so that plain conjugate gradients converge in few steps: heights by the cosine transform, h =
+DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as deviations from the heights' one-sided differences.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.fft import dctn
+
+from helio_jax.forward.form_factor import form_factor_at
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.surface import Surface, one_sided, to_pixels
+from helio_jax.inverse.edges import AxisEdges, find_edges, smoothness_weight
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.residuals import (
+    CommonModes,
+    Edges,
+    FixedTerms,
+    FormFactors,
+    Unknowns,
+    expected_data,
+    second_order_noise_bias,
+    surface_of,
+)
+from helio_jax.inverse.solver import Solution, solve, whitened_parameters
+from helio_jax.inverse.state import FitState, Held, moved_optics
+from helio_jax.robust import cauchy_weight
+
+MODE_BLOCK = 4
+"""Common modes are filled up to a multiple of this."""
+_NOISY = 3.0
+"""Largest standard deviation that slopes are credited with, in that of a pixel with median noise."""
+
+
+def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float) -> np.ndarray:
+    """Compute the standard deviation of each cosine mode of the heights that a slope noise per pixel leaves, um."""
+    ky = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[0]) / shape[0]) / dy
+    kx = 2.0 * np.sin(0.5 * np.pi * np.arange(shape[1]) / shape[1]) / dx
+    eigenvalue = ky[:, None] ** 2 + kx[None, :] ** 2
+    eigenvalue[0, 0] = eigenvalue.ravel()[1:].min()
+    return slope_noise / np.sqrt(eigenvalue)
+
+
+@eqx.filter_jit
+def _form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormFactors:
+    """Expand the visible form factors about heights [y, x] and moves [move, detector]."""
+    masked, masked_moves, masked_at = held
+
+    def derivatives(at, heights):
+        here, one = moved_optics(optics, at), jnp.ones_like(heights)
+
+        def value(h):
+            return form_factor_at(here, h)
+
+        def slope(h):
+            return jax.jvp(value, (h,), (one,))[1]
+
+        return jnp.stack([value(heights), slope(heights), jax.jvp(slope, (heights,), (one,))[1]])
+
+    def by_moves(heights):
+        if not len(moved):
+            return jnp.zeros((0, optics.n_detectors, 3, *heights.shape))
+        by = jax.jacfwd(lambda step: form_factor_at(moved_optics(optics, moved + step[:, None]), heights))(jnp.zeros(3))
+        return jnp.moveaxis(by, -1, 0)
+
+    mean = jnp.mean(height)
+    terms, level = derivatives(moved, height), derivatives(moved, mean[None])
+    direction = terms[0] / jnp.sqrt(jnp.sum(terms[0] ** 2, 1, keepdims=True))
+    masked = masked + jnp.einsum("mk,mkiyx->kiyx", moved - masked_at, masked_moves)
+    return FormFactors(
+        height,
+        terms.at[0].add(-masked),
+        direction,
+        by_moves(height) - masked_moves,
+        moved,
+        mean,
+        level[:, :, :2, 0],
+        by_moves(mean[None])[:, :, :2, 0],
+        form_factor_at(optics, jnp.zeros(1))[:, :2, 0],
+    )
+
+
+_noise_bias = eqx.filter_jit(second_order_noise_bias)
+_expected = eqx.filter_jit(
+    lambda unknowns, fixed: expected_data(surface_of(unknowns, fixed), unknowns.parameters, fixed)
+)
+
+
+def edges_of(
+    problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[AxisEdges, AxisEdges]:
+    """Find the edges of a surface along x and along y; those that are `occluded` count as depth jumps."""
+    found = (
+        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.slope_noise, cut),
+        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.slope_noise, cut),
+    )
+    if occluded is None:
+        return found
+    along_x, along_y = (replace(e, joined=np.where(o, 0.0, e.joined)) for e, o in zip(found, occluded, strict=True))
+    return along_x, along_y
+
+
+def freeze(
+    problem: FitProblem,
+    state: FitState,
+    limit: float,
+    cut: float,
+    occluded: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[Unknowns, FixedTerms]:
+    """Fix corrections, edges and robust weights at a state; return the state as unknowns, too.
+
+    Args:
+        problem: the data.
+        state: current surface and parameters.
+        limit: residual at which a datum's weight falls to a half [standard deviations].
+        cut: misfit at which an edge loses most of its weight [standard deviations].
+        occluded: edges to cut along x and y.
+    """
+    held, noise = state.held, problem.slope_noise
+    height, slope_x, slope_y = state.surface.height, state.surface.slope_x, state.surface.slope_y
+    dx, dy = problem.raster.dx, problem.raster.dy
+    along_x, along_y = edges_of(problem, state.surface, cut, occluded)
+    # a kink lies in one of `stride` edges of each of `stride` parallel paths of a thinned raster
+    strictness = problem.stride**1.5
+    edges = Edges(
+        along_x.joined,
+        along_y.joined,
+        along_x.weight * strictness,
+        along_y.weight * strictness,
+        smoothness_weight(along_x.joined, slope_x, noise, 1),
+        smoothness_weight(along_y.joined, slope_y, noise, 0),
+    )
+    steepness = 1.0 + slope_x**2 + slope_y**2  # of slopes against normals
+    scale_x, scale_y = (_slope_scale(e, axis, noise * steepness) for e, axis in ((along_x, 1), (along_y, 0)))
+    whitening = _whitening(problem.raster.shape, dx, dy, noise)
+    unknowns = Unknowns(
+        dctn(height, norm="ortho") / whitening,
+        (slope_x - one_sided(np.diff(height, axis=1) / dx, along_x.joined, 1)) / scale_x,
+        (slope_y - one_sided(np.diff(height, axis=0) / dy, along_y.joined, 0)) / scale_y,
+        state.parameters,
+    )
+    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma
+    priors, moved = problem.priors, problem.moves(state.parameters)
+    with jax.enable_x64(True):
+        factors = _form_factors(problem.optics, moved, height, (held.masked, held.moves, held.moved))
+        largest = _NOISY * noise * steepness
+        bias = _noise_bias(slope_x, slope_y, factors.terms[0], problem.shift, inverse_sigma, largest)
+    occluded_std = held.corrections.occluded
+    fixed = FixedTerms(
+        data=problem.data,
+        inverse_sigma=inverse_sigma * problem.stride,
+        form_factors=factors,
+        multiple=held.multiple,
+        occluded=np.zeros(problem.signal.shape) if occluded_std is None else occluded_std,
+        noise_bias=bias,
+        modes=_common_modes(held, np.exp(priors.gain * state.parameters.log_gain)),
+        drift_modes=problem.drift_modes,
+        position=problem.position,
+        edges=edges,
+        border=problem.border,
+        level_weight=problem.level_weight,
+        held_level=problem.held_level,
+        whitening=whitening,
+        slope_scale_x=scale_x,
+        slope_scale_y=scale_y,
+        priors=priors,
+        beam_shift=problem.shift,
+        dx=dx,
+        dy=dy,
+        slow_axis=problem.order.slow_axis,
+    )
+    as_array = lambda a: np.asarray(a, float)  # noqa: E731
+    return jax.tree.map(as_array, unknowns), jax.tree.map(as_array, fixed)
+
+
+def _common_modes(held: Held, gain: np.ndarray) -> CommonModes:
+    """Stack the responses, filled up with empty ones, so that one compilation serves different numbers of them."""
+    n, shape = len(held.responses), held.multiple.shape
+    room = MODE_BLOCK * max(1, -(-n // MODE_BLOCK))
+    weights, change = np.zeros((room, *shape[1:])), np.zeros((room, *shape))
+    for i, response in enumerate(held.responses):
+        weights[i], change[i] = response.weights, gain[:, None, None] * response.change
+    return CommonModes(weights, np.einsum("myx,yx->m", weights, held.surface.height), change)
+
+
+def _slope_scale(edges: AxisEdges, axis: int, free: np.ndarray) -> np.ndarray:
+    """Compute the scale of whitened slopes: the deviation from one-sided differences that edges and data leave."""
+    return 1.0 / np.sqrt(0.25 * to_pixels(edges.weight**2, axis) + 1.0 / free**2)
+
+
+def step(
+    problem: FitProblem,
+    state: FitState,
+    limit: float,
+    cut: float,
+    is_instrument_free: bool,
+    occluded: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[FitState, Solution]:
+    """Solve one weighted least-squares problem from a state; arguments as those of `freeze`."""
+    s = problem.settings
+    start, fixed = freeze(problem, state, limit, cut, occluded)
+    free, mixing_is_whitened = np.asarray(float(is_instrument_free)), problem.is_instrument_unknown
+    with jax.enable_x64(True):
+        if is_instrument_free and (mixing_is_whitened or problem.is_level_free):
+            mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)))
+        else:  # as they are, where they are held or little is unknown
+            n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
+            mixing = np.diag([1.0] * n + [0.0])
+        # the switch is an array: one compilation serves both cases
+        found = jax.tree.map(np.asarray, solve(start, fixed, s.lm_steps, s.cg_steps, mixing, free))
+    residuals = (found.data - problem.data) / state.held.sigma
+    return replace(state, surface=found.surface, parameters=found.parameters, residuals=residuals), found
+
+
+def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndarray:
+    """Compute the data expected at a state, whose slopes may be noisy ones; 0 where not observed."""
+    unknowns, fixed = freeze(problem, state, problem.settings.robust_limits[-1], problem.settings.jump_limits[-1])
+    if not is_noisy:
+        fixed = eqx.tree_at(lambda f: f.noise_bias, fixed, np.zeros(problem.signal.shape))
+    with jax.enable_x64(True):
+        return np.where(problem.is_observed, np.asarray(_expected(unknowns, fixed)), 0.0)
+
+
+def levelled(problem: FitProblem, state: FitState) -> Surface:
+    """Return the surface above the substrate, which may be tilted."""
+    s, tilt = state.surface, problem.priors.tilt * state.parameters.tilt
+    if not tilt.size:
+        return s
+    return Surface(s.height - np.tensordot(tilt, problem.position, 1), s.slope_x - tilt[0], s.slope_y - tilt[1])
+
+
+def misfit(problem: FitProblem, state: FitState, limit: float, cut: float) -> float:
+    """Compute half the robust chi-square of data and edges, with the data's normalisation."""
+    data = 0.5 * limit**2 * np.sum(1.0 - cauchy_weight(state.residuals, limit))
+    data += np.sum(np.log(state.held.sigma[problem.is_observed]))
+    edges = edges_of(problem, state.surface, cut)
+    return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.joined)) for e in edges))
+
+
+def model_share(problem: FitProblem, state: FitState) -> np.ndarray:
+    """Compute the share of prediction errors in the variance of every datum; 0 where not observed [detector, y, x]."""
+    share = np.maximum(1.0 - problem.variance / state.held.sigma**2, 0.0)
+    return np.where(problem.is_observed, share, 0.0)
