@@ -37,7 +37,6 @@ DOORS = {
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},
     "optimistix": {"inverse/solver.py"},
-    "lineax": {"inverse/solver.py"},
     "distributed": {"trace/scan.py"},
     "rich": {"commands/app.py"},
     "manifold3d": {"scene/drill.py"},

@@ -15,57 +15,58 @@ class RefineSettings(Settings):
     """The fit of the heights: table `[reconstruct.refine]`."""
 
     max_rounds: int = Field(default=3, ge=1, le=50)
-    """How often multiple scattering and masks are predicted anew on the current surface."""
+    """Outer iterations: how often masks and multiple scattering are predicted on the current surface."""
     tolerance_um: float = Field(default=1.0, gt=0.0, le=1e3)
-    """The fit has converged when a round changes the heights by less than this (root mean square) [um]."""
+    """The fit has converged when an outer iteration changes the heights by less than this (root mean square) [um]."""
     gain_std: float = Field(default=0.02, gt=0.0, le=1.0)
-    """Prior deviation of each detector's gain, relative."""
+    """Prior standard deviation of each detector's gain, relative."""
     offset_std: float = Field(default=0.01, gt=0.0, le=1.0)
-    """Prior deviation of each detector's offset, relative to its median signal."""
+    """Prior standard deviation of each detector's offset, relative to its median signal."""
     drift_std: float = Field(default=0.0, ge=0.0, le=10.0)
-    """Prior deviation of the slow drift of each detector's offset, relative to its median signal; 0: no drift."""
+    """Prior standard deviation of the slow drift of each detector's offset, relative to its median signal; 0: no drift."""
     drift_degrees: tuple[Annotated[int, Field(ge=1, le=9)], Annotated[int, Field(ge=1, le=9)]] = (4, 3)
     """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
-    """Prior deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
+    """Prior standard deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
     law_std: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Prior deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
+    """Prior standard deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
     geometry: bool = True
-    """Whether distance, tilt and aims are unknowns where the instrument's table [uncertainty] says so."""
+    """Whether distance, tilt and aperture angles are unknowns where the instrument's table [uncertainty] states them."""
     level_std_um: float | None = Field(default=None, gt=0.0, le=1e5)
     """With a free border: the mean height stays where the fit starts, and the distance from there to the plate is an
-    unknown of this prior deviation [um]; the relief's scale goes with it. Default: the mean height is unknown."""
+    unknown of this prior standard deviation [um]; the relief's scale goes with it. Default: the mean height is unknown."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Prior deviation of the smooth relative albedo; 0: the albedo is constant."""
+    """Prior standard deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
-    """Side of the flat that scatters around the image [um]; default: as far beyond each border as the outermost
+    """Side of the substrate that scatters around the image [um]; default: as far beyond each border as the outermost
     aperture reaches, and once more the plate's distance."""
     mask_error: float = Field(default=0.15, ge=0.0, le=10.0)
-    """Relative error assumed of the predicted hidden signal; masked data are down-weighted by it."""
+    """Assumed relative error of the predicted masked signal; masked data are down-weighted by it."""
     multiple_error: float = Field(default=0.1, ge=0.0, le=10.0)
-    """Relative error assumed of the predicted multiple scattering."""
+    """Assumed relative error of the predicted multiple scattering."""
     error_reach: float = Field(default=0.06, ge=0.0, le=1.0)
-    """Error bars: how far those two errors agree, as a share of the range of heights, for they come from its walls."""
+    """Error bars: correlation length of those two errors, as a share of the range of heights."""
     robust_limits: tuple[float, ...] = Field(default=(10.0, 10.0, 8.0), min_length=1, max_length=20)
-    """Residuals [standard deviations] at which a datum's weight falls to a half, for each re-weighting of round 1."""
+    """Residuals [standard deviations] at which a datum's weight falls to a half, for each re-weighting of the first
+    iteration."""
     jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)
     """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
     fixed_rounds: int = Field(default=1, ge=0, le=50)
-    """Rounds during which gain and offset stay at their prior means, while the prediction is still crude; none where
-    drift or geometry are unknown: heights fitted to a wrong geometry close the surface behind rims for good."""
+    """Outer iterations during which gain and offset stay at their prior means, while the prediction is still crude; none
+    where drift or geometry are unknown: heights fitted to a wrong geometry would close depth jumps for good."""
     reweightings: int = Field(default=2, ge=1, le=100)
-    """Re-weightings in every later round, with the last limits."""
+    """Re-weightings in every later iteration, with the last limits."""
     photometric_rounds: int = Field(default=4, ge=1, le=20)
     """Photometric solutions, each corrected by a prediction on the last, before the fit."""
     lm_steps: int = Field(default=4, ge=1, le=1000)
-    """Levenberg-Marquardt steps per re-weighting."""
+    """Gauss-Newton steps per re-weighting."""
     cg_steps: int = Field(default=40, ge=1, le=10_000)
-    """Conjugate-gradient steps per Levenberg-Marquardt step."""
+    """Conjugate-gradient steps per Gauss-Newton step; truncating them regularises."""
     bias_pairs: int = Field(default=4, ge=0, le=1000)
-    """Pairs of fits to simulated data, of opposite noise, that tell the bias by noise; only with a free border. A pair
-    takes about as long as two of the fit's rounds."""
+    """Pairs of fits to simulated data, of opposite noise, that estimate the bias by noise; only with a free border. A
+    pair takes about as long as two outer iterations."""
     samples: int = Field(default=32, ge=0, le=10_000)
     """Samples of the posterior, from which the standard deviation of every height is taken; 0: no error bars."""
     multiple: Literal["traced", "radiosity"] = "traced"
@@ -92,21 +93,21 @@ class ReconstructSettings(Settings):
 
     method: Literal["linear", "nearfield", "refine"] = "refine"
     """`linear`: constant detection directions (the paper's method); `nearfield`: directions follow the height;
-    `refine`: fit of the heights through the render model, with masking, shadows and multiple scattering."""
+    `refine`: fit of the heights through the render model, with masking, depth jumps and multiple scattering."""
     integrator: Literal["weighted", "dct_poisson", "harker_oleary", "bilateral"] = "weighted"
     """From slopes to heights: `weighted` cuts depth jumps; the others are kept for comparison."""
     rounds: int = Field(default=4, ge=1, le=100)
     """`nearfield`: how often the directions are evaluated at the current height."""
     damping: float = Field(default=0.8, gt=0.0, le=1.0)
-    """`nearfield`: share of the new height in each round."""
+    """`nearfield`: share of the new height in each iteration."""
     border: Literal["flat", "free"] = "flat"
-    """Whether the border of the image lies on the flat reference plane: levels the heights there."""
+    """Whether the border of the image lies on the substrate: levels the heights there."""
     border_fraction: float = Field(default=0.06, gt=0.0, lt=0.5)
     """Width of that border, as a fraction of the image on each side."""
     border_std_um: float = Field(default=2.0, gt=0.0, le=1e4)
     """`refine`: how flat the border is known to be [um]."""
     corrections: int = Field(default=1, ge=0, le=20)
-    """`nearfield`: how often predicted shadows and multiple scattering are taken off the data; 0: the plain method."""
+    """`nearfield`: how often predicted masking and multiple scattering are subtracted from the data; 0: the plain method."""
     samples: int = Field(default=16, ge=0, le=10_000)
-    """`linear`, `nearfield`: how often noise and calibration are drawn anew for the error bars; 0: no error bars."""
+    """`linear`, `nearfield`: how often noise and calibration are drawn for the error bars; 0: no error bars."""
     refine: RefineSettings = RefineSettings()
