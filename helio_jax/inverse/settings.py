@@ -23,7 +23,7 @@ class RefineSettings(Settings):
     offset_std: float = Field(default=0.01, gt=0.0, le=1.0)
     """Prior standard deviation of each detector's offset, relative to its median signal."""
     drift_std: float = Field(default=0.0, ge=0.0, le=10.0)
-    """Prior standard deviation of the slow drift of each detector's offset, relative to its median signal; 0: no drift."""
+    """Prior standard deviation of each detector's slow drift, relative to its median signal; 0: no drift."""
     drift_degrees: tuple[Annotated[int, Field(ge=1, le=9)], Annotated[int, Field(ge=1, le=9)]] = (4, 3)
     """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
@@ -31,10 +31,10 @@ class RefineSettings(Settings):
     law_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior standard deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
     geometry: bool = True
-    """Whether distance, tilt and aperture angles are unknowns where the instrument's table [uncertainty] states them."""
+    """Whether distance, tilt and aperture angles are unknowns where the instrument's [uncertainty] states them."""
     level_std_um: float | None = Field(default=None, gt=0.0, le=1e5)
     """With a free border: the mean height stays where the fit starts, and the distance from there to the plate is an
-    unknown of this prior standard deviation [um]; the relief's scale goes with it. Default: the mean height is unknown."""
+    unknown of this prior standard deviation [um]; the relief's scale goes with it. Default: the level is unknown."""
     albedo_std: float = Field(default=0.0, ge=0.0, le=1.0)
     """Prior standard deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
@@ -54,8 +54,8 @@ class RefineSettings(Settings):
     jump_limits: tuple[float, ...] = Field(default=(5.0, 4.0, 4.0), min_length=1, max_length=20)
     """Misfits [standard deviations] at which an edge between two pixels loses most of its weight: a depth jump."""
     fixed_rounds: int = Field(default=1, ge=0, le=50)
-    """Outer iterations during which gain and offset stay at their prior means, while the prediction is still crude; none
-    where drift or geometry are unknown: heights fitted to a wrong geometry would close depth jumps for good."""
+    """Outer iterations during which gain and offset stay at their prior means, while the prediction is still crude;
+    none where drift or geometry are unknown: heights fitted to a wrong geometry would close depth jumps for good."""
     reweightings: int = Field(default=2, ge=1, le=100)
     """Re-weightings in every later iteration, with the last limits."""
     photometric_rounds: int = Field(default=4, ge=1, le=20)
@@ -107,7 +107,7 @@ class ReconstructSettings(Settings):
     border_std_um: float = Field(default=2.0, gt=0.0, le=1e4)
     """`refine`: how flat the border is known to be [um]."""
     corrections: int = Field(default=1, ge=0, le=20)
-    """`nearfield`: how often predicted masking and multiple scattering are subtracted from the data; 0: the plain method."""
+    """`nearfield`: how often predicted masking and multiple scattering are subtracted from the data; 0: never."""
     samples: int = Field(default=16, ge=0, le=10_000)
     """`linear`, `nearfield`: how often noise and calibration are drawn for the error bars; 0: no error bars."""
     refine: RefineSettings = RefineSettings()
