@@ -22,7 +22,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.state import FitState, Predict, update_corrections
+from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, step
 from helio_jax.robust import cauchy_weight
 
@@ -110,7 +110,7 @@ def misfit_on(
     s, state = problem.settings, FitState.at(problem, surface)
     if parameters is not None:
         state = replace(state, parameters=parameters)
-    state = update_corrections(problem, state, predict)
+    state = predict_corrections(problem, state, predict)
     for _ in range(s.reweightings):
         state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
     return misfit(problem, state, s.robust_limits[-1], s.jump_limits[-1]), state.surface

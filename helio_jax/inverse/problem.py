@@ -36,8 +36,8 @@ class FitProblem:
         uncertainty: prior standard deviations of the geometry.
         raster: beam positions.
         settings: of the fit.
+        border_settings: what is known of the border.
         order: in which the pixels were recorded.
-        border: prior weight of each height above the substrate [y, x], 1/um.
         is_level_held, is_level_free: whether the mean height is held, or unknown; a flat border does neither.
         held_level: mean height that is held, over its standard deviation.
         region: number of the plateau of every pixel, whose masks are to follow their levels, 0: none [y, x].
@@ -54,8 +54,8 @@ class FitProblem:
     uncertainty: Uncertainty
     raster: Raster
     settings: RefineSettings
+    border_settings: ReconstructSettings
     order: ScanOrder
-    border: np.ndarray
     is_level_held: bool
     is_level_free: bool
     held_level: float
@@ -93,7 +93,7 @@ class FitProblem:
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
-            signal, variance, optics, stated, raster, s, order, _border_weight(shape, settings), is_held,
+            signal, variance, optics, stated, raster, s, settings, order, is_held,
             is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median,
             noise, given,
         )  # fmt: skip
@@ -124,6 +124,11 @@ class FitProblem:
         """Weights [y, x] of the mean height over its standard deviation, or 0 where nothing holds it."""
         enough = self.has_enough_images
         return self.is_level_held * enough / np.maximum(enough.sum(), 1) / LEVEL_STD
+
+    @property
+    def border(self) -> np.ndarray:
+        """Prior weight of each height above the substrate [y, x], 1/um."""
+        return _border_weight(self.raster.shape, self.border_settings)
 
     @property
     def position(self) -> np.ndarray:
@@ -197,7 +202,6 @@ class FitProblem:
             variance=self.variance[:, *thin],
             raster=Raster.regular(self.signal[0][thin].shape, self.raster.dx * stride, self.raster.dy * stride),
             order=self.order.thinned(thin),
-            border=self.border[thin],
             region=self.region[thin],
             drift_modes=self.drift_modes[:, :, *thin],
             stride=stride,

@@ -4,10 +4,10 @@ Corrections are held fixed during a solve. Where the data determine something co
 the priors, as the level of a plateau or, with a free border, level, scale and tilt of all heights, iterations that hold
 the corrections would run away along it, or rest where the misfit is not least (relief came out 8 % too flat on
 pyramids). So the corrections follow these changes to first order: masks by the derivative of the horizon march,
-multiple scattering by that of the radiosity model.
+multiple scattering by that of the radiosity model. The surroundings of a free border go along with its lowest part.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,15 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from helio_jax.arrays import border_mask
 from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
 from helio_jax.forward.render import single_scattering
-from helio_jax.forward.surface import Surface, unit_normal
+from helio_jax.forward.surface import Surface, slopes_of_normal, unit_normal
 from helio_jax.inverse.samples import thinning
 
 LEVEL_FACET = 0.9
 """Facets whose unit normal has a larger vertical part count as level."""
+GROUND_BORDER, GROUND_SHARE = 0.06, 0.05
+"""Width of the border, as a share of each side, and the share of its pixels that are taken for ground, as by
+`scene.border`, which continues a surface with a free border for the tracer."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
 
@@ -62,17 +66,32 @@ def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Ra
 
 @eqx.filter_jit
 def _multiple_change(
-    surface: Surface, change: Surface, optics: Optics, raster: Raster, plan: Plan
+    surface: Surface,
+    change: Surface,
+    ground: jax.Array,
+    ground_change: jax.Array,
+    optics: Optics,
+    raster: Raster,
+    plan: Plan,
 ) -> tuple[jax.Array, jax.Array]:
-    """Compute multiple scattering and its change along a change of the surface [detector, y, x]."""
+    """Compute multiple scattering and its change along changes of the surface and its ground [detector, y, x]."""
 
-    def normal(s):
-        return unit_normal(s.slope_x, s.slope_y, optics.beam_shift)
+    def multiple(s, level):
+        normals = jnp.moveaxis(unit_normal(s.slope_x, s.slope_y, optics.beam_shift), 0, -1)
+        return radiosity(s.height - level, normals, _on_ground(optics, level), raster, plan)
 
-    def multiple(s):
-        return radiosity(s.height, jnp.moveaxis(normal(s), 0, -1), optics, raster, plan)
+    return jax.jvp(multiple, (surface, ground), (change, ground_change))
 
-    return jax.jvp(multiple, (surface,), (change,))
+
+def _on_ground(optics: Optics, level: Any) -> Optics:
+    """Return optics whose substrate stands at a level above the stated one, um."""
+    return eqx.tree_at(lambda o: o.sample_distance, optics, optics.sample_distance - level)
+
+
+def _is_ground(height: np.ndarray) -> np.ndarray:
+    """Return True in the lowest pixels of the border, at whose level the surroundings of a free border stand [y, x]."""
+    border = border_mask(height.shape, GROUND_BORDER)
+    return border & (height <= np.quantile(height[border], GROUND_SHARE))
 
 
 def _as_jax(surface: Surface) -> Surface:
@@ -98,12 +117,18 @@ def region_responses(surface: Surface, optics: Optics, raster: Raster, region: n
 
 
 def relief_responses(
-    surface: Surface, optics: Optics, raster: Raster, has_enough_images: np.ndarray, distance: float
+    surface: Surface,
+    normals: np.ndarray,
+    optics: Optics,
+    raster: Raster,
+    has_enough_images: np.ndarray,
+    distance: float,
 ) -> tuple[Response, ...]:
     """Compute how masks and multiple scattering follow level, scale and tilt of all heights.
 
     Args:
         surface: of the corrections.
+        normals: unit normals for which multiple scattering was predicted, without the noise of the slopes [y, x, 3].
         optics, raster: of the scan.
         has_enough_images: where the data determine the surface [y, x].
         distance: of the sample from the plate, the scale of level changes, um.
@@ -114,15 +139,23 @@ def relief_responses(
     weights[:, has_enough_images] = np.linalg.pinv(heights)
     stride = thinning(has_enough_images.shape, MAX_RADIOSITY_PIXELS)
     thin = (slice(None, None, stride),) * 2
-    coarse, coarse_raster = jax.tree.map(lambda f: np.asarray(f)[thin], surface), raster.thinned(stride)
-    plan = plan_radiosity(coarse.height, coarse.normals(np.asarray(optics.beam_shift)), optics, coarse_raster)
+    optics = jax.tree.map(np.asarray, optics)  # JAX would round differences to float32
+    shift = optics.beam_shift
+    smooth = Surface(surface.height, *slopes_of_normal(normals, shift)[:2])
+    coarse, coarse_raster = jax.tree.map(lambda f: np.asarray(f)[thin], smooth), raster.thinned(stride)
+    is_ground = _is_ground(coarse.height)
+    ground = np.mean(coarse.height[is_ground])
+    plan = plan_radiosity(coarse.height - ground, coarse.normals(shift), _on_ground(optics, ground), coarse_raster)
     out = []
-    for i, change in enumerate(changes):
+    smooth_changes = _relief_changes(smooth, raster, has_enough_images, distance)
+    for i, (change, smooth_change) in enumerate(zip(changes, smooth_changes, strict=True)):
         with jax.enable_x64(True):
             masked = np.asarray(_masked_change(_as_jax(surface), _as_jax(change), optics, raster))
-            thinned = _as_jax(jax.tree.map(lambda f: f[thin], change))
-            value, slope = _multiple_change(_as_jax(coarse), thinned, optics, coarse_raster, plan)
-        own = _own_normal_change(np.asarray(value), coarse, thinned, np.asarray(optics.beam_shift))
+            thinned = _as_jax(jax.tree.map(lambda f: f[thin], smooth_change))
+            level, rise = jnp.asarray(ground), jnp.asarray(np.mean(np.asarray(thinned.height)[is_ground]))
+            value, slope = _multiple_change(_as_jax(coarse), thinned, level, rise, optics, coarse_raster, plan)
+        sharp, turned = (jax.tree.map(lambda f: np.asarray(f)[thin], s) for s in (surface, change))
+        own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2]) * _vertical_change(sharp, turned, shift)
         out.append(Response(weights[i], masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
     return tuple(out)
 
@@ -141,12 +174,14 @@ def _relief_changes(surface: Surface, raster: Raster, has_enough_images: np.ndar
     ]
 
 
-def _own_normal_change(multiple: np.ndarray, surface: Surface, change: Surface, shift: np.ndarray) -> np.ndarray:
-    """Compute the change of multiple scattering by a facet's own normal that a solve knows of [detector, y, x]."""
+def _vertical_change(surface: Surface, change: Surface, shift: np.ndarray) -> np.ndarray:
+    """Compute the change of the normals' vertical part along a change of the surface [y, x].
+
+    A solve knows how multiple scattering follows it, see `normal_slope`.
+    """
     with jax.enable_x64(True):
         at, along = (tuple(jnp.asarray(f) for f in (s.slope_x, s.slope_y)) for s in (surface, change))
-        normal, turned = jax.jvp(lambda x, y: unit_normal(x, y, shift)[2], at, along)
-    return -normal_slope(multiple, np.asarray(normal)) * np.asarray(turned)
+        return np.asarray(jax.jvp(lambda x, y: unit_normal(x, y, shift)[2], at, along)[1])
 
 
 def _upsampled(images: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:

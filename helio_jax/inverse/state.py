@@ -158,12 +158,17 @@ def set_corrections(problem: FitProblem, state: FitState, corrections: Correctio
     return replace(state, held=held)
 
 
-def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
-    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
+def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
+    """Predict masks and multiple scattering on the current surface, which follow no common changes of heights."""
     surface, is_known = state.surface, not len(problem.moves(state.parameters))
     instrument = () if is_known else (problem.fitted_instrument(state.parameters),)
     corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
-    return with_responses(problem, set_corrections(problem, state, corrections, surface))
+    return set_corrections(problem, state, corrections, surface)
+
+
+def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
+    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
+    return with_responses(problem, predict_corrections(problem, state, predict))
 
 
 def with_responses(problem: FitProblem, state: FitState) -> FitState:
@@ -172,8 +177,10 @@ def with_responses(problem: FitProblem, state: FitState) -> FitState:
     optics = moved_optics(problem.optics, problem.moves(state.parameters))
     responses = region_responses(surface, optics, raster, problem.region)
     if problem.is_level_free or problem.is_level_held:
-        distance = float(problem.optics.sample_distance)
-        responses += relief_responses(surface, optics, raster, problem.has_enough_images, distance)
+        smooth = state.held.corrections.normals
+        normals = surface.normals(problem.shift) if smooth is None else smooth
+        known = problem.has_enough_images, float(problem.optics.sample_distance)
+        responses += relief_responses(surface, normals, optics, raster, *known)
     return replace(state, held=replace(state.held, responses=responses))
 
 

@@ -126,8 +126,9 @@ def predictor_of(stack: MicrographStack, n_rays: int, substrate_um: float | None
     return predict
 
 
-def no_change(surface: Surface, change: Surface, optics: Optics, *_: Any) -> tuple[np.ndarray, np.ndarray]:
+def no_change(surface: Surface, *rest: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return no change of multiple scattering with the relief: what is made up does not follow the radiosity model."""
+    optics = next(part for part in rest if isinstance(part, Optics))
     nothing = np.zeros((optics.n_detectors, *surface.height.shape))
     return nothing, nothing
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helio_jax.arrays import border_mask
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
@@ -17,6 +18,8 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, set_corrections, update_corrections
 from helio_jax.inverse.steps import expected
+from helio_jax.workflows import pipeline
+from tests.inverse.test_reconstruct import bump_stack
 
 SHAPE, PITCH = (24, 20), 30.0
 
@@ -57,6 +60,7 @@ def follower(bshem):
     """Return a fit with a free border about a raised bump, its state without corrections, and their computation.
 
     Multiple scattering is computed with one plan of who sees whom: anew, the plan's choices would add 1e-8 of the beam.
+    Around the image is ground as high as the lowest part of its border, which goes along.
     """
     bump_only, _ = bump()
     surface = Surface(bump_only.height + 100.0, bump_only.slope_x, bump_only.slope_y)
@@ -64,11 +68,19 @@ def follower(bshem):
     signal = form_factor(optics, surface.height)[:, 2]
     settings = ReconstructSettings(border="free")
     problem = FitProblem.of(signal, (0.003 * signal) ** 2, bshem, raster, surface, settings)
-    plan = plan_radiosity(surface.height, surface.normals(problem.shift), optics, raster)
+    edge = border_mask(SHAPE, 0.06)
+    is_ground = edge & (surface.height <= np.quantile(surface.height[edge], 0.05))
+
+    def grounded(height):
+        ground = height[is_ground].mean()
+        return height - ground, Optics.of(bshem.at_distance(bshem.sample_distance - ground))
+
+    plan = plan_radiosity(grounded(surface.height)[0], surface.normals(problem.shift), optics, raster)
 
     def predict(height, normals):
-        at = Surface(height, *slopes_of_normal(normals, bshem.beam_shift)[:2])
-        return radiosity_corrections(at, optics, raster, plan)
+        relative, at = grounded(height)
+        surface = Surface(relative, *slopes_of_normal(normals, bshem.beam_shift)[:2])
+        return radiosity_corrections(surface, at, raster, plan)
 
     return problem, FitState.at(problem, surface), predict
 
@@ -100,7 +112,7 @@ def test_corrections_follow_the_relief(bshem):
     anew = data_of(problem, set_corrections(problem, state, anew, changed), changed)
     followed = data_of(problem, update_corrections(problem, state, predict), changed)
     missing = np.sqrt(np.mean((held - anew) ** 2))
-    assert missing > 1e-4 * anew.mean()
+    assert missing > 5e-5 * anew.mean()
     assert np.sqrt(np.mean((followed - anew) ** 2)) < 0.05 * missing
 
 
@@ -116,6 +128,21 @@ def test_other_changes_are_not_followed(bshem):
     changed = Surface(surface.height + bumpy, surface.slope_x, surface.slope_y)
     alone = replace(state, held=replace(state.held, responses=()))
     assert data_of(problem, state, changed) == pytest.approx(data_of(problem, alone, changed), rel=1e-12)
+
+
+def test_a_level_that_is_free_comes_to_rest(bshem):
+    """Iterations on a noisy bump with a free border: the fourth changes the heights by less than 3 um (measured 0.5).
+
+    Catches ground around the image that stays where it is when the heights are lowered: multiple scattering then seems
+    to determine the level, which swings by 60 um.
+    """
+    stack, _, _ = bump_stack(bshem, n=40)
+    mean = stack.counts / 1e6 * 3.5e4
+    counts = np.random.default_rng(2).poisson(mean).astype(float)
+    one = stack.replace(counts=counts, variance=mean, n_rays=3.5e4)
+    refine = {"max_rounds": 4, "rays": 100_000, "bias_pairs": 0, "samples": 0}
+    rec = pipeline.reconstruct(one, "refine", border="free", refine=refine)
+    assert rec.provenance["height_changes_um"][-1] < 3.0
 
 
 def nothing_more(height, normals, *instrument):

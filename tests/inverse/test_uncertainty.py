@@ -120,6 +120,21 @@ def level_fit(instrument, shape):
     return freeze(problem, FitState.at(problem, level), 8.0, 4.0)
 
 
+def test_a_thinned_raster_has_a_whole_border(bshem):
+    """Every second of 20 rows and 22 columns: the flat border still holds all four sides.
+
+    Catches the border's weights thinned, too, which leaves the last row and column free.
+    """
+    level = Surface(*np.zeros((3, 20, 22)))
+    signal = form_factor(Optics.of(bshem), level.height)[:, 2]
+    known = signal, (0.03 * signal) ** 2, bshem, Raster.regular((20, 22), 30.0), level, ReconstructSettings()
+    border = FitProblem.of(*known).thinned(2).border
+    assert border.shape == (10, 11)
+    for side in (border[0], border[-1], border[:, 0], border[:, -1]):
+        assert np.all(side == border.max())
+    assert np.all(border[1:-1, 1:-1] < 0.1 * border.max())
+
+
 def test_a_pixel_that_nothing_fixes_has_a_large_deviation(bshem):
     """All four edges cut and no datum left: an error bar of millimetres, no singular matrix."""
     shape = (5, 6)
