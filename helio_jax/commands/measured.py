@@ -138,22 +138,10 @@ def align(
     if as_json:
         print(json.dumps(stack.provenance["align"]))
         return
-    _print_alignment(stack)
+    from helio_jax.figures.overlay import describe_alignment
+
+    print("\n".join(describe_alignment(stack)))
     print(f"written to {output}")
-
-
-def _print_alignment(stack: Any) -> None:
-    """Print the motions of an aligned stack, and how many pixels three or more of its images show."""
-    record = stack.provenance["align"]
-    for scan in record["scans"]:
-        x, y = scan["shift_um"]
-        error = f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown"
-        print(f"  {scan['name']}: rotated by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um, {error}")
-    if "points" in record:
-        residual, left_out = record["points"]["residual_rms_um"], record["points"]["left_out_rms_um"]
-        print(f"  points: residual {residual:.1f} um, leave-one-out {left_out:.1f} um (rms)")
-    n, ny, nx = stack.shape
-    print(f"{n} images on {nx} x {ny} pixels; {(stack.is_observed.sum(0) >= 3).mean():.0%} of them in 3 or more")
 
 
 @app.command()

@@ -87,3 +87,19 @@ def facet_map(rec: Reconstruction, labels: np.ndarray) -> canvas.Figure:
     for ax, title in ((left, "height"), (right, "facets")):
         canvas.label_axes(ax, title, "x (µm)")
     return figure
+
+
+def describe_alignment(stack: MicrographStack) -> list[str]:
+    """List the motions of an aligned stack in words, and how many pixels three or more of its images show."""
+    record, lines = stack.provenance["align"], []
+    for scan in record["scans"]:
+        x, y = scan["shift_um"]
+        error = f"+- {scan['std_um']:.1f} um" if scan["std_um"] is not None else "error unknown"
+        moved = f"rotated by {scan['rotation_deg']:.3f} deg, moved by ({x:.1f}, {y:.1f}) um, {error}"
+        lines.append(f"  {scan['name']}: {moved}")
+    if "points" in record:
+        residual, left_out = record["points"]["residual_rms_um"], record["points"]["left_out_rms_um"]
+        lines.append(f"  points: residual {residual:.1f} um, leave-one-out {left_out:.1f} um (rms)")
+    n, ny, nx = stack.shape
+    share = (stack.is_observed.sum(0) >= 3).mean()
+    return [*lines, f"{n} images on {nx} x {ny} pixels; {share:.0%} of them in 3 or more"]

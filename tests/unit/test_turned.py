@@ -11,7 +11,8 @@ from helio_jax import reconstruct
 from helio_jax.alignment.resample import resample, scan_times
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.calibration.self_calibration import Relief, self_calibrate
-from helio_jax.errors import GuardError
+from helio_jax.errors import PredictionError
+from helio_jax.forward.optics import Optics
 from helio_jax.instrument import Detector
 from helio_jax.micrograph import MicrographStack, ScanAlignment
 from helio_jax.workflows import calibrate_rotated as rotated
@@ -49,7 +50,7 @@ def test_multiple_scattering_stays_for_a_fit(calibrated):
     """
     kept, without = calibrated
     assert kept.provenance["self_calibrate"]["gain"] == without.provenance["self_calibrate"]["gain"]
-    flat = rotated.substrate_signal(kept.instrument)[:, None, None]
+    flat = rotated.substrate_signal(Optics.of(kept.instrument))[:, None, None]
     taken = np.where(kept.is_observed, (kept.counts - without.counts) / flat, 0.0)
     assert taken.min() > -1e-9 and 0.05 < taken.max() < 1.0
 
@@ -73,7 +74,7 @@ def test_says_where_nothing_could_be_predicted(aligned, monkeypatch):
     """A surface too wild to trace from leaves the first calibration, and its record says so."""
 
     def refuse(stack):
-        raise GuardError("too rough")
+        raise PredictionError("too rough")
 
     monkeypatch.setattr(rotated, "_relief_of", refuse)
     done = rotated.calibrate_rotated(aligned).provenance["self_calibrate"]
