@@ -72,6 +72,7 @@ trace/                Scene -> MicrographStack by Monte Carlo (NumPy, numba, Emb
   scan                all units of a scan on threads, processes or a cluster
   follow              single atoms (helio rays)
 forward/              heights and optics -> expected counts, differentiable (JAX); no optimiser
+  compiling           how large JAX functions are compiled
   optics              Optics, Raster: beam, apertures and beam positions as pytrees; moving them
   surface             Surface: heights and slopes in the beam frame, normals
   form_factor         vector form factor of an elliptical aperture

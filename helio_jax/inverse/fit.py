@@ -23,7 +23,7 @@ from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
-from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, step
+from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, pixel_terms, step
 from helio_jax.robust import cauchy_weight
 
 GEOMETRY = "distance", "tilt", "aim"
@@ -91,7 +91,8 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     length = s.error_reach * float(np.ptp(state.surface.height))
     part = problem.thinned(stride) if stride > 1 else problem
     there = state.thinned(part, stride) if stride > 1 else state
-    unknowns, fixed = freeze(part, there, s.robust_limits[-1], s.jump_limits[-1])
+    limits = s.robust_limits[-1], s.jump_limits[-1]
+    unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     found = sample_posterior(linearise(unknowns, fixed), n_samples, error=error)
     planes = part.priors.tilt * part.position
@@ -156,7 +157,7 @@ def fit_heights(
             break
         change_before, last_change = last_change, state.surface.height - before.surface.height
         changes.append(float(np.sqrt(np.mean(last_change**2))))
-        said = f"cost {sum(map(float, found.cost.values())):.4g}, height change {changes[-1]:.2f} um"
+        said = f"cost {found.cost:.4g}, height change {changes[-1]:.2f} um"
         if number:
             extrapolation = aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:

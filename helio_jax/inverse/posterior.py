@@ -24,6 +24,7 @@ import scipy.sparse as sparse
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface, along
 from helio_jax.inverse.residuals import (
     SLOPE_STD,
@@ -262,7 +263,7 @@ class _Rows:
         return sparse.csr_matrix(sparse.vstack([*self._blocks, empty]))
 
 
-@eqx.filter_jit
+@compiled
 def _derivatives(unknowns: Unknowns, fixed: FixedTerms):
     """Compute the blocks of the Jacobian.
 

@@ -278,7 +278,7 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
 
 
 def second_order_noise_bias(
-    slope_x: jax.Array, slope_y: jax.Array, visible: jax.Array, shift: Any, inverse_sigma: jax.Array, largest: jax.Array
+    slope_x: Any, slope_y: Any, visible: Any, shift: Any, inverse_sigma: Any, largest: Any
 ) -> jax.Array:
     """Compute the bias of the mean signal of facets by the noise of their fitted slopes [detector, y, x].
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from helio_jax.arrays import border_mask
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
@@ -57,14 +58,14 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.where(up < LEVEL_FACET, multiple / np.maximum(1.0 - up, 1.0 - LEVEL_FACET), 0.0)
 
 
-@eqx.filter_jit
+@compiled
 def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Raster) -> jax.Array:
     """Compute the change of single scattering by masks [detector, y, x] along a change of the surface."""
     slope = jax.jvp(lambda s: masked_form_factor(s, optics, raster), (surface,), (change,))[1]
     return -single_scattering(slope, unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift))
 
 
-@eqx.filter_jit
+@compiled
 def _multiple_change(
     surface: Surface,
     change: Surface,

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.residuals import (
     FixedTerms,
@@ -17,7 +17,6 @@ from helio_jax.inverse.residuals import (
     Unknowns,
     border_residuals,
     data_residuals,
-    expected_data,
     residuals,
     surface_of,
 )
@@ -97,8 +96,8 @@ class Solution(NamedTuple):
 
     Attributes:
         parameters, surface: found.
-        data: expected there [detector, y, x].
-        cost: half the sum of squares of every kind of residual.
+        data: expected there, as measured where not observed [detector, y, x].
+        cost: half the sum of squares of all residuals.
         is_converged: whether optimistix met its tolerances within its steps.
         next_step_um: root mean square height change of the next Gauss-Newton step from there.
         cg_residual: relative residual of that step's normal equations; above `CG_TOLERANCE` they are truncated.
@@ -107,7 +106,7 @@ class Solution(NamedTuple):
     parameters: Parameters
     surface: Surface
     data: jax.Array
-    cost: dict[str, jax.Array]
+    cost: jax.Array
     is_converged: jax.Array
     next_step_um: jax.Array
     cg_residual: jax.Array
@@ -130,7 +129,7 @@ def free_parameters(parameters: Parameters) -> tuple[jax.Array, Callable[[jax.Ar
     return flat, lambda vector: parameters.replaced(**dict(zip(names, restore(vector), strict=True)))
 
 
-@eqx.filter_jit
+@compiled
 def whitened_parameters(start: Unknowns, fixed: FixedTerms, is_level_free: np.ndarray) -> jax.Array:
     """Compute the matrix whose columns are combinations of parameters and level, each one standard deviation apart.
 
@@ -154,7 +153,7 @@ def whitened_parameters(start: Unknowns, fixed: FixedTerms, is_level_free: np.nd
     return mixing.at[-1].multiply(is_level_free)
 
 
-@eqx.filter_jit
+@compiled
 def solve(
     start: Unknowns,
     fixed: FixedTerms,
@@ -188,26 +187,21 @@ def solve(
     fields = (start.height, start.slope_x, start.slope_y)
     variables, split = ravel_pytree((fields, jnp.zeros(flat.size + 1), jnp.zeros_like(lines)))
 
-    def misfit(v, args):
-        return ravel_pytree(residuals(decoded(v), args))[0]
+    def misfit(v: jax.Array, args: FixedTerms) -> jax.Array:
+        parts = residuals(decoded(v), args)
+        return jnp.concatenate([parts.pop("data").ravel(), *(jnp.ravel(part) for part in parts.values())])
 
-    found = optx.least_squares(
-        lambda v, args: ravel_pytree(residuals(decoded(v), args))[0],
-        GaussNewton(cg_steps),
-        variables,
-        args=fixed,
-        max_steps=max_steps,
-        throw=False,
-    )
-    unknowns = decoded(found.value)
-    surface = surface_of(unknowns, fixed)
-    next_height = split(found.state.descent_state.newton)[0][0] * fixed.whitening
+    found = optx.least_squares(misfit, GaussNewton(cg_steps), variables, args=fixed, max_steps=max_steps, throw=False)
+    unknowns, state = decoded(found.value), found.state
+    data = state.f_info.residual[: fixed.data.size].reshape(fixed.data.shape)
+    is_used = fixed.inverse_sigma > 0.0
     return Solution(
         unknowns.parameters,
-        surface,
-        expected_data(surface, unknowns.parameters, fixed),
-        {name: 0.5 * jnp.sum(r**2) for name, r in residuals(unknowns, fixed).items()},
+        surface_of(unknowns, fixed),
+        fixed.data + jnp.where(is_used, data / jnp.where(is_used, fixed.inverse_sigma, 1.0), 0.0),
+        0.5 * jnp.sum(state.f_info.residual**2),
         found.result == optx.RESULTS.successful,
-        jnp.sqrt(jnp.mean(next_height**2)),  # the cosine transform keeps the norm
-        found.state.descent_state.residual,
+        # the cosine transform keeps the norm
+        jnp.sqrt(jnp.mean((split(state.descent_state.newton)[0][0] * fixed.whitening) ** 2)),
+        state.descent_state.residual,
     )

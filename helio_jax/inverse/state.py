@@ -8,12 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections, single_scattering
@@ -189,7 +189,7 @@ def moved_optics(optics: Optics, moves: Any) -> Optics:
     return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
 
 
-@eqx.filter_jit
+@compiled
 def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
     """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
 

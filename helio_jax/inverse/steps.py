@@ -5,7 +5,7 @@ DCT^-1(y / sqrt(lambda)), for the data fix slopes; slopes as deviations from the
 """
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.fft import dctn
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.form_factor import form_factor_at
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.surface import Surface, one_sided, to_pixels
@@ -47,7 +48,7 @@ def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float)
     return slope_noise / np.sqrt(eigenvalue)
 
 
-@eqx.filter_jit
+@compiled
 def _form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormFactors:
     """Expand the visible form factors about heights [y, x] and moves [move, detector]."""
     masked, masked_moves, masked_at = held
@@ -86,10 +87,8 @@ def _form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormF
     )
 
 
-_noise_bias = eqx.filter_jit(second_order_noise_bias)
-_expected = eqx.filter_jit(
-    lambda unknowns, fixed: expected_data(surface_of(unknowns, fixed), unknowns.parameters, fixed)
-)
+_noise_bias = compiled(second_order_noise_bias)
+_expected = compiled(lambda unknowns, fixed: expected_data(surface_of(unknowns, fixed), unknowns.parameters, fixed))
 
 
 def edges_of(
@@ -106,12 +105,54 @@ def edges_of(
     return along_x, along_y
 
 
+class PixelTerms(NamedTuple):
+    """Terms of every pixel that depend on no neighbour: form factors, and the noise bias [detector, y, x]."""
+
+    factors: FormFactors
+    noise_bias: np.ndarray
+
+    def thinned(self, stride: int) -> "PixelTerms":
+        """Keep every `stride`-th row and column."""
+        thin = (..., slice(None, None, stride), slice(None, None, stride))
+        f = self.factors
+        factors = FormFactors(
+            f.height[thin],
+            f.terms[thin],
+            f.direction[thin],
+            f.moves[thin],
+            f.moved,
+            f.level_height,
+            f.level,
+            f.level_moves,
+            f.stated,
+        )
+        return PixelTerms(factors, self.noise_bias[thin])
+
+
+def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerms:
+    """Expand form factors and estimate the noise bias at a state; `limit` as in `freeze`."""
+    held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
+    largest = _NOISY * noise * _steepness(*slopes)
+    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma
+    corrections = held.masked, held.moves, held.moved
+    with jax.enable_x64(True):
+        factors = _form_factors(problem.optics, problem.moves(state.parameters), state.surface.height, corrections)
+        bias = _noise_bias(*slopes, factors.terms[0], problem.shift, inverse_sigma, largest)
+    return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
+
+
+def _steepness(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
+    """Compute by how much more the slopes of a facet follow its normal than those of a level one [y, x]."""
+    return 1.0 + slope_x**2 + slope_y**2
+
+
 def freeze(
     problem: FitProblem,
     state: FitState,
     limit: float,
     cut: float,
     occluded: tuple[np.ndarray, np.ndarray] | None = None,
+    pixels: PixelTerms | None = None,
 ) -> tuple[Unknowns, FixedTerms]:
     """Fix corrections, edges and robust weights at a state; return the state as unknowns, too.
 
@@ -121,7 +162,9 @@ def freeze(
         limit: residual at which a datum's weight falls to a half [standard deviations].
         cut: misfit at which an edge loses most of its weight [standard deviations].
         occluded: edges to cut along x and y.
+        pixels: from `pixel_terms`; default: computed.
     """
+    pixels = pixel_terms(problem, state, limit) if pixels is None else pixels
     held, noise = state.held, problem.slope_noise
     height, slope_x, slope_y = state.surface.height, state.surface.slope_x, state.surface.slope_y
     dx, dy = problem.raster.dx, problem.raster.dy
@@ -136,8 +179,8 @@ def freeze(
         smoothness_weight(along_x.joined, slope_x, noise, 1),
         smoothness_weight(along_y.joined, slope_y, noise, 0),
     )
-    steepness = 1.0 + slope_x**2 + slope_y**2  # of slopes against normals
-    scale_x, scale_y = (_slope_scale(e, axis, noise * steepness) for e, axis in ((along_x, 1), (along_y, 0)))
+    free = noise * _steepness(slope_x, slope_y)
+    scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))
     whitening = _whitening(problem.raster.shape, dx, dy, noise)
     unknowns = Unknowns(
         dctn(height, norm="ortho") / whitening,
@@ -145,20 +188,15 @@ def freeze(
         (slope_y - one_sided(np.diff(height, axis=0) / dy, along_y.joined, 0)) / scale_y,
         state.parameters,
     )
-    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma
-    priors, moved = problem.priors, problem.moves(state.parameters)
-    with jax.enable_x64(True):
-        factors = _form_factors(problem.optics, moved, height, (held.masked, held.moves, held.moved))
-        largest = _NOISY * noise * steepness
-        bias = _noise_bias(slope_x, slope_y, factors.terms[0], problem.shift, inverse_sigma, largest)
+    inverse_sigma, priors = cauchy_weight(state.residuals, limit) / held.sigma, problem.priors
     occluded_std = held.corrections.occluded
     fixed = FixedTerms(
         data=problem.data,
         inverse_sigma=inverse_sigma * problem.stride,
-        form_factors=factors,
+        form_factors=pixels.factors,
         multiple=held.multiple,
         occluded=np.zeros(problem.signal.shape) if occluded_std is None else occluded_std,
-        noise_bias=bias,
+        noise_bias=pixels.noise_bias,
         modes=_common_modes(held, np.exp(priors.gain * state.parameters.log_gain)),
         drift_modes=problem.drift_modes,
         position=problem.position,
