@@ -365,6 +365,8 @@ def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossin
     low, relief, most = flat[cell.lowest], np.ptp(flat[np.stack(cell[:2])], 0), np.maximum(cell.n_levels, 1)
     share = [(v - low) / np.maximum(relief, 1e-9) for v in z]
     first, final = (np.floor(most * s).clip(0, most - 1).astype(int) for s in share)
+    # all levels of the receiver's own cell lie in one line of sight: the middle one stands for them
+    first, final = (np.where(begin == 0, (first + final) // 2, a) for a in (first, final))
     n = abs(final - first) + 1
     i = np.repeat(np.arange(len(n)), n)  # one strip per level
     k = np.arange(len(i)) - (np.cumsum(n) - n)[i]
