@@ -95,7 +95,7 @@ def compare(name: str, rays: int, finer: int = 1) -> Comparison:
     total, total_variance = (a.reshape(-1, y.size, x.size) for a in estimate.total())
     optics, raster = hx.Optics.of(instrument), hx.Raster(x, y)
     surface = hx.Surface(truth.height, *slopes_of_normal(truth.normals, instrument.beam_shift)[:2])
-    plan = hx.plan_radiosity(truth.height, truth.normals, optics, raster, substrate_um=scene.flat_size)
+    plan = hx.plan_radiosity(truth.height, truth.normals, optics, raster, substrate_um=scene.substrate_size)
     single, both = (np.asarray(hx.render(surface, optics, raster, corrections=c)) for c in ("masking", plan))
     return Comparison(single, both, mean[0], total, np.sqrt(variance[0]), np.sqrt(total_variance))
 
