@@ -131,7 +131,7 @@ def fit_heights(
         predict: multiple scattering and masked form factors on a surface.
         report: called before each outer iteration.
 
-    Source: own derivation; Levenberg-Marquardt of optimistix; robust weights (Geman and McClure, 1987).
+    Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
     """
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
