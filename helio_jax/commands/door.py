@@ -70,7 +70,7 @@ def marks_of(function: Any) -> dict[str, Reads | Writes]:
 
 
 class Command(TyperCommand):
-    """A command of helio; of an option of several numbers, which stand with spaces between, a comma is told."""
+    """A command of helio; commas between the numbers of an option are refused: they are separated by spaces."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse as usual, once no option of several values has been given one word with commas."""

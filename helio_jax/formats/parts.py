@@ -135,7 +135,7 @@ class Parts:
     def remove(self) -> None:
         """Remove the parts and what a killed process left of them, the manifest first, and the folder once it is empty.
 
-        When this is killed half-way, what is left is no unfinished run. What others put there stays.
+        An interrupted removal leaves no unfinished run. Files of others stay.
         """
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             (self.folder / "manifest.json").unlink(missing_ok=True)

@@ -247,7 +247,7 @@ def check_target(target: Path) -> Path:
 def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
     """Refuse, before any work, outputs that are an input, that are one file, or that could not be written.
 
-    Files are told apart by what they are, not by how they are spelled: links of both kinds are seen through.
+    Files are compared by identity, not by name, symbolic and hard links included.
 
     Args:
         inputs: of every file that is read, what names it (an option) and its path.
@@ -314,7 +314,7 @@ def _is_same(path: Path, other: Path) -> bool:
         if path.exists() and other.exists():
             return os.path.samefile(path, other)
         return path.name == other.name and os.path.samefile(path.parent, other.parent)
-    except (OSError, RuntimeError):  # told by whoever reads or writes it
+    except (OSError, RuntimeError):  # reported by whoever reads or writes it
         return False
 
 

@@ -1,18 +1,18 @@
-"""How the rounds of a fit come to rest: how far there is left to go, how it ended."""
+"""Convergence of the outer iterations of a fit: the error that remains, and how the fit ended."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 SLOWEST = 0.9
-"""Contraction per round that a fit is credited with at least: what does not converge is off by nine last changes."""
+"""Largest contraction per iteration that a fit is credited with: without convergence the error is nine last changes."""
 
 
 def aitken(change_before: np.ndarray, change: np.ndarray) -> float:
-    """Return after how many times the last change of the heights, by it and the one before, rounds would be at rest.
+    """Extrapolate a linearly convergent iteration: distance to its limit in units of the last change, plus one.
 
-    It is above 1 where changes creep, below where they swing: a wall's shadow that is predicted too wide raises what
-    lies in it, and the next one is predicted too narrow. Changes that agree, or grow, give infinity, or less than 0.
+    Above 1 where changes keep their sign, below where they alternate (a mask that is predicted too wide raises the
+    surface in it, and the next one is predicted too narrow). Changes that agree, or grow, give infinity or less than 0.
 
     Source: Aitken's Delta^2 for vectors: Irons and Tuck, Int. J. Numer. Meth. Eng. 1 (1969) 275; Kuettler and Wall,
         Comput. Mech. 43 (2008) 61, eq. 44.
@@ -23,49 +23,47 @@ def aitken(change_before: np.ndarray, change: np.ndarray) -> float:
 
 
 def contraction_of(changes: Sequence[float]) -> float | None:
-    """Return by what factor the last round's change is that of the round before, or None where there is none."""
+    """Compute the ratio of the last two changes, or None where there are not two."""
     return changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
 
 
 def remaining_error(changes: Sequence[float], extrapolation: float) -> float:
-    """Return how far the heights are from where further rounds would take them, in changes of the last one.
+    """Estimate the distance of the heights from the limit of further iterations, in units of the last change.
 
-    Rounds that creep have as far to go as `aitken` says, nine changes at most. Those that swing, or tremble for their
-    predictions are noisy, are off by one change, or by what is left of it if changes go on to fall as the last two did,
-    by the lesser fall: one that happens to be small after others that were not says nothing. A single round's change is
-    taken to halve.
+    Slow convergence: the extrapolation, nine changes at most. Iterates that oscillate, or are limited by Monte Carlo
+    noise: one change, or the rest of the geometric series if changes fall at the slower of their last two rates; one
+    small change after larger ones proves nothing. The change of a single iteration is taken to halve.
 
     Args:
-        changes: root mean square of the changes of the heights in every round.
-        extrapolation: from `aitken` by the last two; of no use with fewer.
+        changes: root mean square of the height changes of every iteration.
+        extrapolation: from `aitken` by the last two; unused with fewer.
     """
     known = [c for c in (contraction_of(changes), contraction_of(changes[:-1])) if c is not None]
     if not known:
         return 1.0
     contraction, most = max(known), SLOWEST / (1.0 - SLOWEST)
-    creeps = extrapolation - 1.0 if 0.0 < extrapolation < 1.0 + most else most
-    swings = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
-    return max(creeps, swings)
+    slow = extrapolation - 1.0 if 0.0 < extrapolation < 1.0 + most else most
+    oscillating = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
+    return max(slow, oscillating)
 
 
 def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
-    """Return how a fit ended, in a sentence.
+    """Describe how a fit ended, in a sentence.
 
-    A last change that is larger than the one before is a jitter about the result unless it is also more than half of
-    the largest one: then the fit diverges.
+    A last change above the one before is noise unless it also exceeds half of the largest one: then the fit diverges.
 
     Args:
-        changes: of the heights in every round, um.
-        tolerance: below which a change counts as none, um.
+        changes: of the heights in every iteration, um.
+        tolerance: below which the fit has converged, um.
         is_interrupted: whether the user stopped it.
     """
-    last = f"the last of {len(changes)} rounds changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
+    last = f"the last of {len(changes)} iterations changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
     if is_interrupted:
         return f"interrupted: best so far; {last}"
     if changes[-1] < tolerance:
         return f"converged: {last}"
     if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):
         contraction = contraction_of(changes)
-        growth = "after none before" if contraction is None else f"{contraction:.2f} times the round before"
+        growth = "after none before" if contraction is None else f"{contraction:.2f} times the iteration before"
         return f"diverging: {last}, {growth}; raise mask_error or use nearfield"
     return f"stopped: {last}; raise max_rounds for more"

@@ -2,7 +2,7 @@
 
 Every iteration: predict multiple scattering and masked aperture parts on the current surface (a callable that
 `workflows` supplies, so this stage knows no tracer), decide which edges are smooth, kinked or cut (`edges`), renew the
-robust weights, then a few Levenberg-Marquardt steps (`problem.step`). All of that is constant during a step.
+robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is constant during a step.
 """
 
 from collections.abc import Callable

@@ -80,9 +80,9 @@ def solve_linear(signal: np.ndarray, variance: np.ndarray, phi: np.ndarray) -> P
     Pixels recorded in fewer than 3 images get the flat normal and weight 0 (as in the paper). With more than 3
     images, data darker than the model by several standard deviations are taken as masked and down-weighted
     (Cauchy weight, one-sided: a mask can only darken). Where an aperture is at or below the facet's own horizon and the
-    datum brighter than n . Phi, which is then too small or negative, it tells only that the facet faces away: it is
+    datum brighter than n . Phi, which is then too small or negative, it shows only that the facet faces away: it is
     left out where 3 others remain (else steep facets come out too flat). With exactly 3 images nothing is redundant,
-    and masked data stay: they hold all the steep slope there is (DESIGN.md section 3).
+    and masked data stay: they hold all the steep slope there is (docs/conventions.md).
 
     Args:
         signal, variance: data [detector, y, x], NaN where not observed.

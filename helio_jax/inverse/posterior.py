@@ -126,10 +126,10 @@ class Posterior:
         return np.sqrt(np.mean(self.samples**2, axis=0))
 
     def levelled(self, planes: np.ndarray) -> "Posterior":
-        """Return it for the heights above a reference plane that is tilted, by the parameters tilt[0] and tilt[1].
+        """Refer the heights to a tilted substrate, by the parameters tilt[0] and tilt[1].
 
         Args:
-            planes: what one prior deviation of each raises the reference plane by [2, y, x], um.
+            planes: heights of the substrate for one prior standard deviation of each [2, y, x], um.
         """
         tilts = [self.names.index(name) for name in ("tilt[0]", "tilt[1]") if name in self.names]
         if not tilts:
@@ -377,10 +377,10 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
 
 
 def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
-    """Return by what factor an instrument is farther from what was stated than prior and data explain; at least 1.
+    """Compute the Birge ratio of an instrument: its distance from the stated one over what prior and data explain; >= 1.
 
     Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
-    about the stated one. The factor is the Birge ratio of the combinations of which the data tell more than the prior.
+    about the stated one. Only combinations that the data determine better than the prior count.
 
     Args:
         values: fitted, in prior deviations [parameter].
@@ -389,10 +389,10 @@ def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
     Source: Birge, Phys. Rev. 40 (1932) 207; as scale factor: Particle Data Group, Introduction, sec. 5.2.2.
     """
     left, ways = np.linalg.eigh(covariance)
-    is_told = left < 0.5
-    if not is_told.any():
+    is_determined = left < 0.5
+    if not is_determined.any():
         return 1.0
-    square = (ways.T @ values)[is_told] ** 2 / (1.0 - left[is_told])
+    square = (ways.T @ values)[is_determined] ** 2 / (1.0 - left[is_determined])
     return float(max(1.0, np.sqrt(square.mean())))
 
 

@@ -56,7 +56,7 @@ def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
     """Return the number of the region of every pixel [y, x]: pixels joined by joined edges; the largest region is 0.
 
     Args:
-        joined_x, joined_y: what is left of the edges [y, x - 1], [y - 1, x].
+        joined_x, joined_y: weight left to the edges [y, x - 1], [y - 1, x].
     """
     shape = (joined_x.shape[0], joined_y.shape[1])
     pixel = np.arange(shape[0] * shape[1]).reshape(shape)
@@ -101,7 +101,7 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, joined: np.ndarray, pitch
 
     Args:
         height, slope: heights, um, and slopes along the axis [y, x].
-        joined: what is left of the edges.
+        joined: weight left to the edges.
         pitch: um.
     """
     return (joined < JOINED) & (np.abs(trapezoid_gap(height, slope, pitch, axis)) > SMALLEST_JUMP)

@@ -100,7 +100,7 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     root, tip = seed.size, seed.size + seed.max() + 1  # nodes: pixels, the root, one for each seed
     start = np.concatenate([*(a.ravel() for a, _ in ends), inside, np.full(seed.max(), root)])
     end = np.concatenate([*(b.ravel() for _, b in ends), root + seed[inside], np.arange(root + 1, tip)])
-    # every seed hangs together and on the root by the cheapest links; all else joins by what is left of 1 + strength
+    # every seed hangs together and on the root by the cheapest links; all else joins by the rest of 1 + strength
     cost = np.concatenate([*(1.0 + s.ravel() for s in strength), np.full(inside.size, 1e-3), np.full(seed.max(), 1e-6)])
     tree = minimum_spanning_tree(coo_matrix((cost, (start, end)), shape=(tip, tip)).tocsr()).tocoo()
     kept = (tree.row != root) & (tree.col != root)

@@ -205,8 +205,8 @@ def _core(region: np.ndarray) -> np.ndarray:
 def _assign_borders(rec: Reconstruction, labels: np.ndarray, use: np.ndarray) -> np.ndarray:
     """Assign pixels within a window of facets to the facet whose local plane is nearest in height; one piece each.
 
-    The planes are local: the plane of a whole flank that is bent by 2 degrees over its length misses its edge by tens
-    of um, so that a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
+    The planes are local: the plane of a whole flank whose slope changes by 2 degrees over its length misses its edge by
+    tens of um, so that a top face of 0.110 mm2 comes out at 0.137 (benchmarks/crystal.py, `tall`).
     """
     out, best = labels.copy(), np.full(labels.shape, np.inf)
     numbers = range(1, int(labels.max()) + 1)

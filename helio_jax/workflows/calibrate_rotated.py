@@ -33,7 +33,7 @@ _PRIORS = {"gain_std": 0.05, "offset_std": 0.1, "max_rounds": 12}
 _DRIFT_PRIORS = {"drift_std": 0.1, "drift_degrees": (3, 3)}
 """Priors of the fit after the self-calibration: errors of gains, backgrounds and their drift, over the signal of the
 substrate, on the synthetic samples of benchmarks/crystal.py (1 to 2 % of the reading), and the iterations of the fit.
-With drift held fixed their heights are bent by 20 to 30 um."""
+With drift held fixed their heights are wrong by 20 to 30 um."""
 _JUMPS = {"robust_limits": (10.0, 10.0, 10.0, 8.0), "jump_limits": (100.0, 30.0, 10.0, 4.0)}
 """A beam along the normal sees depth jumps only at walls as steep as itself, so edges are cut gradually. Edges that the
 start cuts by mistake stay cut otherwise, with strips of substrate 60 um too low at the foot of a tall crystal.

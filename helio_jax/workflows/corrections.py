@@ -3,7 +3,7 @@
 `make_predictor` gives the callable that `reconstruct` asks for. Masks come from the horizon march, which takes what
 lies behind a rim for a sheet along the beam; multiple scattering is traced (or computed by radiosity). The side that
 the beam does not see may stand anywhere between that sheet and below the rim: both terms are predicted at two places
-(`UNSEEN_SHARES`), their mean is expected, and half their difference is one unknown of the fit.
+(`OCCLUDED_NODES`), their mean is expected, and half their difference is one unknown of the fit.
 """
 
 import math
@@ -30,14 +30,14 @@ from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 
-UNSEEN_SHARES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
-"""Where the unseen side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
+OCCLUDED_NODES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
+"""Where the occluded side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
 Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
 RAYS = 8
 """Paths per pixel and branch."""
 SMOOTH_PATHS = 40
 """The traced image is averaged over neighbours until this many paths count in every pixel."""
-CALM_PITCHES = 0.5
+MAX_SMOOTHING_STEP = 0.5
 """Mean heights that differ from a pixel's by more than this many pitches are not of its facet."""
 MAX_BURIED = 0.05
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
@@ -57,7 +57,7 @@ def make_predictor(
     """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
     Multiple scattering is traced from the given points, with their normals, or computed by radiosity, which uses
-    neither `n_rays` nor `seed` and knows of the unseen side only the sheet along the beam.
+    neither `n_rays` nor `seed` and knows of the occluded side only the sheet along the beam.
 
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
     with a `flat` border by the flat z = 0, with a `free` one by `extend_border`
@@ -91,21 +91,21 @@ def make_predictor(
             plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * raster.reach)
             return radiosity_corrections(surface, optics, Raster.of(stack), plan)
         masked = masking_corrections(surface, optics, Raster.of(stack)).masked
-        calm, calm_normals = _without_noise(height, normals, CALM_PITCHES * min(dx, dy))
-        sides = raster.sides(calm, calm_normals)
+        smooth, smooth_normals = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
+        sides = raster.sides(smooth, smooth_normals)
         branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes = passes_for(RAYS * branches, SMOOTH_PATHS)
-        traced = [smooth_along_surface(side.multiple(settings), calm_normals, passes) for side in sides]
+        traced = [smooth_along_surface(side.multiple(settings), smooth_normals, passes) for side in sides]
         if len(sides) == 1:
-            return Corrections(masked, traced[0], normals=calm_normals)
+            return Corrections(masked, traced[0], normals=smooth_normals)
         is_masked = np.any(masked != 0.0, axis=(0, 1))
-        sheet = raster.side(calm, calm_normals, 0.0).masked(is_masked)
+        sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
         freed = [side.masked(is_masked) - sheet for side in sides]
         normal = np.moveaxis(normals, -1, 0)
         either = [m - single_scattering(f, normal) for m, f in zip(traced, freed, strict=True)]
         found, occluded = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
-        return Corrections(masked + np.mean(freed, axis=0), found, occluded, calm_normals)
+        return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals)
 
     return predict
 
@@ -121,21 +121,21 @@ def _surroundings(instrument: Instrument) -> float:
     return outermost + instrument.sample_distance
 
 
-def _without_noise(height: np.ndarray, normals: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
+def _denoise_within_facets(height: np.ndarray, normals: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return heights [y, x], um, and unit normals [y, x, 3] averaged over neighbours on the same facet.
 
     Facets that are rough with noise see one another: on a flat they would add half a per cent of its signal. Where the
     mean height differs by more than `largest`, neighbours are at another level, and the height stays.
     """
     mean = smooth_along_surface(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), normals)
-    calm = np.moveaxis(mean[:3], 0, -1)
-    calm /= np.linalg.norm(calm, axis=-1, keepdims=True)
-    return np.where(np.abs(mean[3] - height) < largest, mean[3], height), calm
+    smooth = np.moveaxis(mean[:3], 0, -1)
+    smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+    return np.where(np.abs(mean[3] - height) < largest, mean[3], height), smooth
 
 
 @dataclass(frozen=True)
-class _Side:
-    """A surface whose unseen side stands at one place: a point for every pixel, and the mesh through them."""
+class SurfaceHypothesis:
+    """A surface whose occluded side stands at one place: a point for every pixel, and the mesh through them."""
 
     raster: "_Raster"
     points: Hits
@@ -169,7 +169,7 @@ class _Side:
 @dataclass(frozen=True)
 class _Raster:
     """Beam positions [y, x], how far off the surface points are put, half the side of what is around [um], and whether
-    that is the flat z = 0; else it is level ground, to which the border leads."""
+    that is the flat z = 0; else it is the substrate, to which the border leads."""
 
     instrument: Instrument
     x: np.ndarray
@@ -178,8 +178,8 @@ class _Raster:
     reach: float
     is_flat_around: bool
 
-    def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> _Side:
-        """Return the surface with its unseen side at a share of the way back."""
+    def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> SurfaceHypothesis:
+        """Return the surface with its occluded side at a share of the way back."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
         at = *self.instrument.surface_position(self.x, self.y, height), height
         behind = occluded_vertices(*at, normals, shift, share)
@@ -191,10 +191,10 @@ class _Raster:
             around, behind = (extend_border(*points, ground, self.reach) for points in (at, behind))
             body = with_cavities(surface_body(*around), around, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
-        return _Side(self, Hits.on_mesh(point, normal), Intersector(body))
+        return SurfaceHypothesis(self, Hits.on_mesh(point, normal), Intersector(body))
 
-    def sides(self, height: np.ndarray, normals: np.ndarray) -> list[_Side]:
-        """Return the surface with its unseen side at all `UNSEEN_SHARES`; one, where nothing is unseen."""
+    def sides(self, height: np.ndarray, normals: np.ndarray) -> list[SurfaceHypothesis]:
+        """Return the surface with its occluded side at all `OCCLUDED_NODES`; one, where nothing is unseen."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
         is_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
-        return [self.side(height, normals, share) for share in ((0.0,) if is_seen else UNSEEN_SHARES)]
+        return [self.side(height, normals, share) for share in ((0.0,) if is_seen else OCCLUDED_NODES)]

@@ -152,7 +152,7 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     parts = Parts(output)
     if not parts.exist:
         if is_finished(output):
-            parts.remove()  # what is left when a process is killed while it cleans up
+            parts.remove()  # a process was killed while it cleaned up
             say(f"{output} is complete: nothing to resume")
             return []
         raise ResumeError(f"there is no unfinished run of {output}: {parts.folder} does not exist; start it anew")
@@ -298,7 +298,7 @@ def reconstruct(
 
 
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
-    """Score a reconstruction against the true heights of the same rays (DATA.md, "How we score spheres")."""
+    """Score a reconstruction against the true heights of the same rays (docs/results.md)."""
     return evaluate_height(rec, truth)
 
 
@@ -376,7 +376,7 @@ def run(
             f"{scene_path}: heights come from one raster, scan.kind is {scene.scan.kind!r} with {scene.scan.n_views} "
             "view(s): use helio simulate, which writes any scan"
         )
-    scene.apertures()  # heights need them: told before anything is traced
+    scene.apertures()  # heights need them: an error before anything is traced
     out = Path(folder) if folder else Path("helio-out") / scene.name
     names = {label: name for label, name in RUN_FILES.items() if report or label not in ("report", "panel")}
     check_outputs(files_read(scene_path, "the scene", overrides), files_within("-o", out, names.values()))

@@ -72,7 +72,7 @@ def files_read(
 ) -> list[tuple[str, Path]]:
     """Return what names each file that a scene or instrument file has read, and its path; the file itself first.
 
-    Beside an OBJ every .mtl counts. Nothing is checked: what is wrong with the file is told when it is loaded.
+    Beside an OBJ every .mtl counts. Nothing is checked: errors in the file are reported when it is loaded.
     """
     path = Path(path)
     names: list[str] = []

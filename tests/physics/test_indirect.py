@@ -84,7 +84,7 @@ def predictions(name: str, **changes):
     height, normals = hits.point[:, 2].reshape(grid_x.shape), hits.normal.reshape(*grid_x.shape, 3)
     stack = MicrographStack(np.zeros((3, *height.shape)), x, y, scene.instrument)
     with mock.patch(
-        "helio_jax.workflows.corrections.UNSEEN_SHARES", (0.0, 0.0)
+        "helio_jax.workflows.corrections.OCCLUDED_NODES", (0.0, 0.0)
     ):  # the sheet along the beam, as radiosity has it
         traced, ours = (
             make_predictor(stack, 2_000_000, scene.substrate_size, multiple=model)(height, normals).multiple
