@@ -88,9 +88,11 @@ def compare(name: str, rays: int, finer: int = 1) -> Comparison:
         instrument = four.at_distance(instrument.sample_distance)
     x, y = scene.positions()
     truth = true_surface(scene, x, y)
+    assert truth.normals is not None  # of a scene
     settings = scene.trace.changed(rays=rays, branches=8, n_orders=2, maps=False)
     experiment = make_experiment(scene.build_body(), instrument, settings)
-    estimate = trace_pixels(experiment, *(g.ravel() for g in np.meshgrid(x, y)))
+    at_x, at_y = np.meshgrid(x, y)
+    estimate = trace_pixels(experiment, at_x.ravel(), at_y.ravel())
     mean, variance = (a.reshape(*a.shape[:2], y.size, x.size) for a in estimate.probability())
     total, total_variance = (a.reshape(-1, y.size, x.size) for a in estimate.total())
     optics, raster = hx.Optics.of(instrument), hx.Raster(x, y)
