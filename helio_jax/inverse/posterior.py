@@ -377,7 +377,7 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
 
 
 def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
-    """Compute the Birge ratio of an instrument: its distance from the stated one over what prior and data explain; >= 1.
+    """Compute the Birge ratio of an instrument: its deviation over what prior and data explain; at least 1.
 
     Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
     about the stated one. Only combinations that the data determine better than the prior count.
