@@ -96,6 +96,7 @@ def compare(name: str, rays: int, finer: int = 1) -> Comparison:
     mean, variance = (a.reshape(*a.shape[:2], y.size, x.size) for a in estimate.probability())
     total, total_variance = (a.reshape(-1, y.size, x.size) for a in estimate.total())
     optics, raster = hx.Optics.of(instrument), hx.Raster(x, y)
+    assert truth.normals is not None  # the scene is one of shapes
     surface = hx.Surface(truth.height, *slopes_of_normal(truth.normals, instrument.beam_shift)[:2])
     plan = hx.plan_radiosity(truth.height, truth.normals, optics, raster, substrate_um=scene.substrate_size)
     single, both = (np.asarray(hx.render(surface, optics, raster, corrections=c)) for c in ("masking", plan))
