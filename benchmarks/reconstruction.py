@@ -272,7 +272,7 @@ def without_masks(corrections: Corrections) -> Corrections:
 
 def levels_without_masks() -> Patch:
     """Let no mask follow the level of a plateau."""
-    return mock.patch("helio_jax.inverse.problem.region_responses", lambda *_: ())
+    return mock.patch("helio_jax.inverse.state.region_responses", lambda *_: ())
 
 
 def ablation_row(record: Record, seed: int, size: int) -> None:

@@ -92,8 +92,8 @@ def render(
 
     The cosine law, a spot much smaller than a pixel, nothing outside of the raster but the substrate. Works under
     `jax.jit`, `grad`, `jvp`, `vmap`, `jacfwd` and `jacrev` in every argument that is a number; one compilation serves
-    every geometry, surface and read-out of the same shapes. NumPy arguments are computed in float64, JAX arrays in
-    their own precision.
+    every geometry, surface and read-out of the same shapes. Float64 NumPy heights are computed in float64, JAX arrays
+    in their own precision. More: docs/gradients.md.
 
     Args:
         height: above the substrate at the beam positions [y, x], um; or a `Surface` with known slopes. Slopes of

@@ -105,7 +105,8 @@ def fisher(
     numbers, parameters = tuple(map(str, range(optics.n_detectors))), {}
     for name, std in zip(posterior.names, deviation, strict=True):
         prior, unit = units.get(kind_of(name), (1.0, "prior standard deviations"))
-        parameters[plain_name(name, numbers)] = (float(prior * std), float(prior), unit)
+        if prior > 0:
+            parameters[plain_name(name, numbers)] = (float(prior * std), float(prior), unit)
     return Information(posterior.height_std, parameters, posterior)
 
 

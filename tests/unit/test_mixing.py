@@ -8,7 +8,7 @@ import pytest
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse import problem as fit_problem
+from helio_jax.inverse import steps
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import border_residuals, data_residuals
 from helio_jax.inverse.settings import ReconstructSettings
@@ -37,7 +37,7 @@ def test_data_tell_levels_from_gains_only_where_the_border_is_free(bshem, monkey
         used.append(np.asarray(mixing))
         raise InterruptedError
 
-    monkeypatch.setattr(fit_problem, "solve", solve)
+    monkeypatch.setattr(steps, "solve", solve)
     with pytest.raises(InterruptedError):
         step(problem, state, 8.0, 4.0, is_instrument_free=True)
     (mixing,) = used

@@ -9,8 +9,7 @@ import pytest
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse import problem as fit_problem
-from helio_jax.inverse import residuals
+from helio_jax.inverse import residuals, steps
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
@@ -45,7 +44,7 @@ def test_noisy_slopes_raise_the_gains_as_the_second_order_tells(bshem, monkeypat
     problem, state = level_fit(bshem, 0.05)
     _, fixed = freeze(problem, state, 8.0, 4.0)
     expected = -fixed.noise_bias.mean((1, 2)) / problem.data.mean((1, 2))
-    monkeypatch.setattr(fit_problem, "_noise_bias", lambda *_: np.zeros(problem.data.shape))
+    monkeypatch.setattr(steps, "_noise_bias", lambda *_: np.zeros(problem.data.shape))
     monkeypatch.setattr(residuals, "edge_scale", lambda *_: 1.0)
     jax.clear_caches()
     found = rise(problem, state, 2)
