@@ -1,4 +1,4 @@
-"""Heights and error bars on families of random samples (benchmarks/shapes.py): rows 1 to 9 of docs/results.md, Any shape.
+"""Heights and error bars on random samples in families (benchmarks/shapes.py): docs/results.md, Any shape.
 
 python benchmarks/families.py [--families mesa,slot,...] [--members 12] [--seed 1] [--methods refine,nearfield,linear]
     [--size 61 101] [--output benchmarks/out] [--keep] [--tiny]
@@ -13,7 +13,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +175,7 @@ def steps(member: Member, truth: np.ndarray, rec: Reconstruction) -> list[Case]:
 # --- runs and tables ------------------------------------------------------------------------------------------------
 
 
-def run_member(member: Member, methods: list[str], folder: Path, keeps: bool, done: Callable[[str, str], bool]):
+def run_member(member: Member, methods: Sequence[str], folder: Path, keeps: bool, done: Callable[[str, str], bool]):
     """Yield the cases of a member that are not done yet."""
     left = [m for m in methods if not done(member.name, m)]
     if not left:
@@ -208,8 +208,9 @@ def line(case: Case) -> str:
     tilt = f" tilt {case['tilt_deg']:.2f}" if "tilt_deg" in case else ""
     coverage = "/".join(f"{c:.0%}" for c in case.get("coverage_all", []))
     rms = np.nan if case["rms_valid"] is None else case["rms_valid"]
+    recovered = case.get("recovered", np.nan)
     return (
-        f"{case['case']:<16}{case['method']:<10}{case['kind']:<22} rms {rms:6.2%} rec {case.get('recovered', np.nan):6.1%} "
+        f"{case['case']:<16}{case['method']:<10}{case['kind']:<22} rms {rms:6.2%} rec {recovered:6.1%} "
         f"silent {case.get('silent', np.nan):5.1%} invalid {case['invalid']:4.0%} cover {coverage:<9} "
         f"{'TOLD ' if case['told'] else ''}{case['seconds']:4.0f} s{tilt} steps {shown}"
     )

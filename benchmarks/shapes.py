@@ -277,7 +277,7 @@ def overhang(rng: Rng, scan: Scan) -> Member:
 def _grid(scan: Scan, rng: Rng, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the axes and coordinates of a height map four times finer than the raster, shifted by a fraction of it."""
     step = scan.pitch / 4.0
-    half = int(math.ceil(reach * scan.field / step))
+    half = math.ceil(reach * scan.field / step)
     shift = rng.uniform(-0.5, 0.5, 2) * scan.pitch
     x, y = (step * np.arange(-half, half + 1) + s for s in shift)
     return (x, y, *np.meshgrid(x, y))

@@ -109,6 +109,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   samples             posterior samples of the heights
   noise_bias          bias that the noise of the data causes
   quality             why a height is not valid
+  verdict             whether the data support a height map
   instrument_report   what a fit found out about the instrument
   consistency         misfit of one surface to all images
 calibration/          background, gain, drift and noise

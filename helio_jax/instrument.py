@@ -144,6 +144,11 @@ class Uncertainty(Settings):
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=30.0)
     """Of the azimuth of each aperture about the nominal spot [deg]."""
 
+    @property
+    def is_stated(self) -> bool:
+        """Whether anything of the geometry is uncertain."""
+        return any(self.model_dump().values())
+
 
 class Instrument(Settings):
     """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians)."""

@@ -21,8 +21,19 @@ REASONS = (
     "depth jump",
     "outside the data",
     "floating",
+    "contradicts the data",
 )
 """Meaning of the integers of `Reconstruction.reason`."""
+
+MAX_CONTRADICTED = 0.05
+"""Largest share of contradicted pixels, among those that nothing else makes invalid, of a height map that its data do
+not contradict as a whole."""
+
+
+def contradicted_share(reason: np.ndarray) -> float:
+    """Compute the share of pixels that contradict the data among those that nothing else makes invalid."""
+    is_contradicted = reason == REASONS.index("contradicts the data")
+    return float(np.sum(is_contradicted) / max(1, np.sum(is_contradicted | (reason == 0))))
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,8 @@ class Reconstruction:
         is_valid: True where enough data determine the height [y, x].
         reason: index into `REASONS` [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
+        chi_square: mean square deviation, in standard deviations, of the data of each pixel and its neighbours from the
+            micrographs traced on this height map [y, x]; None: not tested. See `inverse.verdict`.
         gain, offset: fitted or assumed, data = gain * model + offset [detector].
         status: one sentence on how the method ended.
         provenance: history, on which no step depends (JSON-compatible).
@@ -59,6 +72,7 @@ class Reconstruction:
     height_std: np.ndarray | None = None
     height_samples: np.ndarray | None = None
     residuals: np.ndarray | None = None
+    chi_square: np.ndarray | None = None
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
     border: Literal["flat", "free"] = "flat"
@@ -75,6 +89,7 @@ class Reconstruction:
         shapes: dict[str, tuple[int | None, ...]] = {
             "height": shape,
             "albedo": shape,
+            "chi_square": shape,
             "height_std": shape,
             "height_samples": (None, *shape),
             "normals": (*shape, 3),
@@ -119,6 +134,11 @@ class Reconstruction:
     def has_relief(self) -> np.ndarray:
         """True where height differences are meaningful: valid, or floating with an unknown common level [y, x]."""
         return self.is_valid | (self.reason == REASONS.index("floating"))
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the data contradict the height map as a whole: `MAX_CONTRADICTED`."""
+        return contradicted_share(self.reason) > MAX_CONTRADICTED
 
     def beam_positions(self, pixels: np.ndarray) -> np.ndarray:
         """Convert pixel coordinates (column, row) [n, 2] to beam positions (x, y) [n, 2], um."""

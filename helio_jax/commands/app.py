@@ -52,9 +52,25 @@ Scheduler = Annotated[str | None, typer.Option(help="Address of a dask scheduler
 Restart = Annotated[bool, typer.Option("--restart", help="Discard what an unfinished run left, and start afresh.")]
 Method = Annotated[str | None, typer.Option(help="linear, nearfield or refine (default: the scene's, or refine).")]
 
+Strict = Annotated[bool, typer.Option("--strict", help="Exit code 4 if the data contradict the height map.")]
+
 
 def say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
+
+
+def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
+    """Warn of a height map that its own data contradict; with `strict`, end with exit code 4.
+
+    Raises:
+        GuardError: with `strict`.
+    """
+    from helio_jax.errors import GuardError
+
+    if is_contradicted and strict:
+        raise GuardError("the data contradict the height map (--strict): it is written, see its status above")
+    if is_contradicted:
+        say("warning: the data contradict this height map: do not trust it; the status above says where they differ")
 
 
 class Bar:

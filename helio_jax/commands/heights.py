@@ -15,10 +15,12 @@ from helio_jax.commands.app import (
     Bar,
     H5File,
     Method,
+    Strict,
     app,
     given_options,
     print_table,
     set_options,
+    warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads
 
@@ -35,6 +37,7 @@ def reconstruct(
     write_instrument: Annotated[
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
+    strict: Strict = False,
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
@@ -59,6 +62,7 @@ def reconstruct(
     _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
+    warn_if_contradicted(result.is_contradicted, strict)
 
 
 @app.command()

@@ -20,11 +20,13 @@ from helio_jax.commands.app import (
     SceneArg,
     Scheduler,
     Seed,
+    Strict,
     Workers,
     app,
     given_options,
     print_table,
     say,
+    warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads, Writes
 
@@ -48,6 +50,7 @@ def run(
     scheduler: Scheduler = None,
     restart: Restart = False,
     as_json: AsJson = False,
+    strict: Strict = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
     from helio_jax.workflows.pipeline import Executor
@@ -58,6 +61,7 @@ def run(
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
+        warn_if_contradicted(result.is_contradicted, strict)
         return
     print(f"\n{result.name}: {result.method}, {result.status}")
     print_table(result.scores.as_table())
@@ -66,6 +70,7 @@ def run(
         print(f"  {label:<12} {path}")
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
+    warn_if_contradicted(result.is_contradicted, strict)
 
 
 @app.command()

@@ -10,7 +10,7 @@ from helio_jax.arrays import pitch
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
-REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377")
+REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377", "#66ccee")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""

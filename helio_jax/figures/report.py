@@ -102,6 +102,8 @@ def _headline(stack: MicrographStack | None, rec: Reconstruction) -> str:
     if stack is not None:
         facts.insert(0, f"{stack.name} ({stack.noise})")
     status = f"<br>{html.escape(rec.status)}" if rec.status else ""
+    if rec.is_contradicted:
+        status = f'<br><strong class="warning">Warning: the data contradict this height map.</strong>{status}'
     return f'<p class="facts">{html.escape(" · ".join(facts))}{status}</p>'
 
 

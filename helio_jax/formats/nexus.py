@@ -74,6 +74,7 @@ RECONSTRUCTION_FIELDS = (
     Field("is_valid", "is_valid", "", "1 where enough data determine the height"),
     Field("reason", "reason", "", "why a height is not valid: " + ", ".join(f"{i} {r}" for i, r in enumerate(REASONS))),
     Field("residuals", "residuals", "", "(data - model) / standard deviation"),
+    Field("chi_square", "chi_square", "", "mean square deviation of the data from the traced map, 3 x 3 pixels"),
     Field("gain", "gain", "", "data = gain * model + offset, per detector"),
     Field("offset", "offset", "", "data = gain * model + offset, per detector"),
     Field("border", "border", "", "flat: heights count from the substrate at the border; free: their level is unknown"),

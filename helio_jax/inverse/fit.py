@@ -40,6 +40,7 @@ class Fit:
     """Result of the fit; arrays as in `Reconstruction`.
 
     Attributes:
+        problem, state: what was fitted, and where the fit ended.
         surface: heights and slopes.
         normals: unit normals [y, x, 3].
         albedo: relative reflectivity [y, x].
@@ -58,6 +59,8 @@ class Fit:
         is_interrupted: whether it was stopped from the keyboard.
     """
 
+    problem: FitProblem
+    state: FitState
     surface: Surface
     normals: np.ndarray
     albedo: np.ndarray
@@ -200,6 +203,8 @@ def _finish(
     with jax.enable_x64(True):
         albedo = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
     return Fit(
+        problem=problem,
+        state=state,
         surface=surface,
         normals=surface.normals(problem.shift),
         albedo=albedo,

@@ -7,6 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -35,6 +36,7 @@ from helio_jax.inverse.quality import (
 from helio_jax.inverse.regions import find_plateaus, joined, unexplained
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
+from helio_jax.inverse.verdict import Trace, judged, residuals_of_fit, residuals_of_map
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -63,8 +65,9 @@ def reconstruct_stack(
     settings: ReconstructSettings,
     make_predict: "Callable[[int], Predict] | None" = None,
     report: "Report | None" = None,
+    trace: Trace | None = None,
 ) -> Reconstruction:
-    """Reconstruct heights from three or more micrographs.
+    """Reconstruct heights from three or more micrographs, and test them against these.
 
     Args:
         stack: images of one scan; background known or zero.
@@ -72,6 +75,7 @@ def reconstruct_stack(
         make_predict: from a number of paths to what predicts, with them, masks and multiple scattering; `refine` needs
             it, the other methods correct with it.
         report: called before each iteration of `refine`.
+        trace: traces the finished map, for the verdict of the data (`verdict`); None: no verdict.
 
     Raises:
         GuardError: fewer than 3 images, no pixel recorded in 3 of them, or a height that is not finite.
@@ -83,12 +87,13 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result = _refined(stack, settings, make_predict, report)
+        result, residuals = _refined(stack, settings, make_predict, report)
     else:
         result = photometric_heights(stack, settings, make_predict and make_predict(start_paths(stack, settings)))
+        residuals = partial(residuals_of_map, stack, result)
     if not np.all(np.isfinite(result.height)):
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
-    return result
+    return judged(result, stack, partial(residuals, trace)) if trace else result
 
 
 def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
@@ -228,8 +233,8 @@ def _start(stack: MicrographStack, settings: ReconstructSettings, predict: "Pred
     return start, smoothed
 
 
-def _refined(stack, settings, make_predict, report) -> Reconstruction:
-    """Reconstruct by the fit."""
+def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], np.ndarray]]:
+    """Reconstruct by the fit; return what computes its residuals from a trace, too."""
     from helio_jax.inverse.instrument_report import describe_instrument
 
     if make_predict is None:
@@ -251,7 +256,7 @@ def _refined(stack, settings, make_predict, report) -> Reconstruction:
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
-    return Reconstruction(
+    found = Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,
         raster_y=stack.y,
@@ -278,3 +283,4 @@ def _refined(stack, settings, make_predict, report) -> Reconstruction:
             "chi_square": fit.chi_square,
         },
     )
+    return found, partial(residuals_of_fit, fit)

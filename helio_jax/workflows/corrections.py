@@ -53,6 +53,7 @@ def make_predictor(
     workers: int | None = None,
     multiple: Literal["traced", "radiosity"] = "traced",
     border: Literal["flat", "free"] = "flat",
+    masks_by: Literal["horizon", "rays"] = "horizon",
 ) -> Callable[..., Corrections]:
     """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
@@ -62,6 +63,9 @@ def make_predictor(
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
     with a `flat` border by the flat z = 0, with a `free` one by `extend_border`
     (in radiosity by the flat in either case).
+    `masks_by` rays, masks are traced on the mesh instead of computed by the horizon march, for a test of the result
+    that shares neither with the fit.
+
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
     what is traced, by the cosine law.
 
@@ -90,18 +94,23 @@ def make_predictor(
         if multiple == "radiosity":
             plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * raster.reach)
             return radiosity_corrections(surface, optics, Raster.of(stack), plan)
-        masked = masking_corrections(surface, optics, Raster.of(stack)).masked
         smooth, smooth_normals = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
         sides = raster.sides(smooth, smooth_normals)
         branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes = passes_for(RAYS * branches, SMOOTH_PATHS)
         traced = [smooth_along_surface(side.multiple(settings), smooth_normals, passes) for side in sides]
+        if masks_by == "rays":
+            masked, freed = 0.0, [side.masked(np.ones(height.shape, bool)) for side in sides]
+        else:
+            masked = masking_corrections(surface, optics, Raster.of(stack)).masked
+            if len(sides) == 1:
+                return Corrections(masked, traced[0], normals=smooth_normals)
+            is_masked = np.any(masked != 0.0, axis=(0, 1))
+            sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
+            freed = [side.masked(is_masked) - sheet for side in sides]
         if len(sides) == 1:
-            return Corrections(masked, traced[0], normals=smooth_normals)
-        is_masked = np.any(masked != 0.0, axis=(0, 1))
-        sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
-        freed = [side.masked(is_masked) - sheet for side in sides]
+            return Corrections(freed[0], traced[0], normals=smooth_normals)
         normal = np.moveaxis(normals, -1, 0)
         either = [m - single_scattering(f, normal) for m, f in zip(traced, freed, strict=True)]
         found, occluded = np.mean(traced, axis=0), 0.5 * np.subtract(*either)

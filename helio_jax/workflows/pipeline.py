@@ -39,6 +39,8 @@ from helio_jax.workflows.truth import true_height
 
 DEFAULT_EXECUTOR = Executor()
 """Threads of this process, one per CPU."""
+VERDICT_PATHS = 400_000
+"""Paths of the multiple scattering by which a finished height map is tested against its data."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
 RUN_FILES = {
@@ -290,7 +292,9 @@ def reconstruct(
         about = {"multiple": refine.multiple, "border": chosen.border, "workers": workers}
         return make_predictor(one, n_rays, refine.substrate_um, **about)
 
-    rec = reconstruct_stack(one, chosen, make_predict, report)
+    known = {"border": chosen.border, "workers": workers, "masks_by": "rays"}
+    trace = make_predictor(one, VERDICT_PATHS, refine.substrate_um, **known)
+    rec = reconstruct_stack(one, chosen, make_predict, report, trace)
     others = [f"{name} ({kind})" for name, kind in one.materials.items() if kind != "cosine"]
     if not others:
         return rec
@@ -326,6 +330,7 @@ class RunResult:
     name: str
     method: str
     status: str
+    is_contradicted: bool
     scores: Scores
     files: dict[str, Path]
 
@@ -336,6 +341,7 @@ class RunResult:
             "name": self.name,
             "method": self.method,
             "status": self.status,
+            "is_contradicted": self.is_contradicted,
             **self.scores.as_dict(),
             "files": files,
         }
@@ -397,4 +403,4 @@ def run(
         if report:
             title = f"{scene.name}: simulated, reconstructed, scored"
             write_report_files(files["report"], stack, rec, truth, scores, title=title)
-    return RunResult(scene.name, rec.method, rec.status, scores, files)
+    return RunResult(scene.name, rec.method, rec.status, rec.is_contradicted, scores, files)

@@ -1,0 +1,121 @@
+"""Whether the micrographs support a height map: the map is traced, and its micrographs are compared with the data.
+
+A method's own residuals test little: three images fit three unknowns of every pixel, and a robust fit sets aside what
+it cannot explain. Here the heights alone must explain the data, with masks and multiple scattering traced on the
+finished map, and nothing but counting noise, the tracer's error and what the beam does not see is allowed for.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from helio_jax.errors import PredictionError
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.render import Corrections, single_scattering
+from helio_jax.forward.surface import surface_of_heights
+from helio_jax.inverse.linear import signal_of
+from helio_jax.inverse.quality import squares
+from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruction import REASONS, Reconstruction, contradicted_share
+
+if TYPE_CHECKING:
+    from helio_jax.inverse.fit import Fit
+
+LIMIT = 2.5
+"""Mean square deviation of a pixel and its eight neighbours, in all detectors, from which on the data contradict the
+map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
+MULTIPLE_ERROR = 0.1
+"""Assumed relative error of the traced multiple scattering: of paths, raster and what lies outside the image."""
+
+Trace = Callable[..., Corrections]
+"""(heights [y, x] um, unit normals [y, x, 3], instrument) -> masks and multiple scattering, both traced."""
+
+
+def data_std(variance: np.ndarray, corrections: Corrections) -> np.ndarray:
+    """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, occluded side."""
+    hidden = 0.0 if corrections.occluded is None else corrections.occluded
+    return np.sqrt(variance + (MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2)
+
+
+def local_chi_square(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
+    """Compute the mean square residual of every pixel and its neighbours [y, x].
+
+    Data that were not observed, or lie outside the image, count as deviating by one standard deviation.
+
+    Args:
+        residuals: in standard deviations [detector, y, x].
+        is_observed: whether there is a datum [detector, y, x].
+    """
+    square = np.where(is_observed, squares(residuals), 1.0).mean(0)
+    return uniform_filter(square, 3, mode="constant", cval=1.0)
+
+
+def residuals_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) -> np.ndarray:
+    """Compute (model - data) / standard deviation of a photometric height map [detector, y, x].
+
+    The normals are those of the heights, not of the photometric solution; albedo 1.
+
+    Raises:
+        PredictionError: the map is too rough or steep to be traced.
+    """
+    signal, variance = signal_of(stack)
+    optics = Optics.of(rec.instrument)
+    with jax.enable_x64(True):
+        normals = surface_of_heights(rec.height, Raster.of(stack)).normals(optics.beam_shift)
+    c = trace(rec.height, normals, rec.instrument)
+    visible = form_factor(optics, rec.height) - c.masked
+    is_subtracted = stack.calibration is not None and stack.calibration.without_multiple
+    model = single_scattering(visible, np.moveaxis(normals, -1, 0)) + (0.0 if is_subtracted else c.multiple)
+    return (model - signal) / data_std(variance, c)
+
+
+def residuals_of_fit(fit: "Fit", trace: Trace) -> np.ndarray:
+    """Compute (model - data) / standard deviation of a fit's surface, albedo and read-out [detector, y, x].
+
+    Raises:
+        PredictionError: the surface is too rough or steep to be traced.
+    """
+    from helio_jax.inverse.state import predict_corrections
+    from helio_jax.inverse.steps import expected
+
+    problem = fit.problem
+    state = predict_corrections(problem, fit.state, trace)
+    model = expected(problem, state, is_noisy=True)
+    return (model - problem.data) / data_std(problem.variance, state.held.corrections)
+
+
+def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], np.ndarray]) -> Reconstruction:
+    """Return a height map with the verdict of its data: chi-square, reasons, and a sentence in its status.
+
+    Where the stated instrument is uncertain, or the counts had to be calibrated, misfit that is common to the image is
+    theirs: pixels must then deviate by more than `LIMIT` times the median.
+
+    Args:
+        rec: the height map.
+        stack: its micrographs.
+        residuals: computes (model - data) / standard deviation of the traced map [detector, y, x].
+    """
+    try:
+        found = np.where(stack.is_observed, residuals(), np.nan)
+    except PredictionError as error:
+        return rec.replace(status=f"{rec.status}; NOT tested against the data: {error}")
+    chi_square = local_chi_square(found, stack.is_observed)
+    is_uncertain = rec.instrument.uncertainty.is_stated or stack.calibration is not None
+    scale = max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
+    is_worse = (rec.reason == 0) & (chi_square > LIMIT * scale)
+    reason = np.where(is_worse, REASONS.index("contradicts the data"), rec.reason)
+    judged = rec.replace(chi_square=chi_square, reason=reason, is_valid=reason == 0)
+    if not judged.is_contradicted:
+        return judged
+    by_detector = np.nanmean(squares(found), axis=(1, 2))
+    worst = stack.instrument.detector_names[int(np.argmax(by_detector))]
+    said = (
+        f"contradicts the data: micrographs traced on this height map deviate from the measured ones in "
+        f"{contradicted_share(reason):.0%} of the pixels (most in detector {worst}): shape, instrument or scattering "
+        "law are not as assumed"
+    )
+    return judged.replace(status=f"{said}; {rec.status}")

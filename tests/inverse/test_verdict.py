@@ -1,0 +1,80 @@
+"""The verdict of the data on a finished height map: contradicted where it is wrong, and not where it is right."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import helio_jax as hx
+from helio_jax.inverse.verdict import LIMIT, local_chi_square
+from helio_jax.reconstruction import REASONS, contradicted_share
+from helio_jax.workflows import pipeline
+
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
+SPHERE = {"scan.nx": 31, "scan.ny": 31, "scan.pixel_size_um": 90.0, "noise.seed": 3}
+STEP = {"scan.nx": 41, "scan.ny": 31, "sample.height_um": 60.0, "scan.atoms_per_pixel": 300_000}
+CONTRADICTED = REASONS.index("contradicts the data")
+
+
+def test_noise_contradicts_nothing():
+    """False alarms: 600 000 pixels of noise alone, of which 2e-5 are expected above the limit; at most 40 (12 expected).
+
+    Rejects a limit of 2.2, which noise exceeds ten times as often.
+    """
+    rng, shape = np.random.default_rng(5), (3, 300, 200)
+    n_above = [
+        int(np.sum(local_chi_square(rng.standard_normal(shape), np.ones(shape, bool)) > limit))
+        for limit in (LIMIT, 2.1)
+        for _ in range(10)
+    ]
+    assert sum(n_above[:10]) <= 40 < sum(n_above[10:])
+
+
+def test_single_wild_data_are_no_contradiction():
+    """A spike in one datum says nothing of the surface; the same misfit of three neighbours in one detector does."""
+    residuals = np.zeros((3, 9, 9))
+    residuals[0, 4, 4] = 1000.0
+    assert not (local_chi_square(residuals, np.ones(residuals.shape, bool)) > LIMIT).any()
+    residuals[0, 4, 3:6] = 1000.0
+    assert (local_chi_square(residuals, np.ones(residuals.shape, bool)) > LIMIT).any()
+
+
+@pytest.fixture(scope="module")
+def sphere() -> tuple:
+    scene = hx.load_scene(SCENES / "sphere_a.toml", SPHERE)
+    return scene, pipeline.record(scene, hx.simulate(scene))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["nearfield", "refine"])
+def test_a_right_map_is_not_contradicted(sphere, method):
+    """Sphere A: under 5 % of the pixels; the status says nothing, the file keeps the chi-square."""
+    scene, stack = sphere
+    rec = pipeline.reconstruct(stack, method, settings=scene.reconstruct)
+    assert not rec.is_contradicted and "contradicts" not in rec.status
+    assert rec.chi_square is not None and np.median(rec.chi_square) < 1.3
+
+
+@pytest.mark.slow
+def test_a_wrong_instrument_is_contradicted(sphere, tmp_path):
+    """Two channels swapped, nothing else: told in status and reasons, after a file as well."""
+    scene, stack = sphere
+    swapped = stack.replace(counts=stack.counts[[1, 0, 2]], variance=stack.variance[[1, 0, 2]])
+    rec = pipeline.reconstruct(swapped, "nearfield", settings=scene.reconstruct)
+    hx.write(rec, tmp_path / "rec.h5")
+    again = hx.read(tmp_path / "rec.h5")
+    for found in (rec, again):
+        assert found.is_contradicted and "contradicts the data" in found.status
+        assert contradicted_share(found.reason) > 0.2
+    np.testing.assert_array_equal(again.reason == CONTRADICTED, rec.reason == CONTRADICTED)
+
+
+@pytest.mark.slow
+def test_a_step_that_linear_smears_is_contradicted():
+    """A vertical step becomes a slope over many pixels: the smeared wall is not valid, the terraces far from it are."""
+    scene = hx.load_scene(SCENES / "step.toml", STEP)
+    stack = pipeline.record(scene, hx.simulate(scene))
+    rec = pipeline.reconstruct(stack, "linear", settings=scene.reconstruct)
+    is_told = rec.reason == CONTRADICTED
+    wall = slice(14, 28)
+    assert is_told[:, wall].mean() > 0.2 and is_told[:, :6].mean() < 0.05
