@@ -30,6 +30,7 @@ LIMIT = 2.5
 map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
 MULTIPLE_ERROR = 0.1
 """Assumed relative error of the traced multiple scattering: of paths, raster and what lies outside the image."""
+_CONTRADICTED = REASONS.index("contradicts the data")
 
 Trace = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3], instrument) -> masks and multiple scattering, both traced."""
@@ -97,17 +98,20 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
     Args:
         rec: the height map.
         stack: its micrographs.
-        residuals: computes (model - data) / standard deviation of the traced map [detector, y, x].
+        residuals: computes (model - data) / standard deviation of the traced map [detector, y, x]; a PredictionError
+            means that the map cannot be traced, which contradicts the data, too.
     """
     try:
         found = np.where(stack.is_observed, residuals(), np.nan)
-    except PredictionError as error:
-        return rec.replace(status=f"{rec.status}; NOT tested against the data: {error}")
+    except PredictionError:
+        reason = np.where(rec.reason == 0, _CONTRADICTED, rec.reason)
+        said = "contradicts the data: no micrographs can be traced on a height map so rough or steep"
+        return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
     is_uncertain = rec.instrument.uncertainty.is_stated or stack.calibration is not None
     scale = max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
     is_worse = (rec.reason == 0) & (chi_square > LIMIT * scale)
-    reason = np.where(is_worse, REASONS.index("contradicts the data"), rec.reason)
+    reason = np.where(is_worse, _CONTRADICTED, rec.reason)
     judged = rec.replace(chi_square=chi_square, reason=reason, is_valid=reason == 0)
     if not judged.is_contradicted:
         return judged

@@ -39,8 +39,9 @@ SMOOTH_PATHS = 40
 """The traced image is averaged over neighbours until this many paths count in every pixel."""
 MAX_SMOOTHING_STEP = 0.5
 """Mean heights that differ from a pixel's by more than this many pitches are not of its facet."""
-MAX_BURIED = 0.05
-"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface."""
+MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
+"""Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
+for the test of a result, which is to be traced even where it is bad."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
 
@@ -98,8 +99,8 @@ def make_predictor(
         sides = raster.sides(smooth, smooth_normals)
         branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
-        passes = passes_for(RAYS * branches, SMOOTH_PATHS)
-        traced = [smooth_along_surface(side.multiple(settings), smooth_normals, passes) for side in sides]
+        passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
+        traced = [smooth_along_surface(side.multiple(settings, limit), smooth_normals, passes) for side in sides]
         if masks_by == "rays":
             masked, freed = 0.0, [side.masked(np.ones(height.shape, bool)) for side in sides]
         else:
@@ -150,13 +151,13 @@ class SurfaceHypothesis:
     points: Hits
     intersector: Intersector
 
-    def multiple(self, settings: TraceSettings) -> np.ndarray:
+    def multiple(self, settings: TraceSettings, max_buried: float) -> np.ndarray:
         """Return the traced multiple scattering [detector, y, x]."""
         r = self.raster
         experiment = make_experiment(self.intersector, r.instrument, settings)
         x, y = r.x.ravel(), r.y.ravel()
         try:
-            tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=MAX_BURIED)
+            tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=max_buried)
         except GuardError as e:
             found = str(e).split(";")[0]
             raise PredictionError(
