@@ -165,6 +165,7 @@ formats/              the only door to files
   nexus               their NeXus layout
   parts               finished units on disk
   safe                untrusted files, atomic writes
+  suffixes            suffixes of files by format
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold

@@ -23,6 +23,10 @@ from helio_jax.errors import HelioError
 
 WALL_PITCHES = 5.0
 """A height difference of neighbouring pixels (beam-frame raster) above this many pitches counts as a wall."""
+BORDER_WIDTH = 0.06
+"""Width of an image's border, as a fraction of each side, of which `substrate_level` takes the lowest part."""
+SUBSTRATE_QUANTILE = 0.05
+"""Quantile of the border's heights that is taken as the substrate."""
 _STD_OVER_MEDIAN = 1.4826
 """Standard deviation of normal noise divided by the median of its absolute value."""
 
@@ -116,3 +120,13 @@ def border_mask(shape: tuple[int, int], fraction: float) -> np.ndarray:
     frame = np.ones(shape, bool)
     frame[ny:-ny, nx:-nx] = False
     return frame
+
+
+def substrate_level(height: np.ndarray) -> float:
+    """Estimate the height of the substrate from the lowest part of the border of heights [y, x], um."""
+    return float(np.quantile(height[border_mask(height.shape, BORDER_WIDTH)], SUBSTRATE_QUANTILE))
+
+
+def substrate_mask(height: np.ndarray) -> np.ndarray:
+    """Return True in the border's pixels at or below `substrate_level` of heights [y, x]."""
+    return border_mask(height.shape, BORDER_WIDTH) & (height <= substrate_level(height))

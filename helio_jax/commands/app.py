@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
-from helio_jax.commands.door import HDF5_SUFFIXES, Command, Reads, Writes
+from helio_jax.commands.door import Command, Reads, Writes
+from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
 class _Helio(typer.Typer):
-    """An application all of whose commands pass the door."""
+    """An application whose commands are all checked by `door.Command`."""
 
     def command(self, name: str | None = None, *, cls: Any = Command, **options: Any) -> Any:
         return super().command(name, cls=cls, **options)

@@ -1,7 +1,7 @@
-"""The door that every command passes: what it would write is checked before it does anything.
+"""Checks of every command's outputs against its inputs before any work.
 
-A command says in its annotations which files it reads and which it writes; the door refuses an output that is an
-input, two outputs in one file, and an output that could not be written. Light at import, as app.py.
+A command's annotations mark which files it reads and which it writes. `Command` refuses an output that is an input, two
+outputs in one file, and an output that could not be written. Imports nothing heavy, so that `helio --help` is fast.
 """
 
 import inspect
@@ -15,7 +15,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")  # as in formats/hdf5.py, which is too heavy to ask here
+from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Writes:
             )
 
     def files(self, label: str, path: Path) -> list[tuple[str, Path]]:
-        """Return what names each file that is written, and where it is."""
+        """List the files that are written: what names each, and its path."""
         from helio_jax.formats.safe import files_within
 
         if self.within is not None:
@@ -63,7 +63,7 @@ class Writes:
 
 
 def marks_of(function: Any) -> dict[str, Reads | Writes]:
-    """Return the mark of every parameter that has one."""
+    """Collect the mark of every parameter that has one."""
     hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
     marks = ((name, m) for name, hint in hints.items() for m in getattr(hint, "__metadata__", ()))
     return {name: mark for name, mark in marks if isinstance(mark, (Reads, Writes))}
@@ -73,7 +73,7 @@ class Command(TyperCommand):
     """A command of helio; commas between the numbers of an option are refused: they are separated by spaces."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse as usual, once no option of several values has been given one word with commas."""
+        """Parse as usual, after a check that no option of several values was given one word with commas."""
         several = {name: option for option in self.params if option.nargs > 1 for name in option.opts}
         for word, following in itertools.zip_longest(args, args[1:], fillvalue=""):
             name, _, value = word.partition("=")
@@ -87,7 +87,7 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command, once what it would write has been checked."""
+        """Check what the command would write, then run it."""
         marks = marks_of(self.callback)
         for label, mark, path in self._given(ctx, marks, Writes):
             mark.check_suffix(label, path)

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 FORMAT = "1.1"
 """1.1: what steers later steps has places of its own; in files of 1.0 it is in the provenance."""
-HDF5_SUFFIXES = (".h5", ".hdf5", ".nxs")
-"""Suffixes of HDF5 files."""
 MAX_BYTES = 4 * safe.GIB
 _MAX_OBJECTS = 20_000
 _MAX_DEPTH = 8

@@ -85,6 +85,11 @@ class Raster(eqx.Module):
         """Pitch of the rows [um]."""
         return _step(self.y)
 
+    def centred_positions(self) -> np.ndarray:
+        """Compute the positions (x, y) relative to the middle of the raster [2, y, x], um; NumPy axes only."""
+        centred = Raster.regular(self.shape, self.dx, self.dy)
+        return np.stack(np.meshgrid(centred.x, centred.y))
+
     def thinned(self, stride: int) -> "Raster":
         """Keep every `stride`-th row and column."""
         return Raster(self.x[::stride], self.y[::stride])

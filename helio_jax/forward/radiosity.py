@@ -32,7 +32,7 @@ from helio_jax.forward.surface import normal_of_slopes
 
 MERGE = 1.4
 """Strips between two powers of this in distance are seen as one ..."""
-GENTLE = 0.5
+MAX_MERGE_RELIEF = 0.5
 """... if the height changes by less than this within each, in pitches of the raster."""
 LEVEL = 1.0
 """Height of a steep cell's levels, in pitches of the raster; a cell that is lower has none ..."""
@@ -53,7 +53,7 @@ _GRAZING = 1e-5  # slope above the own tangent plane from which on something is 
 _NOWHERE = -1e9  # height outside of the raster, um: never seen
 
 
-class Mix(NamedTuple):
+class Interpolation(NamedTuple):
     """Frozen places on the surface, of height (1 - share) h[first] + share h[second] for flat indices of pixels."""
 
     first: Any
@@ -61,7 +61,7 @@ class Mix(NamedTuple):
     share: Any
 
     def of(self, heights: Any) -> Any:
-        """Return the heights there, um, of `heights` [pixel + 1], the last of which is the flat outside."""
+        """Interpolate the heights there, um, of `heights` [pixel + 1], the last of which is the flat outside."""
         return (1.0 - self.share) * heights[self.first] + self.share * heights[self.second]
 
 
@@ -74,7 +74,7 @@ class Strips(NamedTuple):
 
     receiver: Any
     sender: Any
-    end: Mix
+    end: Interpolation
     distance: Any
     middle: Any
 
@@ -90,7 +90,7 @@ class Plan(NamedTuple):
         directions: azimuths in which the receivers look [azimuth, 2].
     """
 
-    place: Mix
+    place: Interpolation
     cell: Any
     visible: Any
     strips: Strips
@@ -114,7 +114,7 @@ class Receivers(NamedTuple):
     normal: np.ndarray
 
     def tangent(self, direction: np.ndarray, shift: tuple[float, float]) -> np.ndarray:
-        """Return the slope of the tangent planes along an azimuth."""
+        """Compute the slope of the tangent planes along an azimuth."""
         return -(self.normal[:, :2] @ direction) / (self.normal @ [-shift[0], -shift[1], 1.0])
 
 
@@ -167,7 +167,7 @@ def plan_radiosity(
     visible = np.stack([_visible_share(height, receivers, part, pitches, shift) for part in parts], -1)
     with jax.enable_x64(True):
         visible = np.asarray(_spread(visible, height.shape, 1.0))
-    rows = [_look(height, cells, len(visible) - 1, receivers, e, raster, shift, reach) for e in directions]
+    rows = [_visible_strips(height, cells, len(visible) - 1, receivers, e, raster, shift, reach) for e in directions]
     width = _roomy(max(len(row.receiver) for row in rows))
     strips = jax.tree.map(lambda *row: np.stack([_filled(a, width) for a in row]), *rows)
     is_strip = np.arange(width) < np.array([[len(row.receiver)] for row in rows])
@@ -219,12 +219,14 @@ def _visible_share(height, receivers: Receivers, slices: Slices, pitches, shift)
     return np.minimum(visible / total, 1.0)
 
 
-def _look(height, cells: Cells, outside: int, receivers: Receivers, direction, raster: Raster, shift, reach) -> Strips:
+def _visible_strips(
+    height, cells: Cells, outside: int, receivers: Receivers, direction, raster: Raster, shift, reach
+) -> Strips:
     """Find the strips that receivers see along an azimuth, in the order of the receivers [strip]."""
     pitches = (raster.dy, raster.dx)
     crossings, tangent = _crossings(direction, height.shape, pitches), receivers.tangent(direction, shift)
-    horizon, codes = _march(height, receivers, tangent, crossings, GENTLE * max(pitches))
-    strips = _name(height, cells, receivers, direction[::-1] / pitches, crossings, tangent, codes)
+    horizon, codes = _march(height, receivers, tangent, crossings, MAX_MERGE_RELIEF * max(pitches))
+    strips = _label_strips(height, cells, receivers, direction[::-1] / pitches, crossings, tangent, codes)
     # the substrate outside
     row, column = np.divmod(receivers.pixel, height.shape[1])
     x, y = raster.x[0] + column * raster.dx, raster.y[0] + row * raster.dy
@@ -232,25 +234,25 @@ def _look(height, cells: Cells, outside: int, receivers: Receivers, direction, r
     i = np.flatnonzero((horizon < 0.0) & (-receivers.height > horizon * far))
     none = np.full(i.size, height.size)
     middle = 2.0 / (1.0 / far[i] - horizon[i] / receivers.height[i])
-    flat = Strips(i, np.full(i.size, outside), Mix(none, none, 0.0 * middle), far[i], middle)
+    flat = Strips(i, np.full(i.size, outside), Interpolation(none, none, 0.0 * middle), far[i], middle)
     joined = jax.tree.map(lambda *parts: np.concatenate(parts), strips, flat)
     order = np.argsort(joined.receiver, kind="stable")
     return jax.tree.map(lambda a: a[order].astype(np.int32 if a.dtype.kind == "i" else np.float64), joined)
 
 
 def _roomy(count: int) -> int:
-    """Return `count` rounded up by at most an eighth, so that compiled code fits surfaces that differ a little."""
+    """Round `count` up by at most an eighth, so that compiled code fits surfaces that differ a little."""
     unit = 1 << max(0, count.bit_length() - 4)
     return -(-count // unit) * unit
 
 
 def _filled(array: np.ndarray, length: int) -> np.ndarray:
-    """Return an array extended to a length by copies of its last element."""
+    """Extend an array to a length by copies of its last element."""
     return np.pad(array, (0, length - len(array)), mode="edge")
 
 
-def _cut(height: np.ndarray, tall: float) -> tuple[Cells, Mix, np.ndarray]:
-    """Cut the raster's steep cells into levels; return the cells, and of all levels the places and numbers of cells."""
+def _cut(height: np.ndarray, tall: float) -> tuple[Cells, Interpolation, np.ndarray]:
+    """Cut the raster's steep cells into levels: the cells, and of all levels the places and numbers of cells."""
     corners = np.stack(_corners(np.arange(height.size).reshape(height.shape))).reshape(4, -1)
     heights, columns = height.ravel()[corners], np.arange(corners.shape[1])
     lowest, highest = (corners[f(heights, 0), columns] for f in (np.argmin, np.argmax))
@@ -260,37 +262,37 @@ def _cut(height: np.ndarray, tall: float) -> tuple[Cells, Mix, np.ndarray]:
     share = (np.arange(len(cell)) - first[cell] + 0.5) / n_levels[cell]
     room = _roomy(len(cell) + 1)
     cell, share = _filled(np.append(cell, 0), room), _filled(np.append(share, 0.5), room)
-    return Cells(lowest, highest, n_levels, first), Mix(lowest[cell], highest[cell], share), cell
+    return Cells(lowest, highest, n_levels, first), Interpolation(lowest[cell], highest[cell], share), cell
 
 
 def _corners(image: Any) -> tuple[Any, Any, Any, Any]:
-    """Return an image's [y, x, ...] values at the corners of its cells, four of [y - 1, x - 1, ...]."""
+    """Values of an image [y, x, ...] at the corners of its cells, four of [y - 1, x - 1, ...]."""
     return image[:-1, :-1], image[:-1, 1:], image[1:, :-1], image[1:, 1:]
 
 
 def _cell_normals(height, pitches, shift):
-    """Return the unit normals [cell, 3] of the raster's cells, differentiable."""
+    """Compute the unit normals [cell, 3] of the raster's cells, differentiable."""
     h00, h01, h10, h11 = _corners(height)
     slopes = 0.5 * (h01 + h11 - h00 - h10) / pitches[1], 0.5 * (h10 + h11 - h00 - h01) / pitches[0]
     normal = jnp.stack(normal_of_slopes(*slopes, shift), -1).reshape(-1, 3)
     return normal / jnp.sqrt(jnp.sum(normal**2, -1, keepdims=True))
 
 
-def _receivers(height, normals, place: Mix, cell, pitches, shift):
-    """Return heights [receiver], um, and unit normals [receiver, 3] of pixels and levels, differentiable."""
+def _receivers(height, normals, place: Interpolation, cell, pitches, shift):
+    """Compute heights [receiver], um, and unit normals [receiver, 3] of pixels and levels, differentiable."""
     level = _cell_normals(height, pitches, shift)[cell]
     return jnp.append(height, place.of(height.ravel())), jnp.concatenate([normals.reshape(-1, 3), level])
 
 
 def _spread(values, shape: tuple[int, int], outside: float):
-    """Return what senders (cells: mean of corners; levels; the flat outside) have from receivers' values."""
+    """Compute senders' values from receivers': means of corners for cells, levels' own, `outside` for the flat."""
     n, rest = shape[0] * shape[1], values.shape[1:]
     cells = 0.25 * jnp.stack(_corners(values[:n].reshape(*shape, *rest))).sum(0).reshape(-1, *rest)
     return jnp.concatenate([cells, values[n:], jnp.full((1, *rest), outside, values.dtype)])
 
 
 def _crossings(direction: np.ndarray, shape: tuple[int, int], pitches: tuple[float, float]) -> Crossings:
-    """Return the crossings of a pixel's ray with the grid lines."""
+    """Find the crossings of a pixel's ray with the grid lines."""
     step = direction[::-1] / pitches
     parts = []
     for axis in (0, 1):
@@ -307,7 +309,7 @@ def _crossings(direction: np.ndarray, shape: tuple[int, int], pitches: tuple[flo
 
 
 def _march(height, receivers: Receivers, tangent, crossings: Crossings, tall: float) -> tuple[np.ndarray, np.ndarray]:
-    """March over the raster, in single precision; return horizons [receiver] and codes [receiver, step].
+    """March over the raster, in single precision: horizons [receiver] and codes [receiver, step].
 
     Code: is the surface before the crossing seen: 0 no, 1 yes, 2 yes and it rises or falls by more than `tall`.
     """
@@ -342,8 +344,8 @@ def _march_block(heights, base, own, tangent, table, tall):
     return horizon, codes
 
 
-def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossings, tangent, codes) -> Strips:
-    """Return what was seen as strips of senders: pieces are joined (see `MERGE`), or cut at their cell's levels."""
+def _label_strips(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossings, tangent, codes) -> Strips:
+    """Divide what is seen into strips of one sender each: pieces merge (`MERGE`) or are cut at their cell's levels."""
     flat, (ny, nx) = np.append(height, 0.0), height.shape
     before = np.append(0.0, crossings.distance[:-1])
     ring = np.floor(np.log(np.maximum(before, 1.0)) / np.log(MERGE))
@@ -352,10 +354,10 @@ def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossin
     begin = np.nonzero(is_seen & np.concatenate([whole, ~joins], 1))[1]
     receiver, last = np.nonzero(is_seen & np.concatenate([~joins, whole], 1))
 
-    def at(step: np.ndarray) -> Mix:
+    def at(step: np.ndarray) -> Interpolation:
         offset = crossings.first[step], crossings.second[step]
         first, second = (receivers.pixel[receiver] + o @ [nx, 1] for o in offset)
-        return Mix(first, second, crossings.share[step])
+        return Interpolation(first, second, crossings.share[step])
 
     near, far, end, own = before[begin], crossings.distance[last], at(last), receivers.height[receiver]
     z = np.where(begin == 0, own, at(begin - 1).of(flat)), end.of(flat)
@@ -374,8 +376,8 @@ def _name(height, cells: Cells, receivers: Receivers, per_um, crossings: Crossin
     edge = (level + (final > first)[i]) / most[i]
     part = (edge - share[0][i]) / np.where(is_last, 1.0, (share[1] - share[0])[i])
     distance = np.where(is_last, far[i], near[i] + part.clip(0.0, 1.0) * (far - near)[i])
-    levels = Mix(cell.lowest[i], cell.highest[i], edge)
-    ends = Mix(*(np.where(is_last, a[i], b) for a, b in zip(end, levels, strict=True)))
+    levels = Interpolation(cell.lowest[i], cell.highest[i], edge)
+    ends = Interpolation(*(np.where(is_last, a[i], b) for a, b in zip(end, levels, strict=True)))
     start = np.where(k == 0, near[i], np.roll(distance, 1))
     sender = np.where(cell.n_levels[i] > 0, len(cells.level) + cell.level[i] + level, number[i])
     strips = Strips(receiver[i], sender, ends, distance, 0.5 * (start + distance))

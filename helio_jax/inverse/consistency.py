@@ -25,7 +25,7 @@ UNKNOWNS = 2
 
 
 def degrees_of_freedom(stack: MicrographStack) -> int:
-    """Return how many data are left for the test: those beyond two per pixel that is seen in three or more images."""
+    """Count the degrees of freedom: data beyond two per pixel that is seen in three or more images."""
     n = stack.is_observed.sum(0)
     return int(np.sum(n[n >= MIN_IMAGES] - UNKNOWNS))
 
@@ -36,7 +36,7 @@ def misfit(
     settings: ReconstructSettings,
     predict: Callable[[np.ndarray, np.ndarray], Corrections] | None = None,
 ) -> float:
-    """Return the chi-square per degree of freedom of the images that the integrated near-field surface predicts.
+    """Compute the chi-square per degree of freedom of the images that the integrated near-field surface predicts.
 
     The albedo of every pixel is the one that fits best, so that patches of another material cost nothing.
 

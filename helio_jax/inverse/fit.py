@@ -21,7 +21,6 @@ from helio_jax.inverse.posterior import MAX_PIXELS, ModelError, Posterior, linea
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, pixel_terms, step
 from helio_jax.robust import cauchy_weight
@@ -92,8 +91,8 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     s, shape = problem.settings, problem.signal.shape[1:]
     stride = thinning(shape, MAX_PIXELS)
     length = s.error_reach * float(np.ptp(state.surface.height))
-    part = problem.thinned(stride) if stride > 1 else problem
-    there = state.thinned(part, stride) if stride > 1 else state
+    part = problem.thinned(stride)
+    there = state.thinned(part, stride)
     limits = s.robust_limits[-1], s.jump_limits[-1]
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
@@ -120,9 +119,7 @@ def misfit_on(
     return misfit(problem, state, s.robust_limits[-1], s.jump_limits[-1]), state.surface
 
 
-def fit_heights(
-    problem: FitProblem, start: Surface, settings: ReconstructSettings, predict: Predict, report: Report | None = None
-) -> Fit:
+def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
 
     Interrupted from the keyboard after the first iteration, it returns the best so far.
@@ -130,7 +127,6 @@ def fit_heights(
     Args:
         problem: data, instrument, priors.
         start: heights and slopes, e.g. of the photometric solution.
-        settings: of the reconstruction.
         predict: multiple scattering and masked form factors on a surface.
         report: called before each outer iteration.
 

@@ -92,7 +92,7 @@ def _call(function: Any, options: dict[str, Any], *arguments: Any) -> Any:
 
 
 def _prepare(a: Image, b: Image, dx: float, dy: float, weights: Image | None) -> tuple[Image, Image, Image]:
-    """Return checked slopes, unknown ones filled from the nearest known pixel, and weights."""
+    """Check slopes; fill unknown ones from the nearest known pixel; make the weights."""
     a = as_float_array("a", a, (None, None), SceneError)
     b = as_float_array("b", b, a.shape, SceneError)
     trust = np.ones(a.shape) if weights is None else as_float_array("weights", weights, a.shape, SceneError)

@@ -22,7 +22,7 @@ MEMBRANE = 1e-9  # weight, where a flat pixel of median confidence has 1, that d
 
 
 def _side_weights(slope: EdgesX, normal_z: Image, stiffness: float) -> tuple[EdgesX, EdgesX]:
-    """Return, for edges along the last axis, the weight of the edge to its left and to its right pixel.
+    """Compute, for edges along the last axis, the weight of the edge to its left and to its right pixel.
 
     A pixel at the border has one side only and trusts it as an interior pixel does in a smooth place: 1/2.
     """
@@ -36,7 +36,7 @@ def _side_weights(slope: EdgesX, normal_z: Image, stiffness: float) -> tuple[Edg
 def _edges(
     slope: EdgesX, pixel_slope: Image, normal_z: Image, pixel_weight: Image, stiffness: float
 ) -> tuple[EdgesX, EdgesX]:
-    """Return the wanted slope and the weight of the edges along the last axis: both pixels' terms in one.
+    """Compute the wanted slope and the weight of the edges along the last axis: both pixels' terms in one.
 
     A weak membrane (a wanted slope of zero) holds the edges that neither pixel trusts.
     """
@@ -59,7 +59,7 @@ def integrate_bilateral(
     tolerance: float = 1e-4,
     max_steps: int = 2000,
 ) -> Image:
-    """Return the height [um] by bilaterally weighted one-sided differences; mean zero.
+    """Compute the height [um] by bilaterally weighted one-sided differences; mean zero.
 
     Minimises sum over pixels of n_z^2 [w (D+ h - a)^2 + (1 - w) (D- h - a)^2] and the same along y, where
     w = sigmoid(k ((n_z D- h)^2 - (n_z D+ h)^2)) is held fixed in each round. Planes are exact; a curved surface has a
@@ -104,6 +104,6 @@ def integrate_bilateral(
 
 
 def _objective(problem: EdgeProblem, slope_x: EdgesX, slope_y: Image) -> float:
-    """Return the weighted sum of squares of an edge problem at the given slopes."""
+    """Compute the weighted sum of squares of an edge problem at the given slopes."""
     rest_x, rest_y = slope_x - problem.slope_x, slope_y - problem.slope_y
     return float(np.sum(problem.weight_x * rest_x**2) + np.sum(problem.weight_y * rest_y**2))

@@ -30,7 +30,7 @@ MEMBRANE = 1e-7  # weight, of the largest edge weight, that draws every edge to 
 
 
 def edge_confidence(weights: Image, floor: float = 1e-6) -> tuple[EdgesX, EdgesY]:
-    """Return edge confidences relative to the median pixel: harmonic means of the pixels' weights.
+    """Compute edge confidences relative to the median pixel: harmonic means of the pixels' weights.
 
     If a pixel's weight is the inverse variance of its slope, the variance of the mean of two is half the inverse of
     the harmonic mean (own derivation, tests/inverse/test_integrate.py).
@@ -47,7 +47,7 @@ def edge_confidence(weights: Image, floor: float = 1e-6) -> tuple[EdgesX, EdgesY
 
 
 def estimate_slope_noise(a: Image, b: Image, dx: float, dy: float, weights: Image) -> float:
-    """Return the noise [1] of one pixel's slope, estimated from the circulation around squares of four pixels.
+    """Estimate the noise [1] of one pixel's slope, estimated from the circulation around squares of four pixels.
 
     Circulation is free of the surface's shape up to h'''' terms. Each edge slope is a mean of two pixels, which gives
     the circulation the variance (dx^2 + dy^2) sigma^2; the median of its absolute value, over squares whose four
@@ -64,7 +64,7 @@ def estimate_slope_noise(a: Image, b: Image, dx: float, dy: float, weights: Imag
 
 
 def edge_noise(a: Image, b: Image, confidence_x: EdgesX, confidence_y: EdgesY, noise: float) -> tuple[EdgesX, EdgesY]:
-    """Return the standard deviation [1] expected of each edge slope.
+    """Compute the standard deviation [1] expected of each edge slope.
 
     Two parts: the pixels' noise, sigma^2 / (2 confidence), and the trapezoid rule's error at a kink somewhere within
     the edge. With slopes s1, s2 on the two sides of a kink that lies uniformly within the edge, the mean slope's
@@ -76,7 +76,7 @@ def edge_noise(a: Image, b: Image, confidence_x: EdgesX, confidence_y: EdgesY, n
 
 
 def _doubt_guesses(sigma: Edges, slopes: Edges, weights: Image) -> Edges:
-    """Return sigma with the slope itself added in quadrature on edges that touch a pixel of unknown slope.
+    """Compute sigma with the slope itself added in quadrature on edges that touch a pixel of unknown slope.
 
     Such a slope was copied from a neighbour; without this, copies of a grazing pixel's slope would be believed.
     """
@@ -87,7 +87,7 @@ def _doubt_guesses(sigma: Edges, slopes: Edges, weights: Image) -> Edges:
 
 
 def _problem(slopes: Edges, sigma: Edges, jump: Edges, dx: float, dy: float) -> EdgeProblem:
-    """Return the edge problem of weights jump / sigma^2 (largest 1), plus a weak membrane on every edge.
+    """Make the edge problem of weights jump / sigma^2 (largest 1), plus a weak membrane on every edge.
 
     The membrane, `MEMBRANE` (D h)^2, ties regions that are cut off. It draws towards a slope of zero and not to the
     edge's own, or one grazing pixel with a slope of 1e8 would outweigh the rest.
@@ -100,7 +100,7 @@ def _problem(slopes: Edges, sigma: Edges, jump: Edges, dx: float, dy: float) -> 
 
 
 def _misfits(height: Image, slopes: Edges, sigma: Edges, dx: float, dy: float) -> Edges:
-    """Return (D h - s) / sigma on the edges."""
+    """Compute (D h - s) / sigma on the edges."""
     slope_x, slope_y = differentiate(height, dx, dy)
     return (slope_x - slopes[0]) / sigma[0], (slope_y - slopes[1]) / sigma[1]
 
@@ -115,7 +115,7 @@ def integrate_weighted(
     tolerance: float = 1e-8,
     max_steps: int = 2000,
 ) -> Image:
-    """Return the height [um] that fits the edge slopes with the pixels' weights, no edge being cut; mean zero.
+    """Compute the height [um] that fits the edge slopes with the pixels' weights, no edge being cut; mean zero.
 
     Valid for surfaces without jumps.
 
@@ -138,7 +138,7 @@ def integrate_cutting_jumps(
     tolerance: float = 1e-4,
     max_steps: int = 2000,
 ) -> tuple[Image, EdgesX, EdgesY]:
-    """Return the height and the edges that stayed intact, by a robust fit of the edge slopes.
+    """Find the height and the edges that stayed intact, by a robust fit of the edge slopes.
 
     Minimises sum_e rho(r_e), r = (D h - s) / sigma, with Geman and McClure's rho = r^2 c^2 / (r^2 + c^2), by
     reweighting; c falls by halves from the largest misfit of the fit without cuts to `cut` (graduated

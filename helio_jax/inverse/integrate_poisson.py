@@ -22,7 +22,7 @@ EdgesY = Float[np.ndarray, "y-1 x"]
 
 
 def mean_to_edges(a: Image, b: Image) -> tuple[EdgesX, EdgesY]:
-    """Return the slopes on the edges: the mean of the two pixel slopes (trapezoid rule).
+    """Compute the slopes on the edges: the mean of the two pixel slopes (trapezoid rule).
 
     Exact for surfaces of second degree; the error is pitch^2 h''' / 12 otherwise.
     """
@@ -30,7 +30,7 @@ def mean_to_edges(a: Image, b: Image) -> tuple[EdgesX, EdgesY]:
 
 
 def differentiate(height: Image, dx: float, dy: float) -> tuple[EdgesX, EdgesY]:
-    """Return the slopes of `height` along the edges [1], its differences divided by the pitch [um]."""
+    """Compute the slopes of `height` along the edges [1], its differences divided by the pitch [um]."""
     return np.diff(height, axis=1) / dx, np.diff(height, axis=0) / dy
 
 
@@ -70,7 +70,7 @@ def solve_poisson(source: Image, dx: float, dy: float) -> Image:
 
 
 def integrate_poisson(a: Image, b: Image, dx: float, dy: float) -> Image:
-    """Return the height [um] that fits all edge slopes with equal weight; mean zero.
+    """Compute the height [um] that fits all edge slopes with equal weight; mean zero.
 
     Valid for surfaces without jumps: a jump is smeared over the whole raster.
     """
@@ -96,19 +96,19 @@ class EdgeProblem:
     dy: float
 
     def apply(self, height: Image) -> Image:
-        """Return D' w D h, the weighted Laplacian."""
+        """Compute D' w D h, the weighted Laplacian."""
         slope_x, slope_y = differentiate(height, self.dx, self.dy)
         return differentiate_adjoint(self.weight_x * slope_x, self.weight_y * slope_y, self.dx, self.dy)
 
     def residual(self, height: Image) -> Image:
-        """Return D' w (s - D h), the negative half gradient of the objective, without cancellation at a good fit."""
+        """Compute D' w (s - D h), the negative half gradient of the objective, without cancellation at a good fit."""
         slope_x, slope_y = differentiate(height, self.dx, self.dy)
         rest_x, rest_y = self.slope_x - slope_x, self.slope_y - slope_y
         return differentiate_adjoint(self.weight_x * rest_x, self.weight_y * rest_y, self.dx, self.dy)
 
 
 def _dot(f: Image, g: Image) -> float:
-    """Return <f, g>; not by BLAS, whose threads would spin on the other cores for nothing."""
+    """Compute <f, g>; without BLAS, whose idle threads would occupy the other cores."""
     return float(np.einsum("ij,ij->", f, g))
 
 

@@ -19,7 +19,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def derivative_matrix(n: int, pitch: float, points: int = 5, order: int = 1) -> Matrix:
-    """Return the matrix that differentiates n equally spaced samples, exact for degree < `points` up to the ends.
+    """Make the matrix that differentiates n equally spaced samples, exact for degree < `points` up to the ends.
 
     Rows near an end use the outermost `points` samples, so no sample outside is needed.
 
@@ -73,7 +73,7 @@ def integrate_sylvester(
     order: int = 2,
     modes: tuple[int, int] | None = None,
 ) -> Image:
-    """Return the height [um] of least ||H Dx' - A||^2 + ||Dy H - B||^2, the norms over all pixels.
+    """Compute the height [um] of least ||H Dx' - A||^2 + ||Dy H - B||^2, the norms over all pixels.
 
     Valid for smooth surfaces on a full raster of equally trusted slopes. Mean zero, except `dirichlet`: zero on the
     border.
@@ -127,7 +127,7 @@ def _bases(variant: str, n_y: int, n_x: int, modes: tuple[int, int] | None) -> t
 
 
 def _penalty(n: int, pitch: float, order: int) -> Matrix:
-    """Return L'L for the derivative L of `order`; for order 0 half of it, so that x and y together make ||H||^2."""
+    """Compute L'L for the derivative L of `order`; for order 0 half of it, so that x and y together make ||H||^2."""
     if order == 0:
         return 0.5 * np.eye(n)
     matrix = derivative_matrix(n, pitch, 3, order)

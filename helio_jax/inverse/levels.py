@@ -7,6 +7,7 @@ bar says whether masks or the near field fix it; a region that something else ex
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import product
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ class Levels(NamedTuple):
 
 
 def _distance_to_region_edge(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
-    """Return how far it is from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
+    """Compute the distance from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
 
     A region that reaches the image's border does not end there.
     """
@@ -65,11 +66,11 @@ def at_level(
     inside: np.ndarray,
     surface: Surface,
     level: float,
-    ground: float,
+    surroundings: float,
     pitch: tuple[float, float],
     beam_shift: tuple[float, float] | None,
 ) -> Surface:
-    """Return a surface with a region flat at a level above the ground, and with the wall that the beam sees, if any.
+    """Make a surface with a region flat at a level above its surroundings, and with the wall that the beam sees.
 
     The beam sees the wall that faces it: at the far side of a hollow, at the near side of a plateau. In the beam frame
     a vertical wall rises by the cotangent of the incidence along the beam. Deeper than the beam reaches, there is
@@ -78,20 +79,49 @@ def at_level(
     Args:
         inside: the region [y, x].
         surface: to begin with.
-        level: above the ground, um.
-        ground: height of the ground, um.
+        level: above the surroundings, um.
+        surroundings: height of the surface around the region, um.
         pitch: dy, dx, um.
         beam_shift: `Instrument.beam_shift`; None: no wall, as where the region ends undercut.
     """
-    flat = Surface(*(np.full(inside.shape, value) for value in (ground + level, 0.0, 0.0)))
+    flat = Surface(*(np.full(inside.shape, value) for value in (surroundings + level, 0.0, 0.0)))
     if beam_shift is not None:
         along, sign = math.hypot(*beam_shift), np.sign(level)
         x, y = (-sign * shift / along for shift in beam_shift)
         height = _distance_to_region_edge(inside, (x, y), pitch) / along
         is_wall = height < abs(level)
-        wall = Surface(ground + sign * height, -sign * x / along, -sign * y / along)
+        wall = Surface(surroundings + sign * height, -sign * x / along, -sign * y / along)
         flat = jax.tree.map(lambda *fields: np.where(is_wall, *fields), wall, flat)
     return jax.tree.map(lambda *fields: np.where(inside, *fields), flat, surface)
+
+
+@dataclass(frozen=True)
+class _RegionSearch:
+    """Levels tried for one region; `tried` maps the heights of each trial to its misfit and fitted surface."""
+
+    number: int
+    inside: np.ndarray
+    base: Surface
+    surroundings: float
+    pitch: tuple[float, float]
+    beam_shift: tuple[float, float]
+    misfit: Misfit
+    report: Callable[[str], None]
+    tried: dict[bytes, tuple[float, Surface]] = field(default_factory=dict)
+
+    def misfit_at(self, level: float, has_wall: bool) -> float:
+        """Fit the region at a level above the surroundings, um, and compute the misfit; infinite if not predictable."""
+        said = " and a wall" if has_wall else ""
+        self.report(f"region {self.number} of {self.inside.sum()} pixels: trying the level {level:+.0f} um{said}")
+        shift = self.beam_shift if has_wall else None
+        trial = at_level(self.inside, self.base, level, self.surroundings, self.pitch, shift)
+        key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
+        if key not in self.tried:
+            try:
+                self.tried[key] = self.misfit(trial)
+            except PredictionError:  # no level of a wall that nothing can be predicted of
+                self.tried[key] = np.inf, trial
+        return self.tried[key][0]
 
 
 def search_levels(
@@ -103,7 +133,7 @@ def search_levels(
     beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
 ) -> Levels:
-    """Return the surface with all regions at the levels that explain the images best.
+    """Find the surface with all regions at the levels that explain the images best.
 
     A moved region starts flat; its own relief is the fit's matter.
 
@@ -121,40 +151,30 @@ def search_levels(
     for number in np.unique(region[region > 0]):
         inside = region == number
         around = grown(inside) & ~inside
-        ground = float(np.median(found.height[around]))
+        surroundings = float(np.median(found.height[around]))
         room = np.pad(inside, 1, mode="edge")
         width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
-        tried: dict[bytes, tuple[float, Surface]] = {}
-
-        def at(level: float, has_wall: bool, number=number, inside=inside, base=found, tried=tried, ground=ground):
-            said = " and a wall" if has_wall else ""
-            report(f"region {number} of {inside.sum()} pixels: trying the level {level:+.0f} um{said}")
-            trial = at_level(inside, base, level, ground, pitch, beam_shift if has_wall else None)
-            key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
-            if key not in tried:
-                try:
-                    tried[key] = misfit(trial)
-                except PredictionError:  # no level of a wall that nothing can be predicted of
-                    tried[key] = np.inf, trial
-            return tried[key][0]
-
+        search = _RegionSearch(int(number), inside, found, surroundings, pitch, beam_shift, misfit, report)
         levels = sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0))
         kinds = (False, True) if any(beam_shift) else (False,)
-        has_wall, i = min(product(kinds, range(len(levels))), key=lambda trial: at(levels[trial[1]], trial[0]))
+        has_wall, i = min(
+            product(kinds, range(len(levels))), key=lambda trial: search.misfit_at(levels[trial[1]], trial[0])
+        )
         bracket = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
-        minimize_scalar(at, bounds=bracket, args=(has_wall,), method="bounded", options={"maxiter": _LEVEL_STEPS})
-        explanations = [(best, found), *tried.values()]
-        value, better = min(tried.values(), key=lambda entry: entry[0])
+        options = {"maxiter": _LEVEL_STEPS}
+        minimize_scalar(search.misfit_at, bounds=bracket, args=(has_wall,), method="bounded", options=options)
+        explanations = [(best, found), *search.tried.values()]
+        value, better = min(search.tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
             moved.append(int(number))
-        if any(_differ(found, other, inside, ground) for value, other in explanations if value < best + GAIN):
+        if any(_differ(found, other, inside, surroundings) for value, other in explanations if value < best + GAIN):
             undecided.append(int(number))
     return Levels(found, moved, undecided)
 
 
-def _differ(surface: Surface, other: Surface, inside: np.ndarray, ground: float) -> bool:
-    """Return whether two surfaces' heights in a region differ by a large share of its step to the ground."""
+def _differ(surface: Surface, other: Surface, inside: np.ndarray, surroundings: float) -> bool:
+    """Whether two surfaces' heights in a region differ by a large share of its step to the surroundings."""
     heights, others = surface.height[inside], other.height[inside]
-    step = max(abs(float(np.median(h)) - ground) for h in (heights, others))
+    step = max(abs(float(np.median(h)) - surroundings) for h in (heights, others))
     return float(np.median(np.abs(heights - others))) > FLOATING * step

@@ -49,7 +49,7 @@ class PhotometricSolution:
 
 
 def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
-    """Return background-subtracted signal and its variance in units of the beam (counts / n_rays) [detector, y, x].
+    """Compute background-subtracted signal and its variance in units of the beam (counts / n_rays) [detector, y, x].
 
     Without a known number of beam atoms the unit is the mean signal, so that the albedo is relative. Without
     a known variance every datum gets the same one: 1 % of the mean signal, squared.

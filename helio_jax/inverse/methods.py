@@ -128,7 +128,7 @@ def _with_backtracking(work: Callable[[Surface], Any], surface: Surface, smoothe
 
 
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
-    """Return by how many per cent the highest point moves per per cent of signal of each gain and offset.
+    """Compute the change of the highest point per change of each gain and offset, per cent per per cent of signal.
 
     All other unknowns follow the forced change; heights count from the median.
     """
@@ -145,7 +145,7 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
 
 
 def scan_order(stack: MicrographStack) -> ScanOrder:
-    """Return the order in which a stack's pixels were recorded."""
+    """Order in which a stack's pixels were recorded."""
     return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
 
 
@@ -175,9 +175,7 @@ def _with_plateaus(
         known = signal, variance, stack.instrument, raster, surface, settings, region
         return FitProblem.of(*known, scan_order(stack))
 
-    fit, _ = _with_backtracking(
-        lambda surface: fit_heights(pose(surface), surface, settings, predict, report), start, smoothed
-    )
+    fit, _ = _with_backtracking(lambda surface: fit_heights(pose(surface), surface, predict, report), start, smoothed)
     region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
     is_undecided = np.zeros(stack.shape[1:], bool)
     for is_last in (False, True):
@@ -201,7 +199,7 @@ def _with_plateaus(
                 is_moved = np.isin(left, found.moved)
                 is_undecided |= is_moved  # unless the fit goes on from there
                 trial = np.where(is_moved, levelled.max() + left, levelled)
-                fit = fit_heights(pose(found.surface, trial), found.surface, settings, predict, report)
+                fit = fit_heights(pose(found.surface, trial), found.surface, predict, report)
                 levelled, is_undecided = trial, is_undecided & (~is_moved | np.isin(left, found.undecided))
             elif np.unique(left).size == np.unique(single).size:
                 break

@@ -176,7 +176,7 @@ class Posterior:
         return replace(self, samples=add_common_mode(self.samples, error, len(modes)), common_modes=modes)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
-        """Return it on the full raster [y, x], each pixel taking the values of its nearest one."""
+        """Resample to the full raster [y, x], by the nearest pixel."""
         if stride == 1:
             return self
         full = partial(on_raster, shape=shape, stride=stride)
@@ -208,13 +208,13 @@ class ModelError:
         return self.stride * np.sqrt(self.share * np.prod(agreement))
 
     def average(self, white: np.ndarray) -> np.ndarray:
-        """Return errors of variance 1 that agree between neighbours, from white noise; its own transpose."""
+        """Average white noise to errors of variance 1 that agree between neighbours; its own transpose."""
         lengths = [n / self.stride for n in self.length]
         smooth = gaussian_filter(white, lengths, axes=(-2, -1))
         return smooth / np.prod([_averaged_std(n) for n in lengths])
 
     def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
-        """Return errors of the data [detector * y * x, sample], in deviations assumed of them.
+        """Draw errors of the data [detector * y * x, sample], in deviations assumed of them.
 
         `white` is the counts' noise; what the model has of the variance is taken from it.
         """
@@ -224,7 +224,7 @@ class ModelError:
         return (model + counts).reshape(n, -1).T
 
     def covariance(self, influence: np.ndarray) -> np.ndarray:
-        """Return the covariance of the sums of such errors weighted by `influence` [detector * y * x, parameter]."""
+        """Compute the covariance of the sums of such errors weighted by `influence` [detector * y * x, parameter]."""
         images = influence.T.reshape(-1, *self.share.shape)
         model, counts = self.average(self.deviation * images), np.sqrt(1.0 - self.share) * images
         both = np.concatenate([model, counts], axis=1)
@@ -258,7 +258,7 @@ class _Rows:
         return sum(block.shape[0] for block in self._blocks)  # type: ignore[index]  # SciPy's stubs allow no shape
 
     def stack(self, n_more: int) -> sparse.csr_matrix:
-        """Return all rows, and `n_more` empty ones below."""
+        """Append `n_more` empty rows."""
         empty = sparse.csr_matrix((n_more, 3 * self._n))
         return sparse.csr_matrix(sparse.vstack([*self._blocks, empty]))
 
@@ -397,7 +397,7 @@ def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
 
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:
-    """Return the posterior covariance of the heights [y * x, y * x], um^2, dense; for rasters of up to 32 x 32."""
+    """Compute the posterior covariance of the heights [y * x, y * x], um^2, dense; for rasters of up to 32 x 32."""
     both = np.hstack([linear.surface.toarray() + linear.common @ linear.weights.T, linear.instrument])
     covariance = np.linalg.inv(both.T @ both)
     n = 3 * linear.shape[0] * linear.shape[1]

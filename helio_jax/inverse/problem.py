@@ -35,8 +35,7 @@ class FitProblem:
         optics: as stated.
         uncertainty: prior standard deviations of the geometry.
         raster: beam positions.
-        settings: of the fit.
-        border_settings: what is known of the border.
+        reconstruct_settings: of the fit (`settings`), and what is known of the border.
         order: in which the pixels were recorded.
         is_level_held, is_level_free: whether the mean height is held, or unknown; a flat border does neither.
         held_level: mean height that is held, over its standard deviation.
@@ -53,8 +52,7 @@ class FitProblem:
     optics: Optics
     uncertainty: Uncertainty
     raster: Raster
-    settings: RefineSettings
-    border_settings: ReconstructSettings
+    reconstruct_settings: ReconstructSettings
     order: ScanOrder
     is_level_held: bool
     is_level_free: bool
@@ -93,11 +91,16 @@ class FitProblem:
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
-            signal, variance, optics, stated, raster, s, settings, order, is_held,
+            signal, variance, optics, stated, raster, settings, order, is_held,
             is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median,
             noise, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
+
+    @property
+    def settings(self) -> RefineSettings:
+        """Settings of the fit."""
+        return self.reconstruct_settings.refine
 
     @property
     def shift(self) -> np.ndarray:
@@ -128,13 +131,12 @@ class FitProblem:
     @property
     def border(self) -> np.ndarray:
         """Prior weight of each height above the substrate [y, x], 1/um."""
-        return _border_weight(self.raster.shape, self.border_settings)
+        return _border_weight(self.raster.shape, self.reconstruct_settings)
 
     @property
     def position(self) -> np.ndarray:
         """Positions (x, y) about the middle of the raster [2, y, x], um."""
-        centred = Raster.regular(self.raster.shape, self.raster.dx, self.raster.dy)
-        return np.stack(np.meshgrid(centred.x, centred.y))
+        return self.raster.centred_positions()
 
     @property
     def priors(self) -> Priors:
@@ -188,13 +190,15 @@ class FitProblem:
             return np.asarray(moves_of(jax.tree.map(jnp.asarray, parameters), self.priors, len(self.signal)))
 
     def fitted_instrument(self, parameters: Parameters) -> Instrument:
-        """Return the instrument with the geometry that parameters stand for."""
+        """Move the instrument by what parameters stand for."""
         assert self.instrument is not None  # of a measurement
         moves = self.moves(parameters)
         return self.instrument.moved(moves[1:].T, float(moves[0, 0])) if len(moves) else self.instrument
 
     def thinned(self, stride: int) -> "FitProblem":
         """Keep every `stride`-th row and column, each standing for stride^2 data."""
+        if stride == 1:
+            return self
         thin = (slice(None, None, stride),) * 2
         return replace(
             self,

@@ -27,16 +27,16 @@ model explains them: noise alone reaches it in one pixel of a million."""
 _LARGEST = 25.0
 """A datum counts with this square at most."""
 VEILED = 5.0
-"""A datum whose assumed deviation is this many times that of its counts tells little of a facet."""
+"""A datum whose assumed deviation is this many times that of its counts is not informative of a facet."""
 FLOATING = 0.2
-"""A region is floating when its level is uncertain by more than this share of its step to the ground."""
+"""A region is floating when its level is uncertain by more than this share of its step to the substrate."""
 MIN_REGION = 16
 """Smaller regions are part of the jump that surrounds them [pixels]."""
 _FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))
 
 
 def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> np.ndarray:
-    """Return why a pixel is not valid, from the data alone (index into REASONS) [y, x].
+    """Find why a pixel is not valid, from the data alone (index into REASONS) [y, x].
 
     Args:
         stack: the images.
@@ -53,7 +53,7 @@ def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> n
 
 
 def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
-    """Return the number of the region of every pixel [y, x]: pixels joined by joined edges; the largest region is 0.
+    """Number the region of every pixel [y, x]: pixels joined by joined edges; the largest region is 0.
 
     Args:
         joined_x, joined_y: weight left to the edges [y, x - 1], [y - 1, x].
@@ -87,11 +87,11 @@ def floating(
     if common_modes is not None:
         relative = np.sqrt(((common_modes - np.median(common_modes, (1, 2), keepdims=True)) ** 2).sum(0))
         flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
-    ground = region == 0
+    substrate = region == 0
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number
-        step = abs(float(np.median(height[inside]) - np.median(height[ground])))
-        spread = float(np.std(samples[:, inside].mean(1) - samples[:, ground].mean(1)))
+        step = abs(float(np.median(height[inside]) - np.median(height[substrate])))
+        spread = float(np.std(samples[:, inside].mean(1) - samples[:, substrate].mean(1)))
         flags |= inside & (spread > FLOATING * step)
     return flags
 
@@ -108,7 +108,7 @@ def depth_jumps(height: np.ndarray, slope: np.ndarray, joined: np.ndarray, pitch
 
 
 def squares(residuals: np.ndarray) -> np.ndarray:
-    """Return the squares of residuals, limited, so that a few do not speak for all; 0 where there is none."""
+    """Compute squares of residuals, limited so that a few do not dominate; 0 where there is none."""
     return np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST)
 
 
@@ -128,7 +128,7 @@ def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
 
 
 def n_informative(model_share: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
-    """Return how many data tell of every pixel's facet [y, x].
+    """Count the informative data of every pixel's facet [y, x].
 
     Args:
         model_share: share of the prediction's assumed error in the variance of each datum [detector, y, x].

@@ -1,4 +1,4 @@
-"""Plateaus: regions that depth jumps part from the ground, found in the images.
+"""Plateaus: regions that depth jumps part from the substrate, found in the images.
 
 Slopes say nothing about the height of a floor behind a wall that the beam does not see: a least-squares fit bridges the
 wall by slopes that the images contradict. The images show the wall, though: across a mask's edge one detector changes,
@@ -23,7 +23,7 @@ _HALF_LENGTHS = (3, 7)
 MIN_REGION = 50
 """Smallest region that is looked for [pixels]."""
 UNEXPLAINED = 2.0
-"""Mean square residual, within a region or along its border, in those of the ground, from which on levels are tried."""
+"""Mean square residual, in a region or along its border, in those of the substrate, above which levels are tried."""
 _UNKNOWN = 1e6
 """Variance of data that were not observed, in those of the worst ones: finite, for running means."""
 _BAND = 3
@@ -31,7 +31,7 @@ _BAND = 3
 
 
 def wall_strength(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
-    """Return the change across every edge, in chi-square without the detector that changes most.
+    """Compute the change across every edge, in chi-square without the detector that changes most.
 
     Two pixels on each side are compared, averaged over 2 half + 1 pixels along the edge.
     """
@@ -49,24 +49,24 @@ def wall_strength(signal: np.ndarray, variance: np.ndarray, axis: int, half: int
 
 
 def _crests(strength: np.ndarray, axis: int) -> np.ndarray:
-    """Return the strength of the edges [y, x] that are stronger than the edges before and after them, 0 elsewhere."""
+    """Keep the strength of the edges [y, x] that are stronger than the edges before and after them, 0 elsewhere."""
     size = [1, 1]
     size[axis] = 3
     return np.where(strength >= maximum_filter(strength, size), strength, 0.0)
 
 
 def _numbered(mask: np.ndarray) -> np.ndarray:
-    """Return the numbers, from 1, of the connected areas of a mask [y, x]; 0 outside."""
+    """Number, from 1, the connected areas of a mask [y, x]; 0 outside."""
     return np.asarray(label(mask)[0])  # type: ignore[index]  # SciPy's stubs take the result for a number
 
 
 def grown(mask: np.ndarray) -> np.ndarray:
-    """Return a mask [y, x] grown by `_BAND` pixels."""
+    """Grow a mask [y, x] by `_BAND` pixels."""
     return np.asarray(binary_dilation(mask, iterations=_BAND))
 
 
 def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the number of every pixel's region [y, x], 0 being the largest: the ground.
+    """Find the number of every pixel's region [y, x], 0 being the largest: the substrate.
 
     Seeds are the connected areas without a strong change; they grow by a minimum spanning forest over the edges, so
     that their borders lie on the strongest edges between them.
@@ -109,7 +109,7 @@ def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Return the regions with 0 put for those whose images the fit explains [y, x].
+    """Set regions whose images the fit explains to 0 [y, x].
 
     Args:
         region: from `find_plateaus` [y, x].
@@ -127,7 +127,7 @@ def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
 
 
 def joined(region: np.ndarray) -> np.ndarray:
-    """Return the regions with those that (nearly) touch made one, gaps between them included [y, x].
+    """Join regions that (nearly) touch, with the gaps between them [y, x].
 
     Inside a plateau masks may end along strong edges, too.
     """

@@ -60,7 +60,7 @@ class Parameters(eqx.Module):
         return tuple(name for name in NAMES if name != "lines" and getattr(self, name).size)
 
     def replaced(self, **values: Any) -> "Parameters":
-        """Return a copy with other values."""
+        """Copy with other values."""
         return Parameters(**{name: values.get(name, getattr(self, name)) for name in NAMES})
 
 

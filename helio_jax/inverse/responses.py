@@ -4,7 +4,7 @@ Corrections are held fixed during a solve. Where the data determine something co
 the priors, as the level of a plateau or, with a free border, level, scale and tilt of all heights, iterations that hold
 the corrections would run away along it, or rest where the misfit is not least (relief came out 8 % too flat on
 pyramids). So the corrections follow these changes to first order: masks by the derivative of the horizon march,
-multiple scattering by that of the radiosity model. The surroundings of a free border go along with its lowest part.
+multiple scattering by that of the radiosity model. The substrate around a free border moves with its lowest part.
 """
 
 from typing import Any, NamedTuple
@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from helio_jax.arrays import border_mask
+from helio_jax.arrays import substrate_mask
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.masking import masked_form_factor
-from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal, unit_normal
@@ -26,9 +26,6 @@ from helio_jax.inverse.samples import thinning
 
 LEVEL_FACET = 0.9
 """Facets whose unit normal has a larger vertical part count as level."""
-GROUND_BORDER, GROUND_SHARE = 0.06, 0.05
-"""Width of the border, as a share of each side, and the share of its pixels that are taken for ground, as by
-`scene.border`, which continues a surface with a free border for the tracer."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
 
@@ -69,34 +66,24 @@ def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Ra
 def _multiple_change(
     surface: Surface,
     change: Surface,
-    ground: jax.Array,
-    ground_change: jax.Array,
+    level: jax.Array,
+    level_change: jax.Array,
     optics: Optics,
     raster: Raster,
     plan: Plan,
 ) -> tuple[jax.Array, jax.Array]:
-    """Compute multiple scattering and its change along changes of the surface and its ground [detector, y, x]."""
+    """Compute multiple scattering [detector, y, x] and its change with the surface and the substrate's level."""
 
     def multiple(s, level):
         normals = jnp.moveaxis(unit_normal(s.slope_x, s.slope_y, optics.beam_shift), 0, -1)
-        return radiosity(s.height - level, normals, _on_ground(optics, level), raster, plan)
+        return radiosity(s.height - level, normals, _with_substrate_at(optics, level), raster, plan)
 
-    return jax.jvp(multiple, (surface, ground), (change, ground_change))
+    return jax.jvp(multiple, (surface, level), (change, level_change))
 
 
-def _on_ground(optics: Optics, level: Any) -> Optics:
-    """Return optics whose substrate stands at a level above the stated one, um."""
+def _with_substrate_at(optics: Optics, level: Any) -> Optics:
+    """Move the substrate of optics to a level above the stated one, um."""
     return eqx.tree_at(lambda o: o.sample_distance, optics, optics.sample_distance - level)
-
-
-def _is_ground(height: np.ndarray) -> np.ndarray:
-    """Return True in the lowest pixels of the border, at whose level the surroundings of a free border stand [y, x]."""
-    border = border_mask(height.shape, GROUND_BORDER)
-    return border & (height <= np.quantile(height[border], GROUND_SHARE))
-
-
-def _as_jax(surface: Surface) -> Surface:
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), surface)
 
 
 def region_responses(surface: Surface, optics: Optics, raster: Raster, region: np.ndarray) -> tuple[Response, ...]:
@@ -112,7 +99,8 @@ def region_responses(surface: Surface, optics: Optics, raster: Raster, region: n
         inside = region == number
         change = Surface(inside.astype(float), *np.zeros((2, *region.shape)))
         with jax.enable_x64(True):
-            masked = _masked_change(_as_jax(surface), _as_jax(change), optics, raster)
+            at, along = cast((surface, change), jnp.float64)
+            masked = _masked_change(at, along, optics, raster)
         found.append(Response(inside / inside.sum() - substrate / substrate.sum(), np.asarray(masked)))
     return tuple(found)
 
@@ -144,29 +132,32 @@ def relief_responses(
     shift = optics.beam_shift
     smooth = Surface(surface.height, *slopes_of_normal(normals, shift)[:2])
     coarse, coarse_raster = jax.tree.map(lambda f: np.asarray(f)[thin], smooth), raster.thinned(stride)
-    is_ground = _is_ground(coarse.height)
-    ground = np.mean(coarse.height[is_ground])
-    plan = plan_radiosity(coarse.height - ground, coarse.normals(shift), _on_ground(optics, ground), coarse_raster)
+    is_substrate = substrate_mask(coarse.height)
+    level = np.mean(coarse.height[is_substrate])
+    with_level = _with_substrate_at(optics, level)
+    plan = plan_radiosity(coarse.height - level, coarse.normals(shift), with_level, coarse_raster)
     out = []
     smooth_changes = _relief_changes(smooth, raster, has_enough_images, distance)
     for i, (change, smooth_change) in enumerate(zip(changes, smooth_changes, strict=True)):
         with jax.enable_x64(True):
-            masked = np.asarray(_masked_change(_as_jax(surface), _as_jax(change), optics, raster))
-            thinned = _as_jax(jax.tree.map(lambda f: f[thin], smooth_change))
-            level, rise = jnp.asarray(ground), jnp.asarray(np.mean(np.asarray(thinned.height)[is_ground]))
-            value, slope = _multiple_change(_as_jax(coarse), thinned, level, rise, optics, coarse_raster, plan)
-        sharp, turned = (jax.tree.map(lambda f: np.asarray(f)[thin], s) for s in (surface, change))
-        own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2]) * _vertical_change(sharp, turned, shift)
+            at, along = cast((surface, change), jnp.float64)
+            masked = np.asarray(_masked_change(at, along, optics, raster))
+            thinned = jax.tree.map(lambda f: f[thin], smooth_change)
+            levels = jnp.asarray(level), jnp.asarray(np.mean(thinned.height[is_substrate]))
+            at, along = cast((coarse, thinned), jnp.float64)
+            value, slope = _multiple_change(at, along, *levels, optics, coarse_raster, plan)
+        sharp, sharp_change = (jax.tree.map(lambda f: np.asarray(f)[thin], s) for s in (surface, change))
+        vertical = _vertical_change(sharp, sharp_change, shift)
+        own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2]) * vertical
         out.append(Response(weights[i], masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
     return tuple(out)
 
 
 def _relief_changes(surface: Surface, raster: Raster, has_enough_images: np.ndarray, distance: float) -> list[Surface]:
-    """Return changes of a relief that keep its shape: lower, flatter, tilted about y, tilted about x."""
+    """Make the changes of a relief that keep its shape: lower, flatter, tilted about y, tilted about x."""
     none = np.zeros(has_enough_images.shape)
     mean = np.mean(surface.height[has_enough_images])
-    centred = Raster.regular(raster.shape, raster.dx, raster.dy)
-    x, y = np.meshgrid(centred.x, centred.y)
+    x, y = raster.centred_positions()
     return [
         Surface(none - distance, none, none),
         Surface(mean - surface.height, -surface.slope_x, -surface.slope_y),

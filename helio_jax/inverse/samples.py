@@ -4,7 +4,7 @@ import numpy as np
 
 
 def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
-    """Return the power of two by which rows and columns of a raster (y, x) are thinned to so many pixels at most."""
+    """Compute the least power of two by which to thin rows and columns of a raster (y, x) to at most `max_pixels`."""
     stride = 1
     while (shape[0] // stride) * (shape[1] // stride) > max_pixels:
         stride *= 2
@@ -12,7 +12,7 @@ def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
 
 
 def on_raster(fields: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
-    """Return fields [..., y, x] of every `stride`-th pixel on the raster they are of, each taking its nearest one's."""
+    """Resample fields [..., y, x] of every `stride`-th pixel to the full raster, by the nearest pixel."""
     row, column = (
         np.minimum(np.rint(np.arange(n) / stride).astype(int), m - 1)
         for n, m in zip(shape, fields.shape[-2:], strict=True)

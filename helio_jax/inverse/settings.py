@@ -77,7 +77,7 @@ class RefineSettings(Settings):
     per pixel, but 1.5 million at least."""
 
     def paths(self, n_pixels: int) -> int:
-        """Return how many paths a prediction of so many pixels takes."""
+        """Number of paths of a prediction for so many pixels."""
         return max(LEAST_PATHS, PATHS_PER_PIXEL * n_pixels) if self.rays is None else self.rays
 
     @model_validator(mode="after")

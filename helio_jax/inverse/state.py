@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.masking import masked_form_factor
-from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.problem import FitProblem
@@ -35,7 +35,7 @@ class Held:
         corrections: made for `surface`.
         surface: heights and slopes.
         masked: masked form factors as a linear model in the own normal [detector, 3, y, x].
-        multiple: the multiple scattering that goes with it [detector, y, x].
+        multiple: intercept of that model: multiple scattering plus what `masked` subtracts of it [detector, y, x].
         sigma: standard deviation of the data, prediction errors included, infinite where not observed [detector, y, x].
         moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
         moved: the moves at which they were made [move, detector].
@@ -77,6 +77,8 @@ class FitState:
 
     def thinned(self, problem: FitProblem, stride: int) -> "FitState":
         """Keep every `stride`-th row and column, for `problem`, which is thinned."""
+        if stride == 1:
+            return self
         thin = (slice(None, None, stride),) * 2
         h, c = self.held, self.held.corrections
         held = _held(
@@ -151,17 +153,17 @@ def set_corrections(problem: FitProblem, state: FitState, corrections: Correctio
     """Take corrections, made on a surface, for all solves until the next ones."""
     held = _held(problem, corrections, surface, state.parameters)
     if len(held.moved):
-        optics, fields = problem.optics, (surface.height, surface.slope_x, surface.slope_y)
         with jax.enable_x64(True):
-            moves = _masked_moves(Surface(*map(jnp.asarray, fields)), optics, problem.raster, held.moved)
+            moves = _masked_moves(cast(surface, jnp.float64), problem.optics, problem.raster, held.moved)
         held = replace(held, moves=np.asarray(moves))
     return replace(state, held=held)
 
 
 def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
     """Predict masks and multiple scattering on the current surface, which follow no common changes of heights."""
-    surface, is_known = state.surface, not len(problem.moves(state.parameters))
-    instrument = () if is_known else (problem.fitted_instrument(state.parameters),)
+    surface, p = state.surface, state.parameters
+    is_geometry_known = not p.distance.size and not p.aim.size
+    instrument = () if is_geometry_known else (problem.fitted_instrument(p),)
     corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
     return set_corrections(problem, state, corrections, surface)
 
@@ -174,7 +176,7 @@ def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -
 def with_responses(problem: FitProblem, state: FitState) -> FitState:
     """Compute how the corrections follow the levels of plateaus and, with a free border, changes of all heights."""
     surface, raster = state.held.surface, problem.raster
-    optics = moved_optics(problem.optics, problem.moves(state.parameters))
+    optics = moved_optics(problem.optics, state.held.moved)
     responses = region_responses(surface, optics, raster, problem.region)
     if problem.is_level_free or problem.is_level_held:
         smooth = state.held.corrections.normals

@@ -113,6 +113,8 @@ class PixelTerms(NamedTuple):
 
     def thinned(self, stride: int) -> "PixelTerms":
         """Keep every `stride`-th row and column."""
+        if stride == 1:
+            return self
         thin = (..., slice(None, None, stride), slice(None, None, stride))
         f = self.factors
         factors = FormFactors(
@@ -243,9 +245,9 @@ def step(
     """Solve one weighted least-squares problem from a state; arguments as those of `freeze`."""
     s = problem.settings
     start, fixed = freeze(problem, state, limit, cut, occluded)
-    free, mixing_is_whitened = np.asarray(float(is_instrument_free)), problem.is_instrument_unknown
+    free = np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
-        if is_instrument_free and (mixing_is_whitened or problem.is_level_free):
+        if is_instrument_free and (problem.is_instrument_unknown or problem.is_level_free):
             mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)))
         else:  # as they are, where they are held or little is unknown
             n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
@@ -266,7 +268,7 @@ def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndar
 
 
 def levelled(problem: FitProblem, state: FitState) -> Surface:
-    """Return the surface above the substrate, which may be tilted."""
+    """Compute the surface above the substrate, which may be tilted."""
     s, tilt = state.surface, problem.priors.tilt * state.parameters.tilt
     if not tilt.size:
         return s

@@ -7,12 +7,6 @@ height of the border, it would lie above the true substrate, nearer to the apert
 import numpy as np
 from scipy.ndimage import median_filter
 
-from helio_jax.arrays import border_mask
-
-BORDER_WIDTH = 0.06
-"""Width of the border, as a fraction of each side of the image."""
-SUBSTRATE_QUANTILE = 0.05
-"""Quantile of the border's heights that is taken as the substrate."""
 MAX_TERRACE_SLOPE = 0.2
 """A terrace slopes outwards by less than this. Any other border falls with its own slope, by at least this slope.
 A continuation at the height of each border pixel, errors of a fit included, kept the fit of a tall crystal from finding
@@ -23,11 +17,6 @@ _SLOPE_PIXELS = 4
 """Pixels from the border over which its slope is measured."""
 _MEDIAN_PIXELS = 9
 """Pixels along the border whose slopes are reduced to their median."""
-
-
-def substrate_level(height: np.ndarray) -> float:
-    """Estimate the height of the substrate from the lowest part of the border of heights [y, x], um."""
-    return float(np.quantile(height[border_mask(height.shape, BORDER_WIDTH)], SUBSTRATE_QUANTILE))
 
 
 def extend_border(

@@ -7,7 +7,7 @@ substrate came out a fifth too low, and flanks of 55 degrees at 32 (benchmarks/c
 
 import numpy as np
 
-from helio_jax.arrays import as_json, nearest_known
+from helio_jax.arrays import as_json, nearest_known, substrate_level
 from helio_jax.calibration.self_calibration import (
     Relief,
     SelfCalibration,
@@ -23,7 +23,6 @@ from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.nearfield import limited
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import Calibration, MicrographStack
-from helio_jax.scene.border import substrate_level
 from helio_jax.workflows.corrections import make_predictor
 
 _MAX_ITERATIONS, _CONVERGED = 8, (0.01, 0.5)

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import pitch, substrate_level
 from helio_jax.errors import GuardError, PredictionError, SceneError
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
@@ -22,7 +22,7 @@ from helio_jax.forward.render import Corrections, masking_corrections, radiosity
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
-from helio_jax.scene.border import extend_border, substrate_level
+from helio_jax.scene.border import extend_border
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
@@ -121,21 +121,22 @@ def make_predictor(
 
 
 def _surroundings(instrument: Instrument) -> float:
-    """Return how far beyond the image the ground scatters into the detectors [um].
+    """Compute how far beyond the image the substrate scatters into the detectors [um].
 
-    A steep facet sees little of the far ground, but what lies below the outermost aperture, which it faces, sends much
-    of it up: the ground must go on beyond that by the plate's distance. The rest is below 0.2 % of the multiple
-    scattering of 55 degree flanks below an aperture at 46 degrees; without it 4.5 % are (tests/physics).
+    A steep facet sees little of the distant substrate, but the substrate below the outermost aperture, which it faces,
+    scatters strongly towards it: the substrate must extend beyond that by the plate's distance. Of the multiple
+    scattering of 55 degree flanks below an aperture at 46 degrees, below 0.2 % come from farther out; 4.5 % are missing
+    without that margin (tests/physics).
     """
     outermost = max(math.hypot(*a.center) + max(a.semi_axes) for a in instrument.apertures())
     return outermost + instrument.sample_distance
 
 
 def _denoise_within_facets(height: np.ndarray, normals: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return heights [y, x], um, and unit normals [y, x, 3] averaged over neighbours on the same facet.
+    """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
 
-    Facets that are rough with noise see one another: on a flat they would add half a per cent of its signal. Where the
-    mean height differs by more than `largest`, neighbours are at another level, and the height stays.
+    Noise makes facets see one another: on a flat that would add half a per cent of its signal. Where the mean height
+    differs by more than `largest`, neighbours are at another level, and the height stays.
     """
     mean = smooth_along_surface(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), normals)
     smooth = np.moveaxis(mean[:3], 0, -1)
@@ -152,7 +153,7 @@ class SurfaceHypothesis:
     intersector: Intersector
 
     def multiple(self, settings: TraceSettings, max_buried: float) -> np.ndarray:
-        """Return the traced multiple scattering [detector, y, x]."""
+        """Trace the multiple scattering [detector, y, x]."""
         r = self.raster
         experiment = make_experiment(self.intersector, r.instrument, settings)
         x, y = r.x.ravel(), r.y.ravel()
@@ -178,33 +179,40 @@ class SurfaceHypothesis:
 
 @dataclass(frozen=True)
 class _Raster:
-    """Beam positions [y, x], how far off the surface points are put, half the side of what is around [um], and whether
-    that is the flat z = 0; else it is the substrate, to which the border leads."""
+    """Beam positions and surroundings of a scan.
+
+    Attributes:
+        instrument: of the scan.
+        x, y: beam positions [y, x], um.
+        lift: how far off the surface the points are put, um.
+        reach: half the side of the square that the surroundings fill, um.
+        has_flat_surroundings: whether they are the flat z = 0; else the substrate, to which the border is continued.
+    """
 
     instrument: Instrument
     x: np.ndarray
     y: np.ndarray
     lift: float
     reach: float
-    is_flat_around: bool
+    has_flat_surroundings: bool
 
     def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> SurfaceHypothesis:
-        """Return the surface with its occluded side at a share of the way back."""
+        """Make the surface with its occluded side at a share of the way back."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
         at = *self.instrument.surface_position(self.x, self.y, height), height
         behind = occluded_vertices(*at, normals, shift, share)
-        if self.is_flat_around:
+        if self.has_flat_surroundings:
             body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
             body = with_cavities(body, at, behind)
         else:
-            ground = substrate_level(height)
-            around, behind = (extend_border(*points, ground, self.reach) for points in (at, behind))
-            body = with_cavities(surface_body(*around), around, behind)
+            level = substrate_level(height)
+            extended, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
+            body = with_cavities(surface_body(*extended), extended, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
         return SurfaceHypothesis(self, Hits.on_mesh(point, normal), Intersector(body))
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[SurfaceHypothesis]:
-        """Return the surface with its occluded side at all `OCCLUDED_NODES`; one, where nothing is unseen."""
+        """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
-        is_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
-        return [self.side(height, normals, share) for share in ((0.0,) if is_seen else OCCLUDED_NODES)]
+        is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
+        return [self.side(height, normals, share) for share in ((0.0,) if is_fully_seen else OCCLUDED_NODES)]

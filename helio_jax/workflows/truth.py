@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from helio_jax.errors import SceneError
-from helio_jax.formats.hdf5 import HDF5_SUFFIXES, read_height
+from helio_jax.formats.hdf5 import read_height
+from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres

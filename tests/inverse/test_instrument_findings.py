@@ -75,7 +75,7 @@ def test_unknown_geometry_is_free_from_the_first_round_on(bshem, monkeypatch, po
     start, settings = Surface(flat, flat, flat), ReconstructSettings()
     problem = FitProblem.of(signal, 1e-4 * signal, instrument, Raster.regular(flat.shape, 30.0), start, settings)
     with pytest.raises(Enough):
-        refine.fit_heights(problem, start, settings, lambda *surface: Corrections.none(signal.shape))
+        refine.fit_heights(problem, start, lambda *surface: Corrections.none(signal.shape))
     assert said == [(is_free, is_free)]
 
 

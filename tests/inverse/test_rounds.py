@@ -159,7 +159,7 @@ def fitted(bshem, drift=0.0, order=ScanOrder(), border="flat", noise=0.01, state
     data = signal + drift * signal.mean()
     raster = Raster.regular(SHAPE, PITCH)
     problem = FitProblem.of(data, variance, stated or bshem, raster, surface, settings, order=order)
-    return fit_heights(problem, surface, settings, nothing_more)
+    return fit_heights(problem, surface, nothing_more)
 
 
 def signal_of(instrument, surface):

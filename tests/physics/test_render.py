@@ -246,41 +246,48 @@ LIMITS = {
     "rough": (5e-3, 2e-2, 0.75),
     "4 detectors": (1e-3, 1e-2, 0.02),
 }
-"""Largest relative error of the mean of single scattering and of all orders, and largest share of single values that
-differ by more than 1 % of the mean."""
+"""Against the sample: largest relative error of the mean of single scattering and of all orders, and largest share of
+single values that differ by more than 1 % of the mean."""
+GIVEN_LIMITS = 1e-3, 1e-2, 0.06
+"""The same against the given surface, for every scene."""
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_against_the_tracer(name):
     """Means over all pixels and detectors: single scattering within 1e-3 of the tracer's, all orders within 1 %.
 
-    No pixel is left out. What differs are pixels at depth jumps, rims and kinks, which see masks at the raster's
-    resolution: by up to half of the mean. Not within 1e-3, limits set after they were measured: the slot (2e-3,
-    `test_slot_by_pitch`) and the rough surface (3e-3, and 64 % of its pixels off by more than 1 %, nearly the same at a
-    quarter of the pitch; cause not found), whose multiple scattering is 16 % too low (`test_rough_by_pitch`). The
-    centres of slot and rough keep beam positions off walls: with one on a wall, 5e-3 and 9e-3. Rejected: no masks
-    (sphere, slot, 4 detectors), exchanged detectors.
+    That holds in every scene against the surface that the model was given, the heights at the beam positions. No pixel
+    is left out. What differs most are pixels beside depth jumps, by up to half of the mean.
+
+    Against the sample itself two scenes are not within the limits, set after they were measured, for the raster does
+    not contain the relief within a pixel: the tracer has the same deviation from itself when it is given the raster's
+    surface. Rough: 2.7e-3, of which 2.4e-3 are the raster's, and multiple scattering is 16 % too low (the tracer's on
+    the given surface: 15 %). Slot: 1.8e-3, 1.6e-3 of it the raster's. The centres of slot and rough keep beam positions
+    off walls: with one on a wall, 5e-3 and 9e-3. Rejected: no masks (sphere, slot, 4 detectors), exchanged detectors.
     """
-    found = compare(name, 16)
-    single, total, share = LIMITS[name]
-    assert abs(found.single_bias) < single
-    assert abs(found.total_bias) < total
-    assert np.mean(np.abs(found.difference) > 0.01) < share
-    exchanged = np.abs(found.single[::-1] - found.traced_single).mean()
-    assert exchanged > 2.0 * np.abs(found.single - found.traced_single).mean()
+    for found, (single, total, share) in zip(compare(name, 32), (LIMITS[name], GIVEN_LIMITS), strict=True):
+        assert abs(found.single_bias) < single
+        assert abs(found.total_bias) < total
+        assert np.mean(np.abs(found.difference) > 0.01) < share
+        exchanged = np.abs(found.single[::-1] - found.traced_single).mean()
+        assert exchanged > 2.0 * np.abs(found.single - found.traced_single).mean()
 
 
 def test_slot_by_pitch(monkeypatch):
     """Single scattering of the slot: where its walls stand tells detectors apart, kinks at its ends raise the mean.
 
     With the walls half-way between two rows the detectors' errors are within 2e-3 of one another (20 um: 1.4e-3 to
-    2.1e-3; 6 um off: -7e-3 to 1e-2). The mean does not fall steadily with the pitch: 2.1e-3, 7e-5, 1.0e-3, 1.0e-3 and
-    -3e-4 at 20, 10, 6.7, 5 and 3.3 um, so the limit at 6.7 um is 2e-3, and 7e-5 is chance.
+    2.1e-3; 6 um off: -7e-3 to 1e-2). Against the given surface the mean is within 4e-4 at every pitch (20, 10, 6.7, 5
+    and 3.3 um). The given surface's own deviation, mostly of the kinks at the slot's end, is 1.4e-3, 7e-4, 4e-4, 1e-4
+    and 2e-4. What the finite spot adds, up to 7e-4, depends on how many spots a wall cuts: the sum, 1.8e-3, 2e-4, 8e-4,
+    1.1e-3 and -2e-4, does not fall steadily.
     """
-    assert abs(compare("slot", 8, finer=3).single_bias) < 2e-3
+    found = compare("slot", 8, finer=3)
+    assert abs(found.sample.single_bias) < 2e-3
+    assert abs(found.given.single_bias) < 1e-3
     file, changes = SCENES["slot"]
     monkeypatch.setitem(SCENES, "slot", (file, changes | {"scan.center_um": [3.0, 10.0]}))
-    found = compare("slot", 8)
+    found = compare("slot", 8).sample
     errors = found.single.mean((1, 2)) / found.traced_single.mean((1, 2)) - 1.0
     assert np.ptp(errors) < 2e-3
 
@@ -288,9 +295,14 @@ def test_slot_by_pitch(monkeypatch):
 def test_rough_by_pitch():
     """All orders of the rough surface are within 1 % at half the pitch: -1.3e-2, -5.9e-3, -2.1e-3 at 20, 10, 5 um.
 
-    Its multiple scattering is 16 %, 8 % and 3 % too low: radiosity loses what the raster does not resolve.
+    Its multiple scattering is 16 %, 8 % and 4 % too low; compared with the tracer's on the given surface it is within
+    1 %, so that this is relief within a pixel, not a fault of the radiosity.
     """
-    assert abs(compare("rough", 8, finer=2).total_bias) < 1e-2
+    found = compare("rough", 8, finer=2)
+    assert abs(found.sample.total_bias) < 1e-2
+    given = found.given
+    multiple, traced = given.total - given.single, given.traced_total - given.traced_single
+    assert multiple.mean() == pytest.approx(traced.mean(), rel=0.02)
 
 
 def test_precisions_of_the_arguments(instrument, rough):
