@@ -19,10 +19,12 @@ from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
-from helio_jax.inverse.steps import edges_of, freeze, levelled, misfit, model_share, pixel_terms, step
+from helio_jax.inverse.state import FitState, Predict, update_corrections
+from helio_jax.inverse.steps import edges_of, freeze, levelled, model_share, pixel_terms, step
+from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
 GEOMETRY = "distance", "tilt", "aim"
@@ -51,7 +53,8 @@ class Fit:
         weight: robust weight of each datum [detector, y, x].
         model_share: share of the prediction errors in the variance of each datum [detector, y, x].
         joined_x, joined_y: weight left to the edges between pixels [y, x - 1], [y - 1, x]; 0 at a jump.
-        posterior: error bars, or None where none were asked for.
+        remaining: how far the heights still are from where further iterations would take them [y, x], um.
+        posterior: error bars, or None: not computed (`with_posterior`).
         changes: root mean square height change of every iteration [um].
         contraction: ratio of the last two changes, or None.
         status: a sentence: how the fit ended.
@@ -73,6 +76,7 @@ class Fit:
     model_share: np.ndarray
     joined_x: np.ndarray
     joined_y: np.ndarray
+    remaining: np.ndarray
     posterior: Posterior | None
     changes: tuple[float, ...]
     contraction: float | None
@@ -102,25 +106,22 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
 
 
-def misfit_on(
-    problem: FitProblem, surface: Surface, predict: Predict, parameters: Parameters | None = None
-) -> tuple[float, Surface]:
-    """Fit a surface's relief to the data; return half the robust chi-square, and the fitted surface.
+def misfit_on(problem: FitProblem, surface: Surface, predict: Predict, parameters: Parameters | None = None) -> float:
+    """Compute half the chi-square of the data expected on a surface; a few data far off count for little.
 
-    Counts data, with the logarithm of their assumed standard deviations, and edges; the instrument stays at
-    `parameters`, or at its prior means.
+    Nothing is fitted; the instrument is at `parameters`, or at its prior means.
+
+    Raises:
+        PredictionError: nothing can be predicted of the surface.
     """
-    s, state = problem.settings, FitState.at(problem, surface)
+    state = FitState.at(problem, surface)
     if parameters is not None:
         state = replace(state, parameters=parameters)
-    state = predict_corrections(problem, state, predict)
-    for _ in range(s.reweightings):
-        state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
-    return misfit(problem, state, s.robust_limits[-1], s.jump_limits[-1]), state.surface
+    return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict))))
 
 
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
-    """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs.
+    """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
     Interrupted from the keyboard after the first iteration, it returns the best so far.
 
@@ -168,12 +169,17 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             state = subtract_bias(problem, state, *noise_bias(problem, state, s.bias_pairs))
         except KeyboardInterrupt:
             is_interrupted = True
-    posterior = None
-    if s.samples and not is_interrupted:
-        posterior = posterior_at(problem, state, s.samples).with_common_mode(
-            remaining_error(changes, extrapolation) * last_change
-        )
-    return _finish(problem, state, changes, is_interrupted, posterior, found.status)
+    remaining = remaining_error(changes, extrapolation) * last_change
+    return _finish(problem, state, changes, is_interrupted, remaining, found.status)
+
+
+def with_posterior(fit: Fit) -> Fit:
+    """Compute the error bars of a fit, if it was not interrupted and its settings ask for them."""
+    n_samples = fit.problem.settings.samples
+    if fit.is_interrupted or not n_samples:
+        return fit
+    posterior = posterior_at(fit.problem, fit.state, n_samples).with_common_mode(fit.remaining)
+    return replace(fit, posterior=posterior)
 
 
 def _occlusion_edges(problem: FitProblem, state: FitState) -> tuple[np.ndarray, np.ndarray] | None:
@@ -189,7 +195,7 @@ def _finish(
     state: FitState,
     changes: list[float],
     is_interrupted: bool,
-    posterior: Posterior | None,
+    remaining: np.ndarray,
     optimiser: str,
 ) -> Fit:
     s, priors, parameters = problem.settings, problem.priors, state.parameters
@@ -214,7 +220,8 @@ def _finish(
         model_share=model_share(problem, state),
         joined_x=edges_x.joined,
         joined_y=edges_y.joined,
-        posterior=posterior,
+        remaining=remaining,
+        posterior=None,
         changes=tuple(changes),
         contraction=contraction_of(changes),
         status=f"{status_of(changes, s.tolerance_um, is_interrupted)}; {optimiser}",

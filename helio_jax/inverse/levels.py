@@ -1,14 +1,14 @@
-"""Levels of plateaus: regions of which slopes do not say how high they lie are tried at many; what fits best is kept.
+"""Levels of regions that depth jumps part from their surroundings: many are tried, the best explanation is kept.
 
-`search_levels` tries each region at a number of levels, flat and with the wall that the beam would see, all physics
-predicted anew, and keeps what explains the images best. The level is then fitted like every other height, and its error
-bar says whether masks or the near field fix it; a region that something else explains about as well is undecided.
+`search_levels` tries each region at a number of levels: flat, with the relief that was fitted, and with the wall that
+the beam would see. All physics is predicted anew, nothing is fitted: masks that end elsewhere than in the images are
+what tells the levels apart. The level is then fitted like every other height, and its error bar says whether masks or
+the near field fix it; a region that something else explains about as well is undecided.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 
+from helio_jax.arrays import nearest_known
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.quality import FLOATING
@@ -29,12 +30,18 @@ worse may be true as well."""
 _LEVEL_STEPS = 8
 """Evaluations by which the best level is refined."""
 
-Misfit = Callable[[Surface], tuple[float, Surface]]
-"""Half the robust chi-square of a surface after its slopes have been fitted, and that surface."""
+SKIRT = 4
+"""Pixels around a region that a fit without the jump may have raised."""
+KINDS = "flat", "as fitted", "flat, with a wall"
+"""Relief of a region that is put to another level."""
+
+Misfit = Callable[[Surface], float]
+"""Half the chi-square of the data expected on a surface, nothing fitted."""
 
 
 class Levels(NamedTuple):
-    """What a search found: the surface, the regions that it moved, and those that other levels explain as well."""
+    """What a search found: the surface, the regions that it moved, and those that other levels explain as well; both
+    by their places among the regions."""
 
     surface: Surface
     moved: list[int]
@@ -97,9 +104,9 @@ def at_level(
 
 @dataclass(frozen=True)
 class _RegionSearch:
-    """Levels tried for one region; `tried` maps the heights of each trial to its misfit and fitted surface."""
+    """Levels tried for one region; `tried` maps the heights of each trial to its misfit and surface."""
 
-    number: int
+    name: str
     inside: np.ndarray
     base: Surface
     surroundings: float
@@ -109,23 +116,40 @@ class _RegionSearch:
     report: Callable[[str], None]
     tried: dict[bytes, tuple[float, Surface]] = field(default_factory=dict)
 
-    def misfit_at(self, level: float, has_wall: bool) -> float:
-        """Fit the region at a level above the surroundings, um, and compute the misfit; infinite if not predictable."""
-        said = " and a wall" if has_wall else ""
-        self.report(f"region {self.number} of {self.inside.sum()} pixels: trying the level {level:+.0f} um{said}")
-        shift = self.beam_shift if has_wall else None
-        trial = at_level(self.inside, self.base, level, self.surroundings, self.pitch, shift)
+    def trial(self, level: float, kind: str) -> Surface:
+        """Make the surface with the region at a level above the surroundings, um."""
+        if kind == "as fitted":
+            rise = level + self.surroundings - float(np.median(self.base.height[self.inside]))
+            return Surface(self.base.height + rise * self.inside, self.base.slope_x, self.base.slope_y)
+        shift = self.beam_shift if kind == "flat, with a wall" else None
+        return at_level(self.inside, self.base, level, self.surroundings, self.pitch, shift)
+
+    def misfit_at(self, level: float, kind: str) -> float:
+        """Compute the misfit with the region at a level above the surroundings, um; infinite if not predictable."""
+        self.report(f"{self.name}: trying the level {level:+.0f} um, {kind}")
+        trial = self.trial(level, kind)
         key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
         if key not in self.tried:
             try:
-                self.tried[key] = self.misfit(trial)
+                self.tried[key] = self.misfit(trial), trial
             except PredictionError:  # no level of a wall that nothing can be predicted of
                 self.tried[key] = np.inf, trial
         return self.tried[key][0]
 
+    def search(self, levels: list[float]) -> None:
+        """Try all levels and kinds of relief, and refine the best of each kind."""
+        for kind in KINDS if any(self.beam_shift) else KINDS[:-1]:
+            current = float(np.median(self.base.height[self.inside])) - self.surroundings
+            tried = sorted([*levels, current]) if kind == "as fitted" else levels
+            i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
+            bracket = tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]
+            minimize_scalar(
+                self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options={"maxiter": _LEVEL_STEPS}
+            )
+
 
 def search_levels(
-    region: np.ndarray,
+    regions: Sequence[np.ndarray],
     surface: Surface,
     pitch: tuple[float, float],
     max_width: float,
@@ -135,10 +159,8 @@ def search_levels(
 ) -> Levels:
     """Find the surface with all regions at the levels that explain the images best.
 
-    A moved region starts flat; its own relief is the fit's matter.
-
     Args:
-        region: number of the region of every pixel, 0: none [y, x].
+        regions: one after the other [region][y, x]; they may overlap.
         surface: to begin with.
         pitch: dy, dx, um.
         max_width: levels up to twice the width of a region are tried, and of this width at most, um.
@@ -146,31 +168,36 @@ def search_levels(
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
     """
-    best, found = misfit(surface)
+    best, found = misfit(surface), surface
     moved, undecided = [], []
-    for number in np.unique(region[region > 0]):
-        inside = region == number
-        around = grown(inside) & ~inside
-        surroundings = float(np.median(found.height[around]))
+    for i, inside in enumerate(regions):
+        base = without_skirt(inside, found)
+        around = grown(inside, SKIRT) & ~inside
+        surroundings = float(np.median(base.height[around]))
         room = np.pad(inside, 1, mode="edge")
         width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
-        search = _RegionSearch(int(number), inside, found, surroundings, pitch, beam_shift, misfit, report)
-        levels = sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0))
-        kinds = (False, True) if any(beam_shift) else (False,)
-        has_wall, i = min(
-            product(kinds, range(len(levels))), key=lambda trial: search.misfit_at(levels[trial[1]], trial[0])
-        )
-        bracket = levels[max(i - 1, 0)], levels[min(i + 1, len(levels) - 1)]
-        options = {"maxiter": _LEVEL_STEPS}
-        minimize_scalar(search.misfit_at, bounds=bracket, args=(has_wall,), method="bounded", options=options)
+        name = f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
+        known = pitch, beam_shift, misfit, report
+        search = _RegionSearch(name, inside, base, surroundings, *known)
+        search.search(sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0)))
         explanations = [(best, found), *search.tried.values()]
         value, better = min(search.tried.values(), key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
-            moved.append(int(number))
+            moved.append(i)
         if any(_differ(found, other, inside, surroundings) for value, other in explanations if value < best + GAIN):
-            undecided.append(int(number))
+            undecided.append(i)
     return Levels(found, moved, undecided)
+
+
+def without_skirt(inside: np.ndarray, surface: Surface) -> Surface:
+    """Continue the surroundings up to a region: a fit that bridged a jump raised the pixels beside it."""
+    skirt = grown(inside, SKIRT) & ~inside
+    is_known = ~(skirt | inside)
+    if not is_known.any():
+        return surface
+    nearest = nearest_known(is_known)
+    return jax.tree.map(lambda f: np.where(skirt, f[nearest], f), surface)
 
 
 def _differ(surface: Surface, other: Surface, inside: np.ndarray, surroundings: float) -> bool:

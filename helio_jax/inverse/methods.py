@@ -32,18 +32,28 @@ from helio_jax.inverse.quality import (
     reasons_from_data,
     reasons_from_fit,
     regions,
+    squares,
 )
-from helio_jax.inverse.regions import find_plateaus, joined, unexplained
+from helio_jax.inverse.regions import covered, find_regions, in_doubt
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
-from helio_jax.inverse.verdict import Trace, judged, residuals_of_fit, residuals_of_map
+from helio_jax.inverse.verdict import (
+    LIMIT,
+    Trace,
+    judged,
+    local_chi_square,
+    residuals_of_map,
+    residuals_of_state,
+)
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 MAX_WIDTH = 0.125
-"""Plateaus are searched up to twice this share of the sample distance above and below the substrate ..."""
+"""Levels are searched up to twice this share of the sample distance above and below the substrate ..."""
 SEARCH_THRIFT = 8
-"""... with this many times fewer paths per prediction than the fit."""
+"""... with this many times fewer paths per prediction than the fit ..."""
+MAX_SEARCHES = 2
+"""... and so often, each time followed by a fit."""
 START_THRIFT = 4
 """The same for photometric solutions, but not fewer than the least number: from a noisier start the rim of sphere B is
 7 % worse."""
@@ -149,7 +159,7 @@ def scan_order(stack: MicrographStack) -> ScanOrder:
     return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
 
 
-def _with_plateaus(
+def _with_levels(
     stack: MicrographStack,
     settings: ReconstructSettings,
     make_predict: "Callable[[int], Predict]",
@@ -157,9 +167,10 @@ def _with_plateaus(
     start: Surface,
     smoothed: Surface,
 ) -> "tuple[Fit, np.ndarray]":
-    """Fit the heights from a start, or one nearer to a smoothed surface; then levels of unexplained plateaus.
+    """Fit the heights from a start, or one nearer to a smoothed surface; then the levels of regions in doubt.
 
-    Plateaus are put to better levels, at first those that touch as one, and all is fitted again.
+    Regions at whose outlines the data contradict the fit are put to the levels that explain the data best, and all is
+    fitted again, until nothing improves.
 
     Returns:
         The fit, and where another level explains the images as well, or better but could not be fitted [y, x].
@@ -175,16 +186,23 @@ def _with_plateaus(
         known = signal, variance, stack.instrument, raster, surface, settings, region
         return FitProblem.of(*known, scan_order(stack))
 
+    def tested(fit: "Fit") -> np.ndarray:
+        return residuals_of_state(fit.problem, fit.state, roughly)
+
     fit, _ = _with_backtracking(lambda surface: fit_heights(pose(surface), surface, predict, report), start, smoothed)
-    region, levelled = find_plateaus(signal, variance), np.zeros(stack.shape[1:], int)
-    is_undecided = np.zeros(stack.shape[1:], bool)
-    for is_last in (False, True):
-        single = unexplained(region, fit.residuals)
-        left = single if is_last else joined(single)
-        if fit.is_interrupted or not left.any():
-            break
-        try:
-            known = fit.parameters.replaced(log_multiple=0.0 * fit.parameters.log_multiple, occluded=np.zeros(()))
+    levelled, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
+    try:
+        residuals = tested(fit)
+        for _ in range(0 if fit.is_interrupted else MAX_SEARCHES):
+            is_contradicted = local_chi_square(residuals, stack.is_observed) > LIMIT
+            reliefs = start.height, fit.surface.height
+            left = in_doubt(find_regions(signal, variance, reliefs), is_contradicted)
+            if not left:
+                break
+            known = None
+            if fit.problem.is_instrument_unknown:
+                p = fit.parameters
+                known = p.replaced(log_multiple=0.0 * p.log_multiple, occluded=np.zeros(()))
             found = search_levels(
                 left,
                 fit.surface,
@@ -194,21 +212,23 @@ def _with_plateaus(
                 stack.instrument.beam_shift,
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
-            is_undecided[left > 0] = np.isin(left, found.undecided)[left > 0]
-            if found.moved:
-                is_moved = np.isin(left, found.moved)
-                is_undecided |= is_moved  # unless the fit goes on from there
-                trial = np.where(is_moved, levelled.max() + left, levelled)
-                fit = fit_heights(pose(found.surface, trial), found.surface, predict, report)
-                levelled, is_undecided = trial, is_undecided & (~is_moved | np.isin(left, found.undecided))
-            elif np.unique(left).size == np.unique(single).size:
+            is_undecided = covered(left, found.undecided)
+            if not found.moved:
                 break
-        except KeyboardInterrupt:
-            fit = replace(fit, status=f"interrupted in the search for plateaus; before that: {fit.status}")
-            break
-        except PredictionError as e:
-            fit = replace(fit, status=f"{fit.status}; a plateau was found that could not be fitted: {e}")
-            break
+            trial = levelled.copy()
+            for i in found.moved:
+                trial[left[i]] = trial.max() + 1
+            is_moved = covered(left, found.moved)
+            before, is_undecided = is_undecided, is_undecided | is_moved  # unless the fit goes on from there
+            again = fit_heights(pose(found.surface, trial), found.surface, predict, report)
+            anew = tested(again)
+            if np.sum(squares(anew)) > np.sum(squares(residuals)):
+                break
+            fit, residuals, levelled, is_undecided = again, anew, trial, before
+    except KeyboardInterrupt:
+        fit = replace(fit, status=f"interrupted in the search for levels; before that: {fit.status}")
+    except PredictionError as e:
+        fit = replace(fit, status=f"{fit.status}; a better level was found that could not be fitted: {e}")
     return fit, is_undecided
 
 
@@ -233,6 +253,7 @@ def _start(stack: MicrographStack, settings: ReconstructSettings, predict: "Pred
 
 def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], np.ndarray]]:
     """Reconstruct by the fit; return what computes its residuals from a trace, too."""
+    from helio_jax.inverse.fit import with_posterior
     from helio_jax.inverse.instrument_report import describe_instrument
 
     if make_predict is None:
@@ -240,7 +261,8 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
     start, smoothed = _start(stack, settings, make_predict(start_paths(stack, settings)))
-    fit, is_floating = _with_plateaus(stack, settings, make_predict, report, start, smoothed)
+    fit, is_floating = _with_levels(stack, settings, make_predict, report, start, smoothed)
+    fit = with_posterior(fit)
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:
         region = regions(fit.joined_x, fit.joined_y)
@@ -281,4 +303,4 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
             "chi_square": fit.chi_square,
         },
     )
-    return found, partial(residuals_of_fit, fit)
+    return found, partial(residuals_of_state, fit.problem, fit.state)

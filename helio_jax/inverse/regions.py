@@ -1,135 +1,115 @@
-"""Plateaus: regions that depth jumps part from the substrate, found in the images.
+"""Regions whose level is in doubt: candidates for `levels`, outlined by the images.
 
-Slopes say nothing about the height of a floor behind a wall that the beam does not see: a least-squares fit bridges the
-wall by slopes that the images contradict. The images show the wall, though: across a mask's edge one detector changes,
-across a wall two or more do. `find_plateaus` parts the image along such lines; `levels` puts each region to the level
-that it asks for.
+Slopes say nothing about the height of what a depth jump parts from the substrate: a least-squares fit bridges the jump
+by slopes that the images contradict. Its heights still show roughly where the region is, and the images show its
+outline: across a mask's edge one detector changes, across a jump two or more do. So regions are flooded from where the
+heights stand out up to the strongest change of the images. Candidates may overlap and be wrong: evidence decides.
 """
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
-from scipy.ndimage import binary_closing, binary_dilation, label, maximum_filter, uniform_filter1d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, label, watershed_ift
 
-from helio_jax.forward.surface import along
-from helio_jax.inverse.edges import ranked
-from helio_jax.inverse.quality import squares
+from helio_jax.arrays import border_mask
 
-WALL = 25.0
-"""Change across an edge (chi-square without the detector that changes most) from which on it may be a wall: noise alone
-reaches it in fewer than one edge of 250 000."""
-_HALF_LENGTHS = (3, 7)
-"""Pixels to both sides, along the edge, over which its change is averaged: short for corners, long for weak steps."""
-MIN_REGION = 50
+SHARES = 0.3, 0.6
+"""Parts of the largest rise (or fall) of the heights beyond which a region is sure to be inside ..."""
+OUTSIDE = 0.1
+"""... and up to which a pixel is sure to be outside."""
+MIN_REGION = 12
 """Smallest region that is looked for [pixels]."""
-UNEXPLAINED = 2.0
-"""Mean square residual, in a region or along its border, in those of the substrate, above which levels are tried."""
+MAX_SHARE = 0.6
+"""Largest share of the image that a region may cover."""
+ALIKE = 0.9
+"""Regions that share more than this of their union are one."""
+CONTRADICTED = 0.1
+"""Share of a region's outline that the data must contradict for its level to be in doubt."""
+_SCALE = 1.0
+"""Width of the Gaussian whose derivative measures the change of the images [pixels]."""
+_DERIVATIVES: tuple[Any, ...] = (0, 0, 1), (0, 1, 0)
+"""Orders of the derivatives by detector, y, x: along x, along y."""
 _UNKNOWN = 1e6
-"""Variance of data that were not observed, in those of the worst ones: finite, for running means."""
-_BAND = 3
-"""Half width of a region's border [pixels]."""
+"""Variance of data that were not observed, in those of the worst ones."""
+_BAND = 2
+"""Half width of a region's outline [pixels]."""
+_STEPS = 60_000
+"""Levels of the flooded relief, below 2^16."""
 
 
-def wall_strength(signal: np.ndarray, variance: np.ndarray, axis: int, half: int) -> np.ndarray:
-    """Compute the change across every edge, in chi-square without the detector that changes most.
+def contrast(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Compute the change of the images at every pixel in standard deviations [y, x].
 
-    Two pixels on each side are compared, averaged over 2 half + 1 pixels along the edge.
-    """
-    length = 2 * half + 1
-    mean, spread = (np.asarray(uniform_filter1d(f, length, 2 - axis, mode="nearest")) for f in (signal, variance))
-    spread = spread / length
-    n = signal.shape[1 + axis] - 1
-
-    def at(field: np.ndarray, offset: int) -> np.ndarray:
-        return np.take(field, np.clip(np.arange(n) + offset, 0, n), 1 + axis)
-
-    change = 0.5 * (at(mean, 1) + at(mean, 2) - at(mean, 0) - at(mean, -1))
-    square = change**2 / (0.25 * sum(at(spread, i) for i in (-1, 0, 1, 2)))
-    return square.sum(0) - square.max(0)
-
-
-def _crests(strength: np.ndarray, axis: int) -> np.ndarray:
-    """Keep the strength of the edges [y, x] that are stronger than the edges before and after them, 0 elsewhere."""
-    size = [1, 1]
-    size[axis] = 3
-    return np.where(strength >= maximum_filter(strength, size), strength, 0.0)
-
-
-def _numbered(mask: np.ndarray) -> np.ndarray:
-    """Number, from 1, the connected areas of a mask [y, x]; 0 outside."""
-    return np.asarray(label(mask)[0])  # type: ignore[index]  # SciPy's stubs take the result for a number
-
-
-def grown(mask: np.ndarray) -> np.ndarray:
-    """Grow a mask [y, x] by `_BAND` pixels."""
-    return np.asarray(binary_dilation(mask, iterations=_BAND))
-
-
-def find_plateaus(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Find the number of every pixel's region [y, x], 0 being the largest: the substrate.
-
-    Seeds are the connected areas without a strong change; they grow by a minimum spanning forest over the edges, so
-    that their borders lie on the strongest edges between them.
+    The detector that changes most is left out: across the edge of a mask no other changes.
 
     Args:
         signal, variance: data [detector, y, x]; NaN where not observed.
-
-    Source: watershed cuts: Cousty, Bertrand, Najman, Couprie, IEEE PAMI 31 (2009) 1362, theorem 14.
     """
-    shape = signal.shape[1:]
     is_known = np.isfinite(signal) & (variance > 0)
-    if not is_known.any():
-        return np.zeros(shape, int)
-    data = np.where(is_known, signal, 0.0)
-    spread = np.where(is_known, variance, _UNKNOWN * variance[is_known].max())
-    strength = [
-        _crests(np.maximum(*(wall_strength(data, spread, axis, half) for half in _HALF_LENGTHS)), axis)
-        for axis in (0, 1)
-    ]
-    is_calm = np.ones(shape, bool)
-    for axis, change in enumerate(strength):
-        for end in along(is_calm, axis):
-            end &= change <= WALL
-    seed = _numbered(is_calm).ravel()
-    seed[np.bincount(seed)[seed] < MIN_REGION] = 0
-    inside = np.flatnonzero(seed)
-    if inside.size == 0:
-        return np.zeros(shape, int)
-    pixel = np.arange(seed.size).reshape(shape)
-    ends = [along(pixel, axis) for axis in (0, 1)]
-    root, tip = seed.size, seed.size + seed.max() + 1  # nodes: pixels, the root, one for each seed
-    start = np.concatenate([*(a.ravel() for a, _ in ends), inside, np.full(seed.max(), root)])
-    end = np.concatenate([*(b.ravel() for _, b in ends), root + seed[inside], np.arange(root + 1, tip)])
-    # every seed hangs together and on the root by the cheapest links; all else joins by the rest of 1 + strength
-    cost = np.concatenate([*(1.0 + s.ravel() for s in strength), np.full(inside.size, 1e-3), np.full(seed.max(), 1e-6)])
-    tree = minimum_spanning_tree(coo_matrix((cost, (start, end)), shape=(tip, tip)).tocsr()).tocoo()
-    kept = (tree.row != root) & (tree.col != root)
-    links = coo_matrix((tree.data[kept], (tree.row[kept], tree.col[kept])), shape=(tip, tip))
-    return ranked(connected_components(links, directed=False)[1][: seed.size]).reshape(shape)
+    worst = _UNKNOWN * np.max(variance, where=is_known, initial=1e-300)
+    data, spread = np.where(is_known, signal, 0.0), np.where(is_known, variance, worst)
+    slopes = (gaussian_filter(data, (0, _SCALE, _SCALE), order, mode="nearest") for order in _DERIVATIVES)
+    square = sum(slope**2 for slope in slopes)
+    noise = gaussian_filter(spread, (0, _SCALE, _SCALE), mode="nearest") / (8.0 * np.pi * _SCALE**4)
+    relative = square / noise
+    return np.sqrt(np.maximum(relative.sum(0) - relative.max(0), 0.0))
 
 
-def unexplained(region: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Set regions whose images the fit explains to 0 [y, x].
+def find_regions(signal: np.ndarray, variance: np.ndarray, reliefs: Iterable[np.ndarray]) -> list[np.ndarray]:
+    """Find regions that stand out of the substrate, or lie below it; the largest first [y, x].
 
     Args:
-        region: from `find_plateaus` [y, x].
-        residuals: of the fit, in standard deviations [detector, y, x].
+        signal, variance: data [detector, y, x]; NaN where not observed.
+        reliefs: heights of several solutions, each [y, x], um.
+
+    Source: flooding: Lotufo and Falcao, The ordered queue and the optimality of the watershed approaches (2000).
     """
-    square = squares(residuals).mean(0)
-    limit = UNEXPLAINED * square[region == 0].mean()
-    left = region.copy()
-    for number in range(1, int(region.max()) + 1):
-        inside = region == number
-        band = grown(inside) & grown(~inside)
-        if max(square[inside].mean(), square[band].mean()) <= limit:
-            left[inside] = 0
-    return left
+    change = contrast(signal, variance)
+    cost = np.rint(_STEPS * change / max(float(change.max()), 1e-300)).astype(np.uint16)
+    found: list[np.ndarray] = []
+    for height in reliefs:
+        rise = height - np.median(height[border_mask((height.shape[0], height.shape[1]), 0.06)])
+        for way in (rise, -rise):
+            top = float(np.quantile(way, 0.995))
+            for share in SHARES if top > 0 else ():
+                number, n = label(way > share * top)  # type: ignore[misc]  # SciPy's stubs
+                for k in range(1, n + 1):
+                    region = _flooded(cost, number == k, way < OUTSIDE * top)
+                    if MIN_REGION <= region.sum() <= MAX_SHARE * region.size and not _is_among(region, found):
+                        found.append(region)
+    return sorted(found, key=lambda region: -int(region.sum()))
 
 
-def joined(region: np.ndarray) -> np.ndarray:
-    """Join regions that (nearly) touch, with the gaps between them [y, x].
+def _flooded(cost: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Grow a region from pixels inside it, against those outside, up to the largest cost between them [y, x]."""
+    if inside.sum() < MIN_REGION or not outside.any():
+        return np.zeros(cost.shape, bool)
+    core = binary_erosion(inside, iterations=1)
+    markers = np.where(core if core.any() else inside, 1, np.where(outside, 2, 0)).astype(np.int16)
+    return watershed_ift(cost, markers) == 1
 
-    Inside a plateau masks may end along strong edges, too.
-    """
-    room = np.pad(region > 0, _BAND, mode="edge")
-    return _numbered(np.asarray(binary_closing(room, np.ones((2 * _BAND + 1,) * 2))))[_BAND:-_BAND, _BAND:-_BAND]
+
+def _is_among(region: np.ndarray, others: list[np.ndarray]) -> bool:
+    """Tell whether a region is (nearly) one of others."""
+    return any((region & other).sum() > ALIKE * (region | other).sum() for other in others)
+
+
+def outline(region: np.ndarray) -> np.ndarray:
+    """Mark the pixels at a region's outline, on both sides [y, x]."""
+    return grown(region, _BAND) & grown(~region, _BAND)
+
+
+def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """Grow a mask [y, x] by so many pixels."""
+    return np.asarray(binary_dilation(mask, np.ones((3, 3)), iterations=pixels))
+
+
+def in_doubt(regions: list[np.ndarray], is_contradicted: np.ndarray) -> list[np.ndarray]:
+    """Keep the regions at whose outlines the data contradict a fit [y, x]."""
+    return [region for region in regions if is_contradicted[outline(region)].mean() > CONTRADICTED]
+
+
+def covered(regions: list[np.ndarray], numbers: Iterable[int]) -> np.ndarray:
+    """Mark the pixels of the regions of some numbers [y, x]."""
+    return np.any([np.zeros_like(regions[0]), *(regions[i] for i in numbers)], axis=0)

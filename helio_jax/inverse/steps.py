@@ -275,14 +275,6 @@ def levelled(problem: FitProblem, state: FitState) -> Surface:
     return Surface(s.height - np.tensordot(tilt, problem.position, 1), s.slope_x - tilt[0], s.slope_y - tilt[1])
 
 
-def misfit(problem: FitProblem, state: FitState, limit: float, cut: float) -> float:
-    """Compute half the robust chi-square of data and edges, with the data's normalisation."""
-    data = 0.5 * limit**2 * np.sum(1.0 - cauchy_weight(state.residuals, limit))
-    data += np.sum(np.log(state.held.sigma[problem.is_observed]))
-    edges = edges_of(problem, state.surface, cut)
-    return float(data + sum(0.5 * cut**2 * np.sum(1.0 - np.sqrt(e.joined)) for e in edges))
-
-
 def model_share(problem: FitProblem, state: FitState) -> np.ndarray:
     """Compute the share of prediction errors in the variance of every datum; 0 where not observed [detector, y, x]."""
     share = np.maximum(1.0 - problem.variance / state.held.sigma**2, 0.0)

@@ -23,7 +23,8 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS, Reconstruction, contradicted_share
 
 if TYPE_CHECKING:
-    from helio_jax.inverse.fit import Fit
+    from helio_jax.inverse.problem import FitProblem
+    from helio_jax.inverse.state import FitState
 
 LIMIT = 2.5
 """Mean square deviation of a pixel and its eight neighbours, in all detectors, from which on the data contradict the
@@ -74,8 +75,10 @@ def residuals_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) 
     return (model - signal) / data_std(variance, c)
 
 
-def residuals_of_fit(fit: "Fit", trace: Trace) -> np.ndarray:
+def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
     """Compute (model - data) / standard deviation of a fit's surface, albedo and read-out [detector, y, x].
+
+    Data that were not observed have none: 0.
 
     Raises:
         PredictionError: the surface is too rough or steep to be traced.
@@ -83,10 +86,9 @@ def residuals_of_fit(fit: "Fit", trace: Trace) -> np.ndarray:
     from helio_jax.inverse.state import predict_corrections
     from helio_jax.inverse.steps import expected
 
-    problem = fit.problem
-    state = predict_corrections(problem, fit.state, trace)
-    model = expected(problem, state, is_noisy=True)
-    return (model - problem.data) / data_std(problem.variance, state.held.corrections)
+    state = predict_corrections(problem, state, trace)
+    rest = expected(problem, state, is_noisy=True) - problem.data
+    return np.where(problem.is_observed, rest / data_std(problem.variance, state.held.corrections), 0.0)
 
 
 def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], np.ndarray]) -> Reconstruction:
