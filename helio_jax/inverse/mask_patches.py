@@ -1,0 +1,173 @@
+"""Surface patches between upper edges, and their levels from the heights of the steps.
+
+Upper edges that no detector's band marks (the shadowed side of an oblique beam) leave gaps between patches. The gaps
+are closed by short lines: heights with the measured jumps across the edges, and further jumps where these let all
+other differences vanish, by iteratively reweighted least squares with a falling tolerance.
+
+Source: graduated non-convexity: Blake and Zisserman, Visual Reconstruction, MIT Press (1987).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
+
+from helio_jax.inverse.mask_edges import Edge
+
+_ITERATIONS = 30
+_TOLERANCES = 0.3, 0.005
+"""Difference of neighbouring pixels from which on it counts as a jump: first and last value, in the smallest step."""
+_EXTENSION = 0.8
+"""By how much edges are extended at both ends, to close corners [pixels]."""
+_JOINED = 0.3
+"""Largest difference of neighbouring pixels of one patch, in the smallest step."""
+_SMALLEST = 9
+"""Smallest patch [pixels]."""
+
+
+def _links(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the two pixels of every link between horizontal, vertical and diagonal neighbours, and its weight."""
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    pairs = (
+        (pixel[:, :-1], pixel[:, 1:], 1.0),
+        (pixel[:-1], pixel[1:], 1.0),
+        (pixel[:-1, :-1], pixel[1:, 1:], 0.5),
+        (pixel[:-1, 1:], pixel[1:, :-1], 0.5),
+    )
+    first, second = (np.concatenate([p[i].ravel() for p in pairs]) for i in (0, 1))  # type: ignore[union-attr]
+    return first, second, np.concatenate([np.full(a.size, weight) for a, _, weight in pairs])
+
+
+def patch_heights(edges: Sequence[Edge], heights: np.ndarray, place: np.ndarray, side: float) -> np.ndarray:
+    """Compute heights with given jumps at the edges and few other jumps [y, x], um.
+
+    Args:
+        edges: upper edges.
+        heights: jump at each edge [edge], um.
+        place: beam positions [y, x, 2], um.
+        side: of a pixel [um].
+    """
+    shape = place.shape[:2]
+    first, second, weight = _links(shape)
+    jump = np.zeros(first.size)
+    points = place.reshape(-1, 2)
+    for edge, height in zip(edges, heights, strict=True):
+        rel = points - edge.middle
+        u, w = rel @ edge.normal, rel @ edge.along
+        crosses = (u[first] < 0) != (u[second] < 0)
+        share = np.abs(u[first]) / np.maximum(np.abs(u[first]) + np.abs(u[second]), 1e-12)
+        at = w[first] + share * (w[second] - w[first])
+        crosses &= np.abs(at) <= 0.5 * edge.length + _EXTENSION * side
+        new = np.where(u[first] < 0, -height, height)  # second minus first: down where the first one is above
+        jump = np.where(crosses & (np.abs(new) > np.abs(jump)), new, jump)
+    n, scale = shape[0] * shape[1], max(float(np.min(heights)), 1e-9)
+    row = np.tile(np.arange(first.size), 2)
+    value = np.repeat([-1.0, 1.0], first.size)
+    slope = coo_matrix((value, (row, np.concatenate([first, second]))), (first.size, n)).tocsr()
+    pinned = coo_matrix(([1e-6], ([0], [0])), (n, n)).tocsr()
+    height, strength = np.zeros(n), weight.copy()
+    for tolerance in scale * np.geomspace(*_TOLERANCES, _ITERATIONS):
+        scaled = slope.multiply(strength[:, None]).tocsr()
+        height = spsolve((slope.T @ scaled + pinned).tocsc(), slope.T @ (strength * jump))
+        rest = slope @ height - jump
+        strength = weight * tolerance**2 / (rest**2 + tolerance**2) + 1e-7
+    return height.reshape(shape)
+
+
+def find_patches(edges: Sequence[Edge], heights: np.ndarray, place: np.ndarray, side: float) -> np.ndarray:
+    """Return the number of every pixel's patch [y, x]; 0: the largest one, the substrate. Arguments: `patch_heights`."""
+    shape = place.shape[:2]
+    if not len(edges):
+        return np.zeros(shape, int)
+    level = patch_heights(edges, heights, place, side).ravel()
+    first, second, weight = _links(shape)
+    near = (weight == 1.0) & (np.abs(level[second] - level[first]) <= _JOINED * float(np.min(heights)))
+    graph = coo_matrix((np.ones(near.sum()), (first[near], second[near])), (level.size,) * 2)
+    group = connected_components(graph, directed=False)[1]
+    size = np.bincount(group)
+    # pixels of a slope between two patches go to the nearest level of a large one nearby: by a second pass over links
+    big = size[group] >= _SMALLEST
+    for _ in range(max(shape)):
+        if big.all():
+            break
+        gap = np.abs(level[first] - level[second])
+        best = np.full(level.size, np.inf)
+        owner = group.copy()
+        for a, b in ((first, second), (second, first)):
+            use = big[a] & ~big[b]
+            order = np.argsort(-gap[use], kind="stable")
+            to, of, cost = b[use][order], a[use][order], gap[use][order]
+            better = cost < best[to]
+            owner[to[better]] = group[of[better]]
+            best[to[better]] = cost[better]
+        new = np.isfinite(best)
+        if not new.any():
+            break
+        group, big = np.where(new, owner, group), big | new
+    order = np.argsort(-np.bincount(group), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    return rank[group].reshape(shape)
+
+
+def sides_of(edge: Edge, patch: np.ndarray, place: np.ndarray, side: float) -> tuple[int, int]:
+    """Return the patches above and below an edge: the most frequent ones a pixel beside it."""
+    rel = place - edge.middle
+    u, w = rel @ edge.normal, rel @ edge.along
+    near = (np.abs(w) <= 0.5 * edge.length) & (np.abs(u) > 0.5 * side) & (np.abs(u) < 1.8 * side)
+    out = [np.bincount(patch[near & is_side]) for is_side in (u < 0, u > 0)]
+    return tuple(int(np.argmax(count)) if count.size else 0 for count in out)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of patches above patch 0 [patch], um.
+
+    Attributes:
+        level, std: NaN where no step ties a patch to patch 0.
+        chi2, dof: of the steps' agreement.
+    """
+
+    level: np.ndarray
+    std: np.ndarray
+    chi2: float
+    dof: int
+
+
+def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarray, std: np.ndarray) -> Levels:
+    """Compute the levels of patches by weighted least squares; robust: steps beyond 3 deviations lose weight.
+
+    Args:
+        n: number of patches.
+        above, below: patches of each step [step].
+        height, std: of each step [step], um.
+    """
+    level, error = np.full(n, np.nan), np.full(n, np.nan)
+    level[0] = error[0] = 0.0
+    graph = coo_matrix((np.ones(len(above)), (above, below)), (n, n))
+    group = connected_components(graph, directed=False)[1]
+    tied = np.flatnonzero(group == group[0])
+    free = tied[tied != 0]
+    use = np.isin(above, tied) & (above != below)
+    dof = int(use.sum()) - free.size
+    if not free.size or not use.any():
+        return Levels(level, error, 0.0, 0)
+    design = np.zeros((int(use.sum()), n))
+    rows = np.arange(len(design))
+    design[rows, above[use]] += 1.0
+    design[rows, below[use]] -= 1.0
+    a, b, sigma = design[:, free], height[use], std[use].copy()
+    solution = np.zeros(free.size)
+    for _ in range(20):
+        solution = np.linalg.lstsq(a / sigma[:, None], b / sigma, rcond=None)[0]
+        rest = np.abs(b - a @ solution) / std[use]
+        sigma = std[use] * np.maximum(1.0, rest / 3.0)
+    chi2 = float(np.sum(((b - a @ solution) / std[use]) ** 2))
+    robust = float(np.sum(((b - a @ solution) / sigma) ** 2))
+    birge = max(1.0, robust / dof) if dof > 0 else 1.0
+    cov = np.linalg.pinv((a / sigma[:, None]).T @ (a / sigma[:, None])) * birge
+    level[free], error[free] = solution, np.sqrt(np.diag(cov))
+    return Levels(level, error, chi2, dof)
