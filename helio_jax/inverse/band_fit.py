@@ -52,6 +52,8 @@ _PLACES = np.arange(-0.8, 0.81, 0.08)
 """Shifts of an edge that are compared [pixels]."""
 _PIT_STD = 0.4
 """The same beside other walls, as in a pit."""
+_TEMPERATURE = 5.0
+"""Factor on the noise where the place of an edge is compared: the model errs from pixel to pixel in common."""
 _LEAST_HEIGHT = 0.1
 """Least height that is looked for, in pixels of the band."""
 _SEARCH = 1.06, 1.01
@@ -91,6 +93,7 @@ class Band:
         end_std: standard deviation of the far end's place, because pixels sample it [um].
         chi2, n_data: weighted squares of the residuals, number of data.
         far_chi2, n_far: the same about the far end.
+        abrupt: how much worse an abrupt far end fits than a penumbra, as a change of chi2; below 0: better.
         reach: how far from the edge data lie [um].
         levels: fitted signal of upper and lower level, in that of `Levels.lit` [2].
     """
@@ -104,6 +107,7 @@ class Band:
     n_data: int
     far_chi2: float
     n_far: int
+    abrupt: float
     reach: float
     levels: tuple[float, float]
 
@@ -334,14 +338,14 @@ def fit_band(
     factor = signal.length if kind == "dark" else signal.strip
     most = max(signal.strip, signal.strip + signal.q[-1] - max(signal.shift, 0.0)) if kind == "dark" else signal.strip
     height = _first_height(edge, images, k, signal, drift) if start is None else start
-    pixels = None
+    pixels = plain = None
     for i, step in enumerate(_SEARCH):
         ratios = step ** np.arange(-10, 11)
         far = height * most
         new = _select(edge, images, k, signal, drift, far + max(_BEYOND[0] * far, _BEYOND[1] * side))
         if new is None:
             return None
-        pixels = new
+        pixels, plain = new, replace(new)
         if i > 0:
             pixels.base_std = _base_std(pixels, height, side, images.spot)
             residuals = _residuals(pixels, height, side, images.spot)[0][: len(pixels.u)]
@@ -349,7 +353,8 @@ def fit_band(
         tries = height * ratios
         cost = [float(np.sum(_residuals(pixels, h, side, images.spot)[0] ** 2)) for h in tries]
         height = float(tries[int(np.argmin(cost))])
-    assert pixels is not None
+    assert pixels is not None and plain is not None
+    plain.base_std = pixels.base_std
     height, curvature = _polish(pixels, height, side, images.spot)
     residuals, levels = _residuals(pixels, height, side, images.spot)
     own = residuals[: len(pixels.u)]
@@ -369,6 +374,7 @@ def fit_band(
         n_data=len(own),
         far_chi2=float(own[is_far] @ own[is_far]),
         n_far=int(is_far.sum()),
+        abrupt=_abrupt_end(plain, height, side, images.spot) if kind == "dark" else math.inf,
         reach=float(pixels.u.max()),
         levels=(float(levels[0]), float(levels[1])),
     )
@@ -409,12 +415,27 @@ def place_edge(
             tries = [
                 _residuals(pixels, height * f, side, images.spot, _SHARP)[0] for f in (0.98, 1.0, 1.02)
             ]
-            cost[i] += min(float(np.sum(_OUTLIER**2 * np.log1p((r / _OUTLIER) ** 2))) for r in tries)
+            cost[i] += min(map(_robust, tries))
     cost -= cost.min()
-    weight = np.exp(-0.5 * cost)
+    weight = np.exp(-0.5 * cost / _TEMPERATURE)
     weight /= weight.sum()
     mean = float(weight @ places)
     return mean, math.sqrt(float(weight @ (places - mean) ** 2) + (0.03 * side) ** 2)
+
+
+def _robust(residuals: np.ndarray) -> float:
+    """Return the sum of squares of residuals, in which outliers count less (Cauchy)."""
+    return float(np.sum(_OUTLIER**2 * np.log1p((residuals / _OUTLIER) ** 2)))
+
+
+def _abrupt_end(pixels: _Pixels, height: float, side: float, spot: float) -> float:
+    """Compute how much worse an abrupt far end fits than a penumbra: what ends abruptly, something else ends."""
+    s = pixels.signal
+    mean = float(np.diff(s.below, prepend=0.0) @ s.q)
+    sharp = replace(pixels, signal=replace(s, q=mean + 1e-3 * (s.q - mean)))
+    factors = np.linspace(0.85, 1.15, 16)
+    soft, hard = (min(_robust(_residuals(p, height * f, side, spot)[0]) for f in factors) for p in (pixels, sharp))
+    return hard - soft
 
 
 def _base_std(pixels: _Pixels, height: float, side: float, spot: float) -> float:
@@ -422,10 +443,7 @@ def _base_std(pixels: _Pixels, height: float, side: float, spot: float) -> float
     found = []
     for base in (1.0, _PIT_STD / _BASE_STD):
         trial = replace(pixels, base_std=pixels.base_std * base)
-        cost = min(
-            float(np.sum(_OUTLIER**2 * np.log1p((_residuals(trial, height * f, side, spot)[0] / _OUTLIER) ** 2)))
-            for f in (0.9, 0.95, 1.0, 1.05, 1.1)
-        )
+        cost = min(_robust(_residuals(trial, height * f, side, spot)[0]) for f in (0.9, 0.95, 1.0, 1.05, 1.1))
         found.append((cost + 2.0 * math.log(base), trial.base_std))
     return min(found)[1]
 

@@ -19,15 +19,17 @@ from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
 from helio_jax.inverse.band_fit import Band, Images, abruptness, fit_band, kind_of, lay_edge, place_edge
 from helio_jax.inverse.mask_edges import Edge, Levels, edge_points, find_levels, straight_edges, variance_of
-from helio_jax.inverse.mask_patches import find_patches, sides_of, solve_levels
+from helio_jax.inverse.mask_patches import find_patches, likeness, sides_of, solve_levels
 from helio_jax.inverse.wall_signal import Opening, WallSignal, opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
 
-MIN_WALL = 0.9
+MIN_WALL = 0.5
 """Least probability that the signal falls abruptly, for a wall."""
+_SURE_WALL = 0.9
+"""The same where only a lower bound of the height is known."""
 _MISFIT = 4.0
 """Mean square residual above which a band is not explained by a wall."""
-_FAR_MISFIT = 3.0
+_FAR_MISFIT = 5.0
 """The same about the far end, above which something else ends the band."""
 _MODEL_STD = 0.004
 """Standard deviation of heights from what the model of a wall neglects, as a fraction."""
@@ -220,13 +222,14 @@ def find_steps(stack: MicrographStack) -> Steps:
     edges = _laid(_found(scan, levels), scan)
     flat = [0.0] * len(edges)
     first = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, flat, strict=True), 1)]
-    result = _joined(first, scan, levels)
+    patch = _patches(first, images, levels)
+    result = _joined(first, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step
     low = [result.patches[s.below].level_um for s in result.steps]
     moved = [z if math.isfinite(z) else 0.0 for z in low]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
         again = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
-        result = _joined(again, scan, levels)
+        result = _joined(again, patch, scan, levels)
     return result
 
 
@@ -343,7 +346,7 @@ def _row(number: int, name: str, band: Band, edge: Edge, v: np.ndarray, place_st
     is_cut = band.n_far < 3 or band.reach < band.factor * band.height
     misfit = band.chi2 / max(band.n_data - 4, 1)
     far_misfit = band.far_chi2 / max(band.n_far, 1)
-    is_bound = is_cut or far_misfit > _FAR_MISFIT
+    is_bound = is_cut or far_misfit > _FAR_MISFIT or band.abrupt < 0.0
     note = "no wall explains the signal" if misfit > _MISFIT and not is_bound else ""
     if band.factor * band.height < 0.4 * side:
         note = "too short"
@@ -405,16 +408,25 @@ def _combined(number: int, edge: Edge, rows: list[BandRow], used: list[Band], pl
     )
 
 
-def _joined(measured: list[_Measured], scan: _Scan, levels: Levels) -> Steps:
-    """Find the patches between the steps and their levels."""
-    images = scan.images
-    walls = [m for m in measured if math.isfinite(m.step.height_um) and m.step.note in ("", "lower bound")]
+def _patches(measured: list[_Measured], images: Images, levels: Levels) -> np.ndarray:
+    """Find the patches between the steps [y, x]."""
+    walls = [m for m in measured if m.step.is_used or (m.step.note == "lower bound" and m.step.p_wall > _SURE_WALL)]
     heights = np.array([max(m.step.height_um, 1e-3) for m in walls])
-    patch = find_patches([m.edge for m in walls], heights, images.place, images.side)
+    alike = likeness(images.signal, images.variance, levels.is_dark.any(0))
+    return find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
+
+
+def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: Levels) -> Steps:
+    """Solve for the levels of the patches."""
+    images = scan.images
     steps = []
     for m in measured:
         above, below = sides_of(m.edge, patch, images.place, images.side)
-        steps.append(replace(m.step, above=above, below=below))
+        step = replace(m.step, above=above, below=below)
+        if above == below:  # the level from which the detectors are seen is not known
+            unknown = 0.5 * step.height_um**2 / scan.stack.instrument.sample_distance
+            step = replace(step, height_std_um=math.hypot(step.height_std_um, unknown))
+        steps.append(step)
     n = int(patch.max()) + 1
     good = [s for s in steps if s.is_used]
     arrays = (np.array([getattr(s, name) for s in good]) for name in ("above", "below", "height_um", "height_std_um"))
