@@ -1,7 +1,7 @@
 """Upper edges of walls, found in the micrographs by the mask bands that begin at them.
 
 A detector's mask band begins at the image of an upper edge and runs along -v (`wall_signal`): the edge, where the
-signal falls along -v, is abrupt, the other end is a penumbra. Places where a signal falls through half its level in
+signal falls along -v, is abrupt, the other end is a penumbra. Places where a signal falls below `SHADED` in
 that direction are joined over all detectors and split into straight edges. Any orientation; nothing is said yet about
 whether an edge is a wall (`band_fit`). Source of the splitting: Ramer, Comput. Graph. Image Process. 1 (1972) 244.
 """
@@ -27,6 +27,11 @@ _STRAIGHT = 0.6
 """Largest distance of the points of an edge from its line [pixels]."""
 _ACROSS = 0.25
 """Least cosine of the angle between an edge's normal and a detector's -v."""
+HALF, SHADED = 0.5, 0.7
+"""Signal, in that of the level surface, below which a pixel counts as masked, and below which edges are looked for:
+in pits multiple scattering fills the masks."""
+_SEEN = 0.2
+"""Least fraction of a dark region in which another detector has signal."""
 _MIN_DARK = 3
 """Smallest dark region [pixels]."""
 
@@ -39,8 +44,9 @@ class Levels:
         lit: signal of the level surface.
         floor, floor_std: signal without direct detection: the pedestal; 0 where the background is known.
         fraction: signal above the floor, in that of the level surface [detector, y, x]; NaN where not observed.
-        is_dark: below half [detector, y, x].
-        probability: that the expected signal is below half [detector, y, x].
+        is_dark: below `HALF` [detector, y, x].
+        is_shaded: below `SHADED`, where edges are looked for [detector, y, x].
+        probability: that the expected signal is below `HALF` [detector, y, x].
     """
 
     lit: np.ndarray
@@ -48,6 +54,7 @@ class Levels:
     floor_std: np.ndarray
     fraction: np.ndarray
     is_dark: np.ndarray
+    is_shaded: np.ndarray
     probability: np.ndarray
 
 
@@ -69,15 +76,21 @@ def find_levels(signal: np.ndarray, variance: np.ndarray, floor_known: bool) -> 
     scale = np.maximum(lit - floor, 1e-12 * np.abs(lit) + 1e-300)[:, None, None]
     fraction = (signal - floor[:, None, None]) / scale
     noise = np.sqrt(np.maximum(variance, 0.0)) / scale
-    with np.errstate(invalid="ignore", divide="ignore"):
-        probability = np.nan_to_num(ndtr((0.5 - fraction) / np.maximum(noise, 1e-9)))
-        dark = fraction < 0.5
-        is_seen = np.any(fraction >= 0.5, axis=0)  # dark everywhere: a hole of the data, not a mask
-    is_dark = dark & is_seen
-    for k in range(len(lit)):
-        number, _ = label(is_dark[k], np.ones((3, 3)))  # type: ignore[misc]
-        is_dark[k] &= np.bincount(number.ravel())[number] >= _MIN_DARK
-    return Levels(lit, floor, std, fraction, is_dark, probability * is_dark)
+    with np.errstate(invalid="ignore"):
+        probability = np.nan_to_num(ndtr((HALF - fraction) / np.maximum(noise, 1e-9)))
+        is_dark, is_shaded = (_regions(fraction < limit, np.any(fraction >= limit, axis=0)) for limit in (HALF, SHADED))
+    return Levels(lit, floor, std, fraction, is_dark, is_shaded, probability * is_dark)
+
+
+def _regions(dark: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
+    """Return the dark pixels [detector, y, x] in connected regions of which another detector sees a part."""
+    out = np.zeros_like(dark)
+    for k, image in enumerate(dark):
+        number = np.asarray(label(image, np.ones((3, 3)))[0])  # type: ignore[index]  # SciPy's stubs
+        size, seen = np.bincount(number.ravel()), np.bincount(number.ravel(), is_seen.ravel())
+        is_mask = (size >= _MIN_DARK) & (seen >= _SEEN * size)
+        out[k] = image & is_mask[number]
+    return out
 
 
 def variance_of(counts: np.ndarray, variance: np.ndarray | None) -> np.ndarray:
@@ -123,7 +136,7 @@ class Edge:
 
 
 def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find where a signal falls through one half along -v.
+    """Find where a signal falls through `SHADED` along -v.
 
     Args:
         fraction: from `Levels` of one detector, dark regions that are to be ignored filled [y, x].
@@ -142,8 +155,8 @@ def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarra
     found = []
     for axis in (0, 1):
         first, second = (np.take(filled, i, axis) for i in (range(filled.shape[axis] - 1), range(1, filled.shape[axis])))
-        i, j = np.nonzero((first < 0.5) != (second < 0.5))
-        t = (0.5 - first[i, j]) / (second[i, j] - first[i, j])
+        i, j = np.nonzero((first < SHADED) != (second < SHADED))
+        t = (SHADED - first[i, j]) / (second[i, j] - first[i, j])
         step = (t * (axis == 0), t * (axis == 1))
         row, column = i + step[0], j + step[1]
         place = np.stack([np.interp(column, np.arange(x.size), x), np.interp(row, np.arange(y.size), y)], -1)

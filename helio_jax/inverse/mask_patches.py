@@ -34,7 +34,7 @@ _CHANGE = 4.0
 """Mean square change between neighbours at which a jump costs half [standard deviations squared]."""
 _BESIDE = 2
 """Pixels beside a masked one whose signals the mask explains, too."""
-_BORDER = 0.02
+_BORDER = 0.2
 """Weight of the links of the border to one common level."""
 _COMMON_STD = 0.004
 """Standard deviation of all levels in common, from what the model of a wall neglects, as a fraction."""

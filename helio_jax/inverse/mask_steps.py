@@ -17,24 +17,24 @@ from scipy.stats import chi2 as chi_square
 from helio_jax.arrays import as_json, pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
-from helio_jax.inverse.band_fit import Band, Images, abruptness, fit_band, kind_of, lay_edge, place_edge
-from helio_jax.inverse.mask_edges import Edge, Levels, edge_points, find_levels, straight_edges, variance_of
+from helio_jax.inverse.band_fit import Band, Images, abruptness, band_coordinates, fit_band, is_disturbed, kind_of, lay_edge, place_edge
+from helio_jax.inverse.mask_edges import SHADED, Edge, Levels, edge_points, find_levels, straight_edges, variance_of
 from helio_jax.inverse.mask_patches import find_patches, likeness, sides_of, solve_levels
 from helio_jax.inverse.wall_signal import Opening, WallSignal, opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
 
-MIN_WALL = 0.5
+MIN_WALL = 0.7
 """Least probability that the signal falls abruptly, for a wall."""
 _SURE_WALL = 0.9
 """The same where only a lower bound of the height is known."""
 _MISFIT = 4.0
 """Mean square residual above which a band is not explained by a wall."""
-_FAR_MISFIT = 5.0
-"""The same about the far end, above which something else ends the band."""
 _MODEL_STD = 0.004
 """Standard deviation of heights from what the model of a wall neglects, as a fraction."""
 _PLACE_STD = 0.03
 """Standard deviation of the edge's place beside the gap between lit and dark pixels [pixels]."""
+_UNEXPLAINED = 0.05
+"""Fraction of a patch's pixels in masks that no step explains, from which on its level is not relied on."""
 _SMALLEST = 8
 """Smallest raster [pixels]."""
 
@@ -114,6 +114,8 @@ class Patch:
         level_um, level_std_um: above patch 0; NaN where no step determines it.
         n_steps: steps that determine it.
         is_lower_bound: only lower bounds of steps are known.
+        unexplained: fraction of its pixels that are masked from a detector though no step masks them: there are
+            further steps in it.
     """
 
     number: int
@@ -122,6 +124,12 @@ class Patch:
     level_std_um: float
     n_steps: int
     is_lower_bound: bool
+    unexplained: float
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the level may be relied on."""
+        return math.isfinite(self.level_um) and not self.is_lower_bound and self.unexplained < _UNEXPLAINED
 
 
 @dataclass(frozen=True)
@@ -237,7 +245,7 @@ def _found(scan: _Scan, levels: Levels) -> list[Edge]:
     """Find the edges at which bands begin, over all detectors."""
     stack, points, normals, numbers = scan.stack, [], [], []
     for k, v in enumerate(scan.directions(scan.seen_from(0.0))):
-        fraction = np.where(levels.is_dark[k] | ~(levels.fraction[k] < 0.5), levels.fraction[k], 1.0)
+        fraction = np.where(levels.is_shaded[k] | ~(levels.fraction[k] < SHADED), levels.fraction[k], 1.0)
         at, normal = edge_points(fraction, stack.x, stack.y, v)
         points.append(at)
         normals.append(normal)
@@ -343,10 +351,8 @@ def _row(number: int, name: str, band: Band, edge: Edge, v: np.ndarray, place_st
     std = math.sqrt(band.std**2 + (end / band.factor) ** 2 + (_MODEL_STD * band.height) ** 2)
     slant = abs(float(v @ edge.normal)) / float(np.hypot(*v)) if band.kind == "dark" else 1.0
     to_length = band.factor / slant
-    is_cut = band.n_far < 3 or band.reach < band.factor * band.height
     misfit = band.chi2 / max(band.n_data - 4, 1)
-    far_misfit = band.far_chi2 / max(band.n_far, 1)
-    is_bound = is_cut or far_misfit > _FAR_MISFIT or band.abrupt < 0.0
+    is_bound = is_disturbed(band)
     note = "no wall explains the signal" if misfit > _MISFIT and not is_bound else ""
     if band.factor * band.height < 0.4 * side:
         note = "too short"
@@ -369,7 +375,7 @@ def _combined(number: int, edge: Edge, rows: list[BandRow], used: list[Band], pl
     height, std, chi2, note = math.nan, math.nan, 0.0, ""
     p_wall = max((r.p_wall for r in rows if math.isfinite(r.p_wall)), default=0.0)
     is_bound = False
-    if used:
+    if any(b.kind == "dark" for b in used):
         h = np.array([b.height for b in used])
         factor = np.array([b.factor for b in used])
         own = np.array([b.std**2 + (b.end_std / b.factor) ** 2 for b in used])
@@ -416,6 +422,24 @@ def _patches(measured: list[_Measured], images: Images, levels: Levels) -> np.nd
     return find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
 
 
+def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
+    """Return the pixels within the bands of the steps, and two pixels beside them [detector, y, x]."""
+    images, names = scan.images, scan.stack.instrument.detector_names
+    v = scan.directions(scan.seen_from(0.0))
+    out = np.zeros(images.signal.shape, bool)
+    for m in measured:
+        for row in m.bands:
+            if row.kind != "dark":
+                continue
+            k = names.index(row.detector)
+            u, w = band_coordinates(m.edge, images, v[k])
+            end = row.length_um * abs(float(v[k] @ m.edge.normal)) / float(np.hypot(*v[k]))
+            beside = 2.0 * images.side
+            room = 0.5 * m.edge.length + beside + 0.3 * np.maximum(u, 0.0)
+            out[k] |= (u > -beside) & (u < 1.4 * end + beside) & (np.abs(w) < room)
+    return out
+
+
 def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: Levels) -> Steps:
     """Solve for the levels of the patches."""
     images = scan.images
@@ -432,6 +456,7 @@ def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: L
     arrays = (np.array([getattr(s, name) for s in good]) for name in ("above", "below", "height_um", "height_std_um"))
     above, below, height, std = arrays
     found = solve_levels(n, above.astype(int), below.astype(int), height, std)
+    unexplained = (levels.is_dark & ~_explained(measured, scan)).any(0)
     patches = []
     for k in range(n):
         touching = [s for s in steps if k in (s.above, s.below) and s.above != s.below]
@@ -443,6 +468,7 @@ def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: L
                 level_std_um=float(found.std[k]),
                 n_steps=sum(s.is_used for s in touching),
                 is_lower_bound=k > 0 and not any(s.is_used for s in touching) and any(s.is_lower_bound for s in touching),
+                unexplained=float(unexplained[patch == k].mean()),
             )
         )
     return Steps(
