@@ -1,5 +1,6 @@
-"""Traced test scenes: terraces with vertical walls on a rectilinear grid, turned by any angle; numbers drawn at random."""
+"""Traced test scenes: terraces with vertical walls, turned by any angle, with numbers drawn at random."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ def terrace_mesh(x: np.ndarray, y: np.ndarray, level: np.ndarray) -> trimesh.Tri
         (x0, x1), (y0, y1), z = x[j : j + 2], y[i : i + 2], level[i, j]
         quads.append([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)])
     cuts = np.unique(level)
-    for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+    for low, high in itertools.pairwise(cuts):
         is_up = level > 0.5 * (low + high)
         for i, j in np.argwhere(is_up[:, 1:] != is_up[:, :-1]):
             at, a, b = x[j + 1], y[i], y[i + 1]

@@ -74,7 +74,7 @@ class Images:
     Attributes:
         signal, variance: [detector, y, x]; NaN where not observed.
         place: beam positions [y, x, 2], um.
-        lit, floor, floor_std: signals of `Levels` [detector].
+        lit, floor, floor_std: signals of `SignalLevels` [detector].
         side: of a pixel [um].
         spot: standard deviation of the beam's spot [um].
     """
@@ -103,7 +103,8 @@ class Band:
         penumbra: length of the penumbra along the normal [pixels].
         abrupt: how much worse an abrupt far end fits than a penumbra, as a change of chi2; below 0: better.
         reach: how far from the edge data lie [um].
-        levels: fitted signals of `_columns`, in that of `Levels.lit`: upper and lower level, scattered, ...
+        least: height at least, if something else ends the band [um].
+        levels: fitted signals of `_columns`, in that of `SignalLevels.lit`: upper and lower level, scattered, ...
     """
 
     kind: str
@@ -118,11 +119,12 @@ class Band:
     penumbra: float
     abrupt: float
     reach: float
+    least: float
     levels: tuple[float, ...]
 
 
 def kind_of(signal: WallSignal) -> str:
-    """Return how a detector shows a wall: "dark", "lit", or "" where its signal says nothing sure of the height."""
+    """Return how a detector shows a wall: "dark", "lit", or "" where its signal does not determine the height."""
     if signal.dark_share >= 0.995 and signal.length >= 0.2 and signal.slant[0] >= _SLANT:
         return "dark"
     if signal.shift < -0.1 and signal.q[-1] < 0.0 and signal.slant[1] >= _SLANT:
@@ -338,7 +340,7 @@ def fit_band(
         start: first height [um]; default: from the deficit of the band.
 
     Returns:
-        The fit, or None where this detector says nothing, or pixels do not suffice.
+        The fit, or None where this detector shows no band, or pixels do not suffice.
     """
     kind = kind_of(signal)
     if not kind:
@@ -386,6 +388,7 @@ def fit_band(
         penumbra=spread * height / side,
         abrupt=_abrupt_end(plain, height, side, images.spot) if kind == "dark" else math.inf,
         reach=float(pixels.u.max()),
+        least=_first_height(edge, images, k, signal, drift) * signal.length / most if kind == "dark" else 0.0,
         levels=tuple(levels.tolist()),
     )
 
@@ -422,9 +425,7 @@ def place_edge(
         for i, place in enumerate(places):
             pixels.u = u - place
             height = max((far - place) / band.factor, 0.2 * band.height)
-            tries = [
-                _residuals(pixels, height * f, side, images.spot, _SHARP)[0] for f in (0.98, 1.0, 1.02)
-            ]
+            tries = [_residuals(pixels, height * f, side, images.spot, _SHARP)[0] for f in (0.98, 1.0, 1.02)]
             cost[i] += min(map(_robust, tries))
     cost -= cost.min()
     weight = np.exp(-0.5 * cost / _TEMPERATURE)
@@ -477,9 +478,7 @@ def _polish(pixels: _Pixels, height: float, side: float, spot: float) -> tuple[f
     return height, curvature
 
 
-def _first_height(
-    edge: Edge, images: Images, k: int, signal: WallSignal, drift: np.ndarray
-) -> float:
+def _first_height(edge: Edge, images: Images, k: int, signal: WallSignal, drift: np.ndarray) -> float:
     """Estimate the height from the mean deficit along the normal, up to where the signal is half back [um]."""
     u, w = band_coordinates(edge, images, drift)
     side = images.side
@@ -535,11 +534,11 @@ def abruptness(edge: Edge, images: Images, k: int, v: np.ndarray, band: float) -
     return float(expit(0.5 * (wide - sharp) / birge))
 
 
-def is_disturbed(band: Band) -> bool:
-    """Return whether a band ends or is filled otherwise than beside a free wall: by another wall, or the border.
+def disturbance(band: Band) -> str:
+    """Return how a band ends or is filled otherwise than beside a free wall: "interrupted", "no free wall", or "".
 
-    Then its length is a lower bound. Free walls of simulated mesas give fitted levels within these limits in 99 of 100
-    bands.
+    A band that another wall or the border ends is at least as long as its dark part. Free walls of simulated mesas give
+    fitted levels within these limits in 99 of 100 bands.
     """
     top, low, scattered, *rest = band.levels
     if band.kind == "dark":
@@ -548,5 +547,6 @@ def is_disturbed(band: Band) -> bool:
     else:
         is_odd, is_abrupt = not 0.7 < low / top < 1.4, False
     is_cut = band.n_far < 3 or band.reach < band.factor * band.height
-    return is_odd or is_abrupt or is_cut or band.far_chi2 > _FAR_MISFIT * max(band.n_far, 1)
-
+    if is_cut or is_abrupt:
+        return "interrupted"
+    return "no free wall" if is_odd or band.far_chi2 > _FAR_MISFIT * max(band.n_far, 1) else ""

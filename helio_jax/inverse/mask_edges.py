@@ -2,8 +2,8 @@
 
 A detector's mask band begins at the image of an upper edge and runs along -v (`wall_signal`): the edge, where the
 signal falls along -v, is abrupt, the other end is a penumbra. Places where a signal falls below `SHADED` in
-that direction are joined over all detectors and split into straight edges. Any orientation; nothing is said yet about
-whether an edge is a wall (`band_fit`). Source of the splitting: Ramer, Comput. Graph. Image Process. 1 (1972) 244.
+that direction are joined over all detectors and split into straight edges. Edges have any orientation; whether
+one is a wall is decided in `band_fit`. Source of the splitting: Ramer, Comput. Graph. Image Process. 1 (1972) 244.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.special import ndtr
 
 from helio_jax.arrays import nearest_known, robust_std
@@ -37,7 +37,7 @@ _MIN_DARK = 3
 
 
 @dataclass(frozen=True)
-class Levels:
+class SignalLevels:
     """Signal of every detector where nothing masks it, and where everything does [detector]; fraction masked.
 
     Attributes:
@@ -58,7 +58,7 @@ class Levels:
     probability: np.ndarray
 
 
-def find_levels(signal: np.ndarray, variance: np.ndarray, floor_known: bool) -> Levels:
+def find_levels(signal: np.ndarray, variance: np.ndarray, floor_known: bool) -> SignalLevels:
     """Find the masked pixels of every detector: near the floor, while another detector has signal.
 
     Args:
@@ -79,14 +79,14 @@ def find_levels(signal: np.ndarray, variance: np.ndarray, floor_known: bool) -> 
     with np.errstate(invalid="ignore"):
         probability = np.nan_to_num(ndtr((HALF - fraction) / np.maximum(noise, 1e-9)))
         is_dark, is_shaded = (_regions(fraction < limit, np.any(fraction >= limit, axis=0)) for limit in (HALF, SHADED))
-    return Levels(lit, floor, std, fraction, is_dark, is_shaded, probability * is_dark)
+    return SignalLevels(lit, floor, std, fraction, is_dark, is_shaded, probability * is_dark)
 
 
 def _regions(dark: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
     """Return the dark pixels [detector, y, x] in connected regions of which another detector sees a part."""
     out = np.zeros_like(dark)
     for k, image in enumerate(dark):
-        number = np.asarray(label(image, np.ones((3, 3)))[0])  # type: ignore[index]  # SciPy's stubs
+        number = np.asarray(label(image, np.ones((3, 3)))[0], np.intp)  # type: ignore[index]  # SciPy's stubs
         size, seen = np.bincount(number.ravel()), np.bincount(number.ravel(), is_seen.ravel())
         is_mask = (size >= _MIN_DARK) & (seen >= _SEEN * size)
         out[k] = image & is_mask[number]
@@ -139,7 +139,7 @@ def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarra
     """Find where a signal falls through `SHADED` along -v.
 
     Args:
-        fraction: from `Levels` of one detector, dark regions that are to be ignored filled [y, x].
+        fraction: from `SignalLevels` of one detector, dark regions that are to be ignored filled [y, x].
         x, y: beam positions [um].
         v: direction of the detector plus beam shift [2].
 
@@ -154,7 +154,9 @@ def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarra
     ]
     found = []
     for axis in (0, 1):
-        first, second = (np.take(filled, i, axis) for i in (range(filled.shape[axis] - 1), range(1, filled.shape[axis])))
+        first, second = (
+            np.take(filled, i, axis) for i in (range(filled.shape[axis] - 1), range(1, filled.shape[axis]))
+        )
         i, j = np.nonzero((first < SHADED) != (second < SHADED))
         t = (SHADED - first[i, j]) / (second[i, j] - first[i, j])
         step = (t * (axis == 0), t * (axis == 1))
@@ -171,9 +173,7 @@ def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarra
     return points[falls, :2], normal[falls]
 
 
-def straight_edges(
-    points: np.ndarray, normals: np.ndarray, detector: np.ndarray, side: float
-) -> list[Edge]:
+def straight_edges(points: np.ndarray, normals: np.ndarray, detector: np.ndarray, side: float) -> list[Edge]:
     """Join points to edges and split these into straight ones.
 
     Args:
@@ -184,7 +184,7 @@ def straight_edges(
     """
     if len(points) < 2:
         return []
-    pairs = cKDTree(points).query_pairs(_NEAR * side, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(_NEAR * side, output_type="ndarray")
     pairs = pairs[np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], 1) >= _COS_TURN]
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     group = connected_components(links, directed=False)[1]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
@@ -36,7 +36,7 @@ _BESIDE = 2
 """Pixels beside a masked one whose signals the mask explains, too."""
 _BORDER = 0.2
 """Weight of the links of the border to one common level."""
-_COMMON_STD = 0.004
+_COMMON_STD = 0.006
 """Standard deviation of all levels in common, from what the model of a wall neglects, as a fraction."""
 
 
@@ -62,13 +62,17 @@ def likeness(signal: np.ndarray, variance: np.ndarray, is_dark: np.ndarray) -> n
         is_dark: masked in some detector [y, x]: the mask explains a change of signals in and beside it.
     """
     known = np.isfinite(signal)
-    smooth = gaussian_filter(np.where(known, signal, 0.0), (0.0, 1.0, 1.0))
-    noise = gaussian_filter(np.where(known, variance, 0.0), (0.0, 1.0, 1.0)) / _AVERAGED
+    smooth, noise = (
+        np.asarray(gaussian_filter(np.where(known, field, 0.0), (0.0, 1.0, 1.0))) for field in (signal, variance)
+    )
+    noise = noise / _AVERAGED
     level, spread = (a.reshape(len(signal), -1) for a in (smooth, noise))
     first, second, _ = _links(signal.shape[1:])
     change = (level[:, first] - level[:, second]) ** 2 / np.maximum(spread[:, first] + spread[:, second], 1e-30)
-    is_explained = binary_dilation(is_dark, iterations=_BESIDE).ravel()
-    return np.where(is_explained[first] | is_explained[second], 1.0, 1.0 / (1.0 + np.mean(change, 0) / _CHANGE))
+    is_explained: np.ndarray = np.asarray(binary_dilation(is_dark, iterations=_BESIDE), bool).ravel()
+    return np.where(
+        np.logical_or(is_explained[first], is_explained[second]), 1.0, 1.0 / (1.0 + np.mean(change, 0) / _CHANGE)
+    )
 
 
 def _jumps(edges: Sequence[Edge], heights: np.ndarray, place: np.ndarray, side: float) -> np.ndarray:
@@ -111,12 +115,12 @@ def patch_heights(
     first, second = np.concatenate([first, border]), np.concatenate([second, np.full(border.size, n)])
     jump = np.concatenate([jump, np.zeros(border.size)])
     row, value = np.tile(np.arange(first.size), 2), np.repeat([-1.0, 1.0], first.size)
-    slope = coo_matrix((value, (row, np.concatenate([first, second]))), (first.size, n + 1)).tocsr()
-    pinned = coo_matrix(([1e-6], ([n], [n])), (n + 1, n + 1)).tocsr()
+    slope = csr_matrix((value, (row, np.concatenate([first, second]))), (first.size, n + 1))
+    pinned = csr_matrix(([1e-6], ([n], [n])), (n + 1, n + 1))
     height, strength = np.zeros(n + 1), weight.copy()
     for tolerance in scale * np.geomspace(*_TOLERANCES, _ITERATIONS):
-        scaled = slope.multiply(strength[:, None]).tocsr()
-        height = spsolve((slope.T @ scaled + pinned).tocsc(), slope.T @ (strength * jump))
+        normal = csc_matrix(slope.T @ diags_array(strength) @ slope + pinned)
+        height = np.asarray(spsolve(normal, slope.T @ (strength * jump)))
         rest = slope @ height - jump
         strength = weight * tolerance**2 / (rest**2 + tolerance**2) + 1e-7
     return height[:n].reshape(shape)
@@ -125,7 +129,7 @@ def patch_heights(
 def find_patches(
     edges: Sequence[Edge], heights: np.ndarray, place: np.ndarray, side: float, alike: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the number of every pixel's patch [y, x]; 0: the largest one, the substrate. Arguments: `patch_heights`."""
+    """Return the number of every pixel's patch [y, x]; 0: the largest one. Arguments as of `patch_heights`."""
     shape = place.shape[:2]
     if not len(edges):
         return np.zeros(shape, int)
@@ -166,7 +170,7 @@ def sides_of(edge: Edge, patch: np.ndarray, place: np.ndarray, side: float) -> t
 
 
 @dataclass(frozen=True)
-class Levels:
+class PatchLevels:
     """Levels of patches above patch 0 [patch], um.
 
     Attributes:
@@ -180,7 +184,7 @@ class Levels:
     dof: int
 
 
-def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarray, std: np.ndarray) -> Levels:
+def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarray, std: np.ndarray) -> PatchLevels:
     """Compute the levels of patches by weighted least squares; robust: steps beyond 3 deviations lose weight.
 
     Args:
@@ -197,7 +201,7 @@ def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarra
     use = np.isin(above, tied) & (above != below)
     dof = int(use.sum()) - free.size
     if not free.size or not use.any():
-        return Levels(level, error, 0.0, 0)
+        return PatchLevels(level, error, 0.0, 0)
     design = np.zeros((int(use.sum()), n))
     rows = np.arange(len(design))
     design[rows, above[use]] += 1.0
@@ -213,4 +217,4 @@ def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarra
     birge = max(1.0, robust / dof) if dof > 0 else 1.0
     cov = np.linalg.pinv((a / sigma[:, None]).T @ (a / sigma[:, None])) * birge
     level[free], error[free] = solution, np.sqrt(np.diag(cov) + (_COMMON_STD * solution) ** 2)
-    return Levels(level, error, chi2, dof)
+    return PatchLevels(level, error, chi2, dof)

@@ -1,9 +1,9 @@
 """Step heights from mask bands: edges, one band per detector, the steps, and the patches between them.
 
-`find_steps` needs no reconstruction and no scattering law: a band's length is the step's height times the tangent of the
-detector's direction plus the beam's (`wall_signal`). Bands of several detectors at an edge must agree. A fit may start
-from the levels and be checked against the bands. The surface is assumed to consist of level patches beside vertical
-walls where a step is stated; elsewhere nothing is stated. NumPy.
+`find_steps` needs no reconstruction: a band's length is the step's height times the tangent of the detector's direction
+plus the beam's (`wall_signal`), whatever gain, offset and scattering law are. Bands of several detectors at an edge
+must agree. A fit may start from the levels and be checked against the bands. Valid where both sides of a vertical wall
+are level; elsewhere nothing is stated. NumPy.
 """
 
 import math
@@ -17,16 +17,34 @@ from scipy.stats import chi2 as chi_square
 from helio_jax.arrays import as_json, pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
-from helio_jax.inverse.band_fit import Band, Images, abruptness, band_coordinates, fit_band, is_disturbed, kind_of, lay_edge, place_edge
-from helio_jax.inverse.mask_edges import SHADED, Edge, Levels, edge_points, find_levels, straight_edges, variance_of
+from helio_jax.inverse.band_fit import (
+    Band,
+    Images,
+    abruptness,
+    band_coordinates,
+    disturbance,
+    fit_band,
+    kind_of,
+    lay_edge,
+    place_edge,
+)
+from helio_jax.inverse.mask_edges import (
+    SHADED,
+    Edge,
+    SignalLevels,
+    edge_points,
+    find_levels,
+    straight_edges,
+    variance_of,
+)
 from helio_jax.inverse.mask_patches import find_patches, likeness, sides_of, solve_levels
 from helio_jax.inverse.wall_signal import Opening, WallSignal, opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
 
 MIN_WALL = 0.7
 """Least probability that the signal falls abruptly, for a wall."""
-_SURE_WALL = 0.9
-"""The same where only a lower bound of the height is known."""
+_CERTAIN_WALL = 0.9
+"""The same where the height is not determined, but the edge may part patches."""
 _MISFIT = 4.0
 """Mean square residual above which a band is not explained by a wall."""
 _MODEL_STD = 0.004
@@ -49,8 +67,9 @@ class BandRow:
         kind: "dark": mask band; "lit": image of the wall.
         length_um, length_std_um: along the detector's direction (a mask band) or along the edge's normal (a wall).
         height_um, height_std_um: of the step; NaN where the band says nothing.
-        is_lower_bound: something else, or the border, ends the band.
+        is_lower_bound: something else, or the border, ends the band: length and height are those of its dark part.
         p_wall: probability that the signal falls abruptly at the edge; NaN for a wall's image.
+        runs_deg: direction in which the band runs from the edge, counter-clockwise from +x.
         note: why a band is not used, or "".
     """
 
@@ -63,6 +82,7 @@ class BandRow:
     height_std_um: float
     is_lower_bound: bool
     p_wall: float
+    runs_deg: float
     note: str
 
 
@@ -241,7 +261,7 @@ def find_steps(stack: MicrographStack) -> Steps:
     return result
 
 
-def _found(scan: _Scan, levels: Levels) -> list[Edge]:
+def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
     """Find the edges at which bands begin, over all detectors."""
     stack, points, normals, numbers = scan.stack, [], [], []
     for k, v in enumerate(scan.directions(scan.seen_from(0.0))):
@@ -250,7 +270,7 @@ def _found(scan: _Scan, levels: Levels) -> list[Edge]:
         points.append(at)
         normals.append(normal)
         numbers.append(np.full(len(at), k))
-    return straight_edges(*map(np.concatenate, (points, normals, numbers)), scan.images.side)
+    return straight_edges(np.concatenate(points), np.concatenate(normals), np.concatenate(numbers), scan.images.side)
 
 
 def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
@@ -283,11 +303,12 @@ def _same(a: Edge, b: Edge, side: float) -> bool:
 
 @dataclass(frozen=True)
 class _Measured:
-    """An edge with its combined height and its bands."""
+    """An edge with its combined height and its bands; `jump`: a rough height, for finding the patches [um]."""
 
     edge: Edge
     step: Step
     bands: tuple[BandRow, ...]
+    jump: float
 
 
 def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -> _Measured:
@@ -319,7 +340,8 @@ def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -
         if row.note == "" and not row.is_lower_bound:
             used.append(band)
     step = _combined(number, line, rows, used, place_std)
-    return _Measured(line, step, tuple(rows))
+    rough = max((band.height for band in bands.values() if band.kind == "dark"), default=0.0)
+    return _Measured(line, step, tuple(rows), step.height_um if step.is_used else rough)
 
 
 def _bands(line: Edge, scan: _Scan, signals: list[WallSignal], v: np.ndarray) -> dict[int, Band]:
@@ -351,21 +373,29 @@ def _row(number: int, name: str, band: Band, edge: Edge, v: np.ndarray, place_st
     std = math.sqrt(band.std**2 + (end / band.factor) ** 2 + (_MODEL_STD * band.height) ** 2)
     slant = abs(float(v @ edge.normal)) / float(np.hypot(*v)) if band.kind == "dark" else 1.0
     to_length = band.factor / slant
+    runs = -v if band.kind == "dark" else edge.normal
     misfit = band.chi2 / max(band.n_data - 4, 1)
-    is_bound = is_disturbed(band)
-    note = "no wall explains the signal" if misfit > _MISFIT and not is_bound else ""
-    if band.factor * band.height < 0.4 * side:
+    disturbed = disturbance(band)
+    is_bound = disturbed == "interrupted"
+    height = band.height
+    if is_bound:
+        height, std = band.least, side / (math.sqrt(12.0) * band.factor)
+    note = "no wall explains the signal" if misfit > _MISFIT else disturbed
+    if is_bound:
+        note = ""
+    elif band.factor * band.height < 0.4 * side:
         note = "too short"
     return BandRow(
         step=number,
         detector=name,
         kind=band.kind,
-        length_um=to_length * band.height,
+        length_um=to_length * height,
         length_std_um=to_length * std,
-        height_um=band.height,
+        height_um=height,
         height_std_um=std,
         is_lower_bound=is_bound,
         p_wall=math.nan,
+        runs_deg=math.degrees(math.atan2(runs[1], runs[0])),
         note=note,
     )
 
@@ -414,11 +444,11 @@ def _combined(number: int, edge: Edge, rows: list[BandRow], used: list[Band], pl
     )
 
 
-def _patches(measured: list[_Measured], images: Images, levels: Levels) -> np.ndarray:
+def _patches(measured: list[_Measured], images: Images, levels: SignalLevels) -> np.ndarray:
     """Find the patches between the steps [y, x]."""
-    walls = [m for m in measured if m.step.is_used or (m.step.note == "lower bound" and m.step.p_wall > _SURE_WALL)]
-    heights = np.array([max(m.step.height_um, 1e-3) for m in walls])
-    alike = likeness(images.signal, images.variance, levels.is_dark.any(0))
+    walls = [m for m in measured if m.step.is_used or (m.step.p_wall > _CERTAIN_WALL and m.jump > 0.0)]
+    heights = np.array([m.jump for m in walls])
+    alike = likeness(images.signal, images.variance, np.any(levels.is_dark, axis=0))
     return find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
 
 
@@ -440,7 +470,7 @@ def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
     return out
 
 
-def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: Levels) -> Steps:
+def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: SignalLevels) -> Steps:
     """Solve for the levels of the patches."""
     images = scan.images
     steps = []
@@ -456,7 +486,7 @@ def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: L
     arrays = (np.array([getattr(s, name) for s in good]) for name in ("above", "below", "height_um", "height_std_um"))
     above, below, height, std = arrays
     found = solve_levels(n, above.astype(int), below.astype(int), height, std)
-    unexplained = (levels.is_dark & ~_explained(measured, scan)).any(0)
+    unexplained = np.asarray(np.any(levels.is_dark & ~_explained(measured, scan), axis=0))
     patches = []
     for k in range(n):
         touching = [s for s in steps if k in (s.above, s.below) and s.above != s.below]
@@ -467,7 +497,9 @@ def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: L
                 level_um=float(found.level[k]),
                 level_std_um=float(found.std[k]),
                 n_steps=sum(s.is_used for s in touching),
-                is_lower_bound=k > 0 and not any(s.is_used for s in touching) and any(s.is_lower_bound for s in touching),
+                is_lower_bound=k > 0
+                and not any(s.is_used for s in touching)
+                and any(s.is_lower_bound for s in touching),
                 unexplained=float(unexplained[patch == k].mean()),
             )
         )

@@ -107,7 +107,7 @@ class WallSignal:
 
     @property
     def dark_share(self) -> float:
-        """Fraction of the aperture from which wall and foot are hidden: from 0 to 1, near 1 for a mask band."""
+        """Fraction of the aperture from which the foot of the wall, and the wall itself, are masked."""
         return 1.0 - float(np.interp(max(self.shift, 0.0), self.q, self.below, 0.0, 1.0))
 
     @property
@@ -127,6 +127,11 @@ class WallSignal:
     def on_wall(self, z: np.ndarray) -> np.ndarray:
         """Return multiple scattering on the wall at heights above its foot."""
         return np.interp(z, self.wall_node, self.wall_scattered)
+
+
+def _slant(a: np.ndarray, normal: np.ndarray) -> float:
+    """Return the cosine of the angle between a unit vector and -a; 0 where a is 0."""
+    return -float(a @ normal) / max(float(np.hypot(a[0], a[1])), 1e-12)
 
 
 def wall_signal(opening: Opening, beam_shift: tuple[float, float], normal: np.ndarray) -> WallSignal:
@@ -154,5 +159,5 @@ def wall_signal(opening: Opening, beam_shift: tuple[float, float], normal: np.nd
     exchange = np.block([[np.zeros((_NODES, _NODES)), to_wall], [to_level, np.zeros((_NODES, _NODES))]])
     more = np.linalg.solve(np.eye(2 * _NODES) - exchange, first) - first
     shift = float(np.dot(beam_shift, normal))
-    slant = tuple(float(-np.dot(a, normal) / max(np.hypot(*a), 1e-12)) for a in (opening.mean + beam_shift, beam_shift))
-    return WallSignal(q, below, shift, d, more[:_NODES], z, more[_NODES:], wall_direct, slant)
+    slants = _slant(opening.mean + beam_shift, normal), _slant(np.array(beam_shift), normal)
+    return WallSignal(q, below, shift, d, more[:_NODES], z, more[_NODES:], wall_direct, slants)
