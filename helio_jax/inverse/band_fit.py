@@ -34,7 +34,7 @@ _SLANT = 0.35
 """Least cosine of the angle between an edge's normal and the direction of its band."""
 _RIGHT = 0.75
 """Least fraction of pixels on the right side of an edge, near each of its points."""
-_SCATTER_STD = {"dark": 0.3, "lit": 0.6}
+_SCATTER_STD = {"dark": 0.6, "lit": 0.6}
 """Prior standard deviation of multiple scattering, as a fraction of the prediction."""
 _BASE_STD = 0.04
 """Prior standard deviation of a constant on the lower level, where it is not the pedestal [signal of the level]."""

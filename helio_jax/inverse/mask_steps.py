@@ -248,16 +248,17 @@ def find_steps(stack: MicrographStack) -> Steps:
     )
     scan = _Scan(images, openings, stack, np.array(stack.instrument.beam_shift))
     edges = _laid(_found(scan, levels), scan)
-    flat = [0.0] * len(edges)
-    first = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, flat, strict=True), 1)]
-    patch = _patches(first, images, levels)
-    result = _joined(first, patch, scan, levels)
+    tried = ((edge, _measure(0, edge, scan, 0.0)) for edge in edges)
+    shown = [(edge, m) for edge, m in tried if m.bands]
+    edges, measured = [edge for edge, _ in shown], [m.numbered(i) for i, (_, m) in enumerate(shown, 1)]
+    patch = _patches(measured, images, levels)
+    result = _joined(measured, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step
     low = [result.patches[s.below].level_um for s in result.steps]
     moved = [z if math.isfinite(z) else 0.0 for z in low]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
-        again = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
-        result = _joined(again, patch, scan, levels)
+        measured = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
+        result = _joined(measured, patch, scan, levels)
     return result
 
 
@@ -309,6 +310,11 @@ class _Measured:
     step: Step
     bands: tuple[BandRow, ...]
     jump: float
+
+    def numbered(self, number: int) -> "_Measured":
+        """Return the edge with another number."""
+        bands = tuple(replace(band, step=number) for band in self.bands)
+        return replace(self, step=replace(self.step, number=number), bands=bands)
 
 
 def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -> _Measured:
