@@ -96,6 +96,11 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   regions             segmentation of the images into regions behind depth jumps
   levels              level search of such regions
   occlusion           depth jumps where the surface leaves the beam
+  mask_steps          hx.find_steps: step heights from the mask bands of the micrographs
+  mask_edges          masked pixels, and the upper edges at which mask bands begin
+  wall_signal         signal across a vertical wall: mask, lit wall, multiple scattering
+  band_fit            length of the band beside an edge, and the height from it
+  mask_patches        surface patches between steps, and their levels
   residuals           residuals of the fit as a function of its unknowns
   problem             FitProblem: data, priors, all that is constant in a fit
   state               FitState and its corrections: all that changes
@@ -156,6 +161,7 @@ figures/              pictures
   before_after        a scan before and after calibration
   overlay             overlay of aligned scans; facet map
   cracks              cracks and vertical edges
+  steps               mask bands and steps on the micrographs
   ripple              a ripple
   spot                the beam's spot
   sweep               scores of a study
@@ -184,6 +190,7 @@ workflows/            what joins the stages
   compare             simulation against experiment
   effects             effects that a simulation may lack
   measure             what helio measure prints
+  steps               what helio measure --steps prints
   study               sweeps of scene values
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
@@ -226,6 +233,7 @@ _HOME = {
     "Information": "inverse.fisher",
     "fisher": "inverse.fisher",
     "posterior_std": "inverse.fisher",
+    "find_steps": "inverse.mask_steps",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

@@ -115,7 +115,7 @@ def report(
 
 @app.command()
 def measure(
-    height: Annotated[Path, typer.Argument(help="Height map (.h5)."), Reads()],
+    height: Annotated[Path, typer.Argument(help="Height map (.h5); with --steps micrographs (.h5)."), Reads()],
     facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
     profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
     step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
@@ -129,6 +129,9 @@ def measure(
     vertical_edges: Annotated[
         bool, typer.Option("--vertical-edges", help="Walls in the map of jumps, masked and floating pixels.")
     ] = False,
+    steps: Annotated[
+        bool, typer.Option("--steps", help="Heights of walls from the mask bands of micrographs, without a height map.")
+    ] = False,
     stack: Annotated[
         Path | None,
         typer.Option(help="Calibrated micrographs (.h5): do they show the ripple? Where are cracks?"),
@@ -139,12 +142,14 @@ def measure(
         list[str] | None, typer.Option("--set", help="KEY=VALUE: max_turn_deg, along_axes, ... (repeat).")
     ] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Facets, ripple, or cracks as a picture (.png, .pdf, .svg)."), FIGURE
+        Path | None, typer.Option(help="Facets, ripple, cracks or steps as a picture (.png, .pdf, .svg)."), FIGURE
     ] = None,
-    table: Annotated[Path | None, typer.Option(help="Cracks and vertical edges, a row for each (.csv)."), CSV] = None,
+    table: Annotated[
+        Path | None, typer.Option(help="Cracks, vertical edges or steps, a row for each (.csv)."), CSV
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on a height map: facets, a profile or step, roughness, a ripple, cracks, vertical edges."""
+    """Measure facets, profiles, roughness, ripples, cracks, edges on a height map; steps on micrographs (--steps)."""
     from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.formats.safe import atomic_path
     from helio_jax.measure.crack_text import table as as_table
@@ -162,11 +167,19 @@ def measure(
         table=table is not None,
         settings=set_options(settings, min_pixels=min_pixels),
     )
-    images = read_stack(stack) if stack else None
-    found, lines = measure_height_map(read_height(height), wanted, figure, images)
+    if steps:
+        from helio_jax.workflows.steps import check_alone, measure_steps, steps_table
+
+        check_alone(wanted, has_stack=stack is not None)
+        found, lines = measure_steps(read_stack(height), figure)
+        text = steps_table(found)
+    else:
+        images = read_stack(stack) if stack else None
+        found, lines = measure_height_map(read_height(height), wanted, figure, images)
+        text = as_table(found)
     if table:
         with atomic_path(table) as part:
-            part.write_text(as_table(found), encoding="utf-8")
+            part.write_text(text, encoding="utf-8")
     print(json.dumps(found) if as_json else "\n".join(lines))
 
 
