@@ -22,7 +22,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.state import FitState, Predict, update_corrections
+from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
@@ -118,6 +118,23 @@ def misfit_on(problem: FitProblem, surface: Surface, predict: Predict, parameter
     if parameters is not None:
         state = replace(state, parameters=parameters)
     return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict))))
+
+
+def settled(
+    problem: FitProblem, surface: Surface, predict: Predict, parameters: Parameters | None = None
+) -> tuple[float, Surface]:
+    """Fit a surface's relief to the data in a few steps; compute the misfit of what comes out, as `misfit_on` does.
+
+    Raises:
+        PredictionError: nothing can be predicted of a surface.
+    """
+    s, state = problem.settings, FitState.at(problem, surface)
+    if parameters is not None:
+        state = replace(state, parameters=parameters)
+    state = predict_corrections(problem, state, predict)
+    for _ in range(s.reweightings):
+        state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
+    return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict)))), state.surface
 
 
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:

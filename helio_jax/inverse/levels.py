@@ -8,6 +8,7 @@ the near field fix it; a region that something else explains about as well is un
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -23,11 +24,13 @@ from helio_jax.inverse.quality import FLOATING
 from helio_jax.inverse.regions import grown
 
 _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
-"""Levels that are tried, up and down, in widths of the region."""
+"""Levels that are tried, up and down, in widths of the region ..."""
+_SHIFTS = (0.03, 0.06, 0.125, 0.25)
+"""... and by how much the relief that was fitted is shifted."""
 GAIN = 30.0
 """By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
 worse may be true as well."""
-_LEVEL_STEPS = 8
+_LEVEL_STEPS = 5
 """Evaluations by which the best level is refined."""
 
 SKIRT = 4
@@ -37,6 +40,8 @@ KINDS = "flat", "as fitted", "flat, with a wall"
 
 Misfit = Callable[[Surface], float]
 """Half the chi-square of the data expected on a surface, nothing fitted."""
+Settle = Callable[[Surface], tuple[float, Surface]]
+"""The same after a short fit from a surface, and the surface fitted."""
 
 
 class Levels(NamedTuple):
@@ -103,18 +108,42 @@ def at_level(
 
 
 @dataclass(frozen=True)
+class Region:
+    """A region whose level is in doubt.
+
+    Attributes:
+        inside: its pixels [y, x].
+        height: measured height, um; None: not known.
+        kinds: of relief that are tried.
+    """
+
+    inside: np.ndarray
+    height: float | None = None
+    kinds: tuple[str, ...] = KINDS
+
+    def heights(self, surroundings: float, pitch: tuple[float, float], max_width: float) -> list[float]:
+        """Choose the heights to be tried, um; arguments as in `search_levels`."""
+        if self.height is not None:
+            return [self.height]
+        room = np.pad(self.inside, 1, mode="edge")
+        width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
+        return [surroundings + sign * width * share for share in sorted(_LEVELS) for sign in (-1.0, 1.0)]
+
+
+@dataclass(frozen=True)
 class _RegionSearch:
-    """Levels tried for one region; `tried` maps the heights of each trial to its misfit and surface."""
+    """Levels tried for one region; `tried` maps the heights of each trial to its misfit."""
 
     name: str
     inside: np.ndarray
+    kinds: tuple[str, ...]
     base: Surface
     surroundings: float
     pitch: tuple[float, float]
     beam_shift: tuple[float, float]
     misfit: Misfit
     report: Callable[[str], None]
-    tried: dict[bytes, tuple[float, Surface]] = field(default_factory=dict)
+    tried: dict[bytes, float] = field(default_factory=dict)
 
     def trial(self, level: float, kind: str) -> Surface:
         """Make the surface with the region at a level above the surroundings, um."""
@@ -131,57 +160,72 @@ class _RegionSearch:
         key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
         if key not in self.tried:
             try:
-                self.tried[key] = self.misfit(trial), trial
+                self.tried[key] = self.misfit(trial)
             except PredictionError:  # no level of a wall that nothing can be predicted of
-                self.tried[key] = np.inf, trial
-        return self.tried[key][0]
+                self.tried[key] = np.inf
+        return self.tried[key]
 
-    def search(self, levels: list[float]) -> None:
-        """Try all levels and kinds of relief, and refine the best of each kind."""
-        for kind in KINDS if any(self.beam_shift) else KINDS[:-1]:
-            current = float(np.median(self.base.height[self.inside])) - self.surroundings
-            tried = sorted([*levels, current]) if kind == "as fitted" else levels
+    def search(self, levels: list[float]) -> list[Surface]:
+        """Find the best level of each kind of relief."""
+        out = []
+        for kind in self.kinds if any(self.beam_shift) else [k for k in self.kinds if k != KINDS[-1]]:
+            tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
-            bracket = tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]
-            minimize_scalar(
-                self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options={"maxiter": _LEVEL_STEPS}
-            )
+            best = tried[i]
+            if len(tried) > 1:
+                bracket, options = (tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]), {"maxiter": _LEVEL_STEPS}
+                found = minimize_scalar(self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options=options)
+                best = min((best, float(found.x)), key=lambda level, kind=kind: self.misfit_at(level, kind))
+            out.append(self.trial(best, kind))
+        return out
+
+    def shifts(self, levels: list[float]) -> list[float]:
+        """Choose the levels to which the relief that was fitted is shifted: about its own, unless one is known, um."""
+        own = float(np.median(self.base.height[self.inside])) - self.surroundings
+        reach = max(abs(level) for level in levels) / max(_LEVELS)
+        return levels if len(levels) == 1 else [own, *(own + sign * reach * s for s in _SHIFTS for sign in (-1, 1))]
 
 
 def search_levels(
-    regions: Sequence[np.ndarray],
+    regions: Sequence[Region],
     surface: Surface,
     pitch: tuple[float, float],
     max_width: float,
     misfit: Misfit,
+    settle: Settle,
     beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
 ) -> Levels:
     """Find the surface with all regions at the levels that explain the images best.
 
+    For every kind of relief the best level is found with nothing fitted. What explains the images best after a short
+    fit is kept.
+
     Args:
-        regions: one after the other [region][y, x]; they may overlap.
+        regions: one after the other; they may overlap.
         surface: to begin with.
         pitch: dy, dx, um.
         max_width: levels up to twice the width of a region are tried, and of this width at most, um.
-        misfit: see `Misfit`.
+        misfit, settle: see `Misfit`, `Settle`.
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
     """
-    best, found = misfit(surface), surface
+    best, found = settle(surface)
     moved, undecided = [], []
-    for i, inside in enumerate(regions):
-        base = without_skirt(inside, found)
+    for i, region in enumerate(regions):
+        inside = region.inside
+        done = np.any([np.zeros_like(inside), *(regions[j].inside for j in moved)], axis=0) & ~inside
+        base = without_skirt(inside, done, found)
         around = grown(inside, SKIRT) & ~inside
         surroundings = float(np.median(base.height[around]))
-        room = np.pad(inside, 1, mode="edge")
-        width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
         name = f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
-        known = pitch, beam_shift, misfit, report
-        search = _RegionSearch(name, inside, base, surroundings, *known)
-        search.search(sorted(sign * width * share for share in _LEVELS for sign in (-1.0, 1.0)))
-        explanations = [(best, found), *search.tried.values()]
-        value, better = min(search.tried.values(), key=lambda entry: entry[0])
+        search = _RegionSearch(name, inside, region.kinds, base, surroundings, pitch, beam_shift, misfit, report)
+        trials = search.search([level - surroundings for level in region.heights(surroundings, pitch, max_width)])
+        explanations = [(best, found)]
+        for trial in trials:
+            with suppress(PredictionError):
+                explanations.append(settle(trial))
+        value, better = min(explanations, key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
             moved.append(i)
@@ -190,10 +234,16 @@ def search_levels(
     return Levels(found, moved, undecided)
 
 
-def without_skirt(inside: np.ndarray, surface: Surface) -> Surface:
-    """Continue the surroundings up to a region: a fit that bridged a jump raised the pixels beside it."""
-    skirt = grown(inside, SKIRT) & ~inside
-    is_known = ~(skirt | inside)
+def without_skirt(inside: np.ndarray, others: np.ndarray, surface: Surface) -> Surface:
+    """Continue the surroundings up to a region: a fit that bridged a jump raised the pixels beside it.
+
+    Args:
+        inside: the region [y, x].
+        others: pixels that stay as they are [y, x].
+        surface: to begin with.
+    """
+    skirt = grown(inside, SKIRT) & ~inside & ~others
+    is_known = ~(grown(inside, SKIRT) | others)
     if not is_known.any():
         return surface
     nearest = nearest_known(is_known)

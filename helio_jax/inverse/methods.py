@@ -5,7 +5,7 @@ the current height. refine: the fit of the heights, started from nearfield. Take
 instrument from the stack, and, if the settings say so, that the border of the image is flat; no truth.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from helio_jax.errors import GuardError, PredictionError
+from helio_jax.errors import GuardError, PredictionError, SceneError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.levels import search_levels
+from helio_jax.inverse.levels import Levels, Region, search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
+from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
 from helio_jax.inverse.quality import (
     FACET_IMAGES,
@@ -34,7 +35,7 @@ from helio_jax.inverse.quality import (
     regions,
     squares,
 )
-from helio_jax.inverse.regions import covered, find_regions, in_doubt
+from helio_jax.inverse.regions import find_regions, in_doubt
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
 from helio_jax.inverse.verdict import (
@@ -52,8 +53,8 @@ MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate ..."""
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit ..."""
-MAX_SEARCHES = 2
-"""... and so often, each time followed by a fit."""
+MAX_SEARCHES, MAX_REGIONS = 2, 3
+"""... and so often, each time in so many regions and followed by a fit."""
 START_THRIFT = 4
 """The same for photometric solutions, but not fewer than the least number: from a noisier start the rim of sphere B is
 7 % worse."""
@@ -67,6 +68,7 @@ GEOMETRY_WARNING = (
 
 if TYPE_CHECKING:
     from helio_jax.inverse.fit import Fit, Report
+    from helio_jax.inverse.residuals import Parameters
     from helio_jax.inverse.state import Predict
 
 
@@ -175,7 +177,7 @@ def _with_levels(
     Returns:
         The fit, and where another level explains the images as well, or better but could not be fitted [y, x].
     """
-    from helio_jax.inverse.fit import fit_heights, misfit_on
+    from helio_jax.inverse.fit import fit_heights, misfit_on, settled
     from helio_jax.inverse.problem import FitProblem
 
     signal, variance = signal_of(stack)
@@ -189,47 +191,82 @@ def _with_levels(
     def tested(fit: "Fit") -> np.ndarray:
         return residuals_of_state(fit.problem, fit.state, roughly)
 
-    fit, _ = _with_backtracking(lambda surface: fit_heights(pose(surface), surface, predict, report), start, smoothed)
-    levelled, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
+    def search(regions: list[Region], surface: Surface, parameters: "Parameters | None") -> Levels:
+        return search_levels(
+            regions,
+            surface,
+            (raster.dy, raster.dx),
+            MAX_WIDTH * stack.instrument.sample_distance,
+            lambda trial: misfit_on(pose(trial), trial, roughly, parameters),
+            lambda trial: settled(pose(trial), trial, roughly, parameters),
+            stack.instrument.beam_shift,
+            lambda said: report(0, settings.refine.max_rounds, said) if report else None,
+        )
+
+    labels, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
+    if steps := measured_regions(stack):
+        try:
+            found = search(steps, start, None)
+            start, is_undecided = found.surface, covered(steps, found.undecided)
+            labels = labelled(labels, steps, found.moved)
+        except PredictionError:
+            pass  # the start is too rough for it: the fit begins at a smoother one
+    fit, _ = _with_backtracking(
+        lambda surface: fit_heights(pose(surface, labels), surface, predict, report), start, smoothed
+    )
     try:
         residuals = tested(fit)
         for _ in range(0 if fit.is_interrupted else MAX_SEARCHES):
             is_contradicted = local_chi_square(residuals, stack.is_observed) > LIMIT
             reliefs = start.height, fit.surface.height
-            left = in_doubt(find_regions(signal, variance, reliefs), is_contradicted)
+            doubtful = in_doubt(find_regions(signal, variance, reliefs), is_contradicted)[:MAX_REGIONS]
+            left = [Region(inside, kinds=("as fitted",)) for inside in doubtful]
             if not left:
                 break
-            known = None
-            if fit.problem.is_instrument_unknown:
-                p = fit.parameters
-                known = p.replaced(log_multiple=0.0 * p.log_multiple, occluded=np.zeros(()))
-            found = search_levels(
-                left,
-                fit.surface,
-                (raster.dy, raster.dx),
-                MAX_WIDTH * stack.instrument.sample_distance,
-                lambda surface, known=known: misfit_on(pose(surface), surface, roughly, known),
-                stack.instrument.beam_shift,
-                lambda said: report(0, settings.refine.max_rounds, said) if report else None,
-            )
-            is_undecided = covered(left, found.undecided)
+            p = fit.parameters
+            known = p.replaced(log_multiple=0.0 * p.log_multiple, occluded=np.zeros(()))
+            found = search(left, fit.surface, known if fit.problem.is_instrument_unknown else None)
+            is_undecided |= covered(left, found.undecided)
             if not found.moved:
                 break
-            trial = levelled.copy()
-            for i in found.moved:
-                trial[left[i]] = trial.max() + 1
-            is_moved = covered(left, found.moved)
-            before, is_undecided = is_undecided, is_undecided | is_moved  # unless the fit goes on from there
+            before, is_undecided = is_undecided, is_undecided | covered(left, found.moved)  # unless the fit goes on
+            trial = labelled(labels, left, found.moved)
             again = fit_heights(pose(found.surface, trial), found.surface, predict, report)
             anew = tested(again)
             if np.sum(squares(anew)) > np.sum(squares(residuals)):
                 break
-            fit, residuals, levelled, is_undecided = again, anew, trial, before
+            fit, residuals, labels, is_undecided = again, anew, trial, before
     except KeyboardInterrupt:
         fit = replace(fit, status=f"interrupted in the search for levels; before that: {fit.status}")
     except PredictionError as e:
         fit = replace(fit, status=f"{fit.status}; a better level was found that could not be fitted: {e}")
     return fit, is_undecided
+
+
+def measured_regions(stack: MicrographStack) -> list[Region]:
+    """Find the patches whose steps the mask bands show, the largest first; none where steps cannot be measured."""
+    try:
+        found = find_steps(stack)
+    except SceneError:
+        return []
+    patches = sorted(found.patches[1:], key=lambda patch: -patch.pixels)
+    return [
+        Region(found.patch == p.number, p.level_um) if p.is_determined else Region(found.patch == p.number)
+        for p in patches
+    ]
+
+
+def covered(regions: list[Region], numbers: Iterable[int]) -> np.ndarray:
+    """Mark the pixels of the regions of some numbers [y, x]."""
+    return np.any([np.zeros_like(regions[0].inside), *(regions[i].inside for i in numbers)], axis=0)
+
+
+def labelled(labels: np.ndarray, regions: list[Region], numbers: Iterable[int]) -> np.ndarray:
+    """Number the pixels of the regions of some numbers beyond the labels that there are [y, x]."""
+    out = labels.copy()
+    for i in numbers:
+        out[regions[i].inside] = out.max() + 1
+    return out
 
 
 def _start(stack: MicrographStack, settings: ReconstructSettings, predict: "Predict") -> tuple[Surface, Surface]:

@@ -108,8 +108,3 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 def in_doubt(regions: list[np.ndarray], is_contradicted: np.ndarray) -> list[np.ndarray]:
     """Keep the regions at whose outlines the data contradict a fit [y, x]."""
     return [region for region in regions if is_contradicted[outline(region)].mean() > CONTRADICTED]
-
-
-def covered(regions: list[np.ndarray], numbers: Iterable[int]) -> np.ndarray:
-    """Mark the pixels of the regions of some numbers [y, x]."""
-    return np.any([np.zeros_like(regions[0]), *(regions[i] for i in numbers)], axis=0)
