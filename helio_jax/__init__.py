@@ -114,6 +114,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   samples             posterior samples of the heights
   noise_bias          bias that the noise of the data causes
   quality             why a height is not valid
+  anchors             what is known of many heights together
   verdict             whether the data support a height map
   instrument_report   what a fit found out about the instrument
   consistency         misfit of one surface to all images

@@ -114,11 +114,13 @@ class Region:
     Attributes:
         inside: its pixels [y, x].
         height: measured height, um; None: not known.
+        std: standard deviation of that, um.
         kinds: of relief that are tried.
     """
 
     inside: np.ndarray
     height: float | None = None
+    std: float = 0.0
     kinds: tuple[str, ...] = KINDS
 
     def heights(self, surroundings: float, pitch: tuple[float, float], max_width: float) -> list[float]:

@@ -18,8 +18,9 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.levels import Levels, Region, search_levels
+from helio_jax.inverse.levels import SKIRT, Levels, Region, search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
@@ -58,6 +59,8 @@ MAX_SEARCHES, MAX_REGIONS = 2, 3
 START_THRIFT = 4
 """The same for photometric solutions, but not fewer than the least number: from a noisier start the rim of sphere B is
 7 % worse."""
+MAX_LEVEL_SLOPE = 0.3
+"""Steeper pixels of a region do not count for its level: they are its wall."""
 MAX_BACKTRACKS = 3
 """How often a starting surface is smoothed when masks and multiple scattering cannot be predicted for it."""
 GEOMETRY_WARNING = (
@@ -184,9 +187,9 @@ def _with_levels(
     raster, n_paths = Raster.of(stack), settings.refine.paths(signal[0].size)
     predict, roughly = make_predict(n_paths), make_predict(max(n_paths // SEARCH_THRIFT, 1000))
 
-    def pose(surface: Surface, region: np.ndarray | None = None) -> FitProblem:
+    def pose(surface: Surface, region: np.ndarray | None = None, anchors: Anchors | None = None) -> FitProblem:
         known = signal, variance, stack.instrument, raster, surface, settings, region
-        return FitProblem.of(*known, scan_order(stack))
+        return FitProblem.of(*known, scan_order(stack), anchors=anchors)
 
     def tested(fit: "Fit") -> np.ndarray:
         return residuals_of_state(fit.problem, fit.state, roughly)
@@ -204,15 +207,17 @@ def _with_levels(
         )
 
     labels, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
+    anchors = None
     if steps := measured_regions(stack):
         try:
             found = search(steps, start, None)
             start, is_undecided = found.surface, covered(steps, found.undecided)
             labels = labelled(labels, steps, found.moved)
+            anchors = level_anchors(labels, [steps[i] for i in found.moved], start)
         except PredictionError:
             pass  # the start is too rough for it: the fit begins at a smoother one
     fit, _ = _with_backtracking(
-        lambda surface: fit_heights(pose(surface, labels), surface, predict, report), start, smoothed
+        lambda surface: fit_heights(pose(surface, labels, anchors), surface, predict, report), start, smoothed
     )
     try:
         residuals = tested(fit)
@@ -231,7 +236,7 @@ def _with_levels(
                 break
             before, is_undecided = is_undecided, is_undecided | covered(left, found.moved)  # unless the fit goes on
             trial = labelled(labels, left, found.moved)
-            again = fit_heights(pose(found.surface, trial), found.surface, predict, report)
+            again = fit_heights(pose(found.surface, trial, anchors), found.surface, predict, report)
             anew = tested(again)
             if np.sum(squares(anew)) > np.sum(squares(residuals)):
                 break
@@ -251,9 +256,24 @@ def measured_regions(stack: MicrographStack) -> list[Region]:
         return []
     patches = sorted(found.patches[1:], key=lambda patch: -patch.pixels)
     return [
-        Region(found.patch == p.number, p.level_um) if p.is_determined else Region(found.patch == p.number)
+        Region(found.patch == p.number, p.level_um, p.level_std_um)
+        if p.is_determined
+        else Region(found.patch == p.number)
         for p in patches
     ]
+
+
+def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:
+    """Anchor the regions whose heights are measured, where the surface is level in them.
+
+    Args:
+        labels: 1, 2, ... in the regions [y, x].
+        regions: that were moved, in this order.
+        surface: with the regions at their levels.
+    """
+    is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
+    known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
+    return Anchors.of_levels(labels, known, is_level, SKIRT)
 
 
 def covered(regions: list[Region], numbers: Iterable[int]) -> np.ndarray:

@@ -316,7 +316,8 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     rows.add((pixel, 0, np.asarray(fixed.border)))
     for part in (1, 2):
         rows.add((pixel, part, np.full(shape, 1.0 / SLOPE_STD)))
-    n_rows = rows.n_rows  # below: the held level, which is of all heights, and the priors of the parameters
+    # below: the anchors, which are of many heights, and the priors of the parameters
+    n_rows, n_anchors = rows.n_rows, len(fixed.anchor_weight)
     names = [f"{n}{list(i)}" for n in free for i in np.ndindex(data_by[n].shape[data[0].ndim :])]
 
     def by_parameter(blocks: dict[str, np.ndarray], n: int) -> np.ndarray:
@@ -324,18 +325,19 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
 
     sizes = n_data, edges.inverse_std_x.size, edges.inverse_std_y.size, pixel.size
     columns = np.concatenate([by_parameter(b, n) for b, n in zip((data_by, *others_by), sizes, strict=True)])
-    matrix = rows.stack(n_more=1 + len(names))
-    by_instrument = np.zeros((n_rows + 1 + len(names), len(names)))
+    matrix = rows.stack(n_more=n_anchors + len(names))
+    by_instrument = np.zeros((n_rows + n_anchors + len(names), len(names)))
     by_instrument[: len(columns)] = columns
     by_instrument[-len(names) :] = np.eye(len(names))
     is_used = np.any(np.asarray(fixed.modes.weights) != 0.0, axis=(1, 2))
     weights = np.asarray(fixed.modes.weights)[is_used]
     response = np.asarray(fixed.modes.response)[is_used] * np.asarray(fixed.inverse_sigma)
-    n_common = len(weights) + 2
+    n_modes, anchors = len(weights), np.asarray(fixed.anchor_weight).reshape(n_anchors, pixel.size)
+    n_common = n_modes + n_anchors + 1
     common, of_surface = np.zeros((len(by_instrument), n_common)), np.zeros((3 * pixel.size, n_common))
-    common[:n_data, :-2] = response.reshape(len(weights), n_data).T
-    of_surface[::3, :-2] = weights.reshape(len(weights), pixel.size).T
-    common[n_rows, -2], of_surface[::3, -2] = 1.0, np.ravel(fixed.level_weight)
+    common[:n_data, :n_modes] = response.reshape(n_modes, n_data).T
+    of_surface[::3, :n_modes] = weights.reshape(n_modes, pixel.size).T
+    common[n_rows : n_rows + n_anchors, n_modes:-1], of_surface[::3, n_modes:-1] = np.eye(n_anchors), anchors.T
     by_height = np.concatenate([part.ravel() for part in raised])
     common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
     return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)

@@ -16,6 +16,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument, Uncertainty
+from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.residuals import Parameters, Priors, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
@@ -39,6 +40,7 @@ class FitProblem:
         order: in which the pixels were recorded.
         is_level_held, is_level_free: whether the mean height is held, or unknown; a flat border does neither.
         held_level: mean height that is held, over its standard deviation.
+        anchors: what is known of the heights.
         region: number of the plateau of every pixel, whose masks are to follow their levels, 0: none [y, x].
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
         median_signal: of every detector, 1 without data [detector].
@@ -57,6 +59,7 @@ class FitProblem:
     is_level_held: bool
     is_level_free: bool
     held_level: float
+    anchors: Anchors
     region: np.ndarray
     drift_modes: np.ndarray
     median_signal: np.ndarray
@@ -76,6 +79,7 @@ class FitProblem:
         region: np.ndarray | None = None,
         order: ScanOrder = ScanOrder(),
         uncertainty: Uncertainty | None = None,
+        anchors: Anchors | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
@@ -92,8 +96,8 @@ class FitProblem:
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
             signal, variance, optics, stated, raster, settings, order, is_held,
-            is_free and not is_held, 0.0, np.zeros(shape, int) if region is None else region, modes, median,
-            noise, given,
+            is_free and not is_held, 0.0, anchors or Anchors.none(shape),
+            np.zeros(shape, int) if region is None else region, modes, median, noise, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -127,6 +131,12 @@ class FitProblem:
         """Weights [y, x] of the mean height over its standard deviation, or 0 where nothing holds it."""
         enough = self.has_enough_images
         return self.is_level_held * enough / np.maximum(enough.sum(), 1) / LEVEL_STD
+
+    @property
+    def all_anchors(self) -> Anchors:
+        """The anchors, with the held mean height."""
+        held = Anchors(self.level_weight[None], np.array([self.held_level]))
+        return held.and_also(self.anchors) if self.is_level_held else self.anchors
 
     @property
     def border(self) -> np.ndarray:
@@ -206,6 +216,7 @@ class FitProblem:
             variance=self.variance[:, *thin],
             raster=Raster.regular(self.signal[0][thin].shape, self.raster.dx * stride, self.raster.dy * stride),
             order=self.order.thinned(thin),
+            anchors=self.anchors.thinned(thin),
             region=self.region[thin],
             drift_modes=self.drift_modes[:, :, *thin],
             stride=stride,

@@ -187,8 +187,9 @@ class FixedTerms(eqx.Module):
         position: (x, y) by which a tilt raises the border [2, y, x], um.
         edges: between pixels.
         border: prior weight of each height above the substrate [y, x], 1/um.
-        level_weight: the sum of these weights times the heights is to be `held_level`, both over its standard
-            deviation [y, x]; 0 where the level is free.
+        anchor_weight: the sums of these weights times the heights are known, over their standard deviations
+            [anchor, y, x], 1/um; all 0 for unused anchors.
+        anchored: those sums, over their standard deviations [anchor].
         whitening: standard deviation of each cosine mode of the heights [y, x], um.
         slope_scale_x, slope_scale_y: scale of the whitened slopes [y, x].
         priors: of the parameters.
@@ -208,8 +209,8 @@ class FixedTerms(eqx.Module):
     position: Any
     edges: Edges
     border: Any
-    level_weight: Any
-    held_level: Any
+    anchor_weight: Any
+    anchored: Any
     whitening: Any
     slope_scale_x: Any
     slope_scale_y: Any
@@ -356,7 +357,7 @@ def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:
         "edge_x": edge_x,
         "edge_y": edge_y,
         "border": border_residuals(surface, parameters, fixed),
-        "level": jnp.sum(fixed.level_weight * surface.height) - fixed.held_level,
+        "anchors": jnp.einsum("ayx,yx->a", fixed.anchor_weight, surface.height) - fixed.anchored,
         "slope_x": surface.slope_x / SLOPE_STD,
         "slope_y": surface.slope_y / SLOPE_STD,
         **{name: getattr(parameters, name) for name in NAMES},

@@ -34,7 +34,7 @@ from helio_jax.inverse.state import FitState, Held, moved_optics
 from helio_jax.robust import cauchy_weight
 
 MODE_BLOCK = 4
-"""Common modes are filled up to a multiple of this."""
+"""Common modes and anchors are filled up to a multiple of this."""
 _NOISY = 3.0
 """Largest standard deviation that slopes are credited with, in that of a pixel with median noise."""
 
@@ -191,7 +191,7 @@ def freeze(
         state.parameters,
     )
     inverse_sigma, priors = cauchy_weight(state.residuals, limit) / held.sigma, problem.priors
-    occluded_std = held.corrections.occluded
+    occluded_std, anchors = held.corrections.occluded, problem.all_anchors.padded(MODE_BLOCK)
     fixed = FixedTerms(
         data=problem.data,
         inverse_sigma=inverse_sigma * problem.stride,
@@ -204,8 +204,8 @@ def freeze(
         position=problem.position,
         edges=edges,
         border=problem.border,
-        level_weight=problem.level_weight,
-        held_level=problem.held_level,
+        anchor_weight=anchors.weight,
+        anchored=anchors.value,
         whitening=whitening,
         slope_scale_x=scale_x,
         slope_scale_y=scale_y,

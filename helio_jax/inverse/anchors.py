@@ -1,0 +1,66 @@
+"""What is known of many heights together: levels of regions, a held mean height."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Sums of weights times heights that are known (levels of regions, a held mean height).
+
+    Attributes:
+        weight: over the standard deviation [anchor, y, x], 1/um.
+        value: of the sums, over their standard deviations [anchor].
+    """
+
+    weight: np.ndarray
+    value: np.ndarray
+
+    @classmethod
+    def none(cls, shape: tuple[int, ...]) -> "Anchors":
+        """Make those of a raster [y, x] without any."""
+        return cls(np.zeros((0, *shape)), np.zeros(0))
+
+    @classmethod
+    def of_levels(
+        cls, region: np.ndarray, levels: Mapping[int, tuple[float, float]], is_level: np.ndarray, margin: int
+    ) -> "Anchors":
+        """Anchor mean heights of regions above the largest one, number 0.
+
+        Args:
+            region: number of every pixel's region [y, x].
+            levels: height above region 0 and its standard deviation by number, um.
+            is_level: pixels that are at their region's level, no walls [y, x].
+            margin: pixels beside other regions that do not count for the level of region 0.
+        """
+        base = np.asarray((region == 0) & ~np.asarray(binary_dilation(region > 0, np.ones((3, 3)), iterations=margin)))
+        weight, value = [], []
+        for number, (height, std) in levels.items():
+            inside = (region == number) & is_level
+            if inside.any() and base.any():
+                weight.append((inside / inside.sum() - base / base.sum()) / std)
+                value.append(height / std)
+        none = cls.none(region.shape)
+        return cls(np.stack([*weight]), np.array(value)) if weight else none
+
+    def and_also(self, other: "Anchors") -> "Anchors":
+        """Join with others."""
+        return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))
+
+    def padded(self, block: int) -> "Anchors":
+        """Fill up with empty ones to a multiple of `block`: one compilation serves different numbers of them."""
+        n = -len(self.value) % block if len(self.value) else block
+        return Anchors(np.pad(self.weight, ((0, n), (0, 0), (0, 0))), np.pad(self.value, (0, n)))
+
+    def thinned(self, thin: tuple[slice, ...]) -> "Anchors":
+        """Keep some rows and columns; the others' shares of positive and negative weights go to those that are left."""
+        out = np.zeros_like(self.weight[:, *thin])
+        for sign in (-1.0, 1.0):
+            part = np.maximum(sign * self.weight, 0.0)
+            kept = part[:, *thin]
+            total, left = part.sum((1, 2)), kept.sum((1, 2))
+            out += (sign * np.where(left > 0, total / np.where(left > 0, left, 1.0), 0.0))[:, None, None] * kept
+        return Anchors(out, self.value)
