@@ -14,7 +14,8 @@ from helio_jax.commands.app import app
 from helio_jax.errors import SceneError
 from helio_jax.formats.hdf5 import write
 from helio_jax.inverse.mask_patches import find_patches, solve_levels
-from helio_jax.inverse.mask_steps import Steps, find_steps
+from helio_jax.inverse.mask_steps import find_steps
+from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.wall_signal import opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
