@@ -42,6 +42,8 @@ _LOW = 0.85, 1.2
 """Signal of the lower level beside a free wall, in that of the upper level."""
 _STEEP = 0.13
 """Largest slope of the lower level's signal beside a free wall, over the range of the data."""
+_LEAST_SCATTERED = -0.5
+"""Least multiple scattering beside a free wall, in the prediction; 0 within its error where walls absorb."""
 _PENUMBRA = 20.0
 """Least change of chi2 by which a resolved penumbra must fit better than an abrupt end."""
 _FAR_MISFIT = 5.0
@@ -357,7 +359,7 @@ def disturbance(band: Band) -> str:
     """
     top, low, scattered, *rest = band.levels
     if band.kind == "dark":
-        is_odd = not _LOW[0] < low / top < _LOW[1] or scattered < 0.0 or abs(rest[1]) > _STEEP
+        is_odd = not _LOW[0] < low / top < _LOW[1] or scattered < _LEAST_SCATTERED or abs(rest[1]) > _STEEP
         is_abrupt = band.abrupt < (_PENUMBRA if band.penumbra > 1.5 else 0.0)
     else:
         is_odd, is_abrupt = not 0.7 < low / top < 1.4, False

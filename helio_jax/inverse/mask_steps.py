@@ -188,10 +188,13 @@ def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -
         shift, place_std = place_edge(line, images, signals, v, scan.beam_shift, bands)
         line = replace(line, start=line.start + shift * line.normal, end=line.end + shift * line.normal)
         bands = _bands(line, scan, signals, v)
-    rows, used = [], []
+    rows, used, masks = [], [], []
     for k, band in bands.items():
         row = _row(number, names[k], band, line, v[k], place_std, images.side)
+        if band.kind == "lit" and row.note == "" and all(_differ(row, mask) for mask in masks):
+            row = replace(row, note="disagrees with the mask bands")
         if band.kind == "dark":
+            masks += [row] if row.note == "" and not row.is_lower_bound else []
             row = replace(row, p_wall=abruptness(line, images, k, v[k], band.factor * band.height))
         rows.append(row)
         if row.note == "" and not row.is_lower_bound:
@@ -199,6 +202,11 @@ def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -
     step = _combined(number, line, rows, used, place_std)
     rough = max((band.height for band in bands.values() if band.kind == "dark"), default=0.0)
     return _Measured(line, step, tuple(rows), step.height_um if step.is_used else rough)
+
+
+def _differ(a: BandRow, b: BandRow) -> bool:
+    """Return whether two heights differ by more than 4 standard deviations."""
+    return abs(a.height_um - b.height_um) > 4.0 * math.hypot(a.height_std_um, b.height_std_um)
 
 
 def _bands(line: Edge, scan: _Scan, signals: list[WallSignal], v: np.ndarray) -> dict[int, Band]:
