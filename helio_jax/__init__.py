@@ -99,8 +99,10 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   mask_steps          hx.find_steps: step heights from the mask bands of the micrographs
   mask_edges          masked pixels, and the upper edges at which mask bands begin
   wall_signal         signal across a vertical wall: mask, lit wall, multiple scattering
+  edge_place          where an upper edge lies between the pixels
   band_fit            length of the band beside an edge, and the height from it
   mask_patches        surface patches between steps, and their levels
+  step_records        records of steps, bands and patches
   residuals           residuals of the fit as a function of its unknowns
   problem             FitProblem: data, priors, all that is constant in a fit
   state               FitState and its corrections: all that changes

@@ -117,3 +117,21 @@ seed = {member["seed"]}
     )
     loaded = load_scene(scene)
     return pipeline.record(loaded, pipeline.simulate(loaded))
+
+
+def seen_level(member: dict[str, Any], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Compute the level that the beam sees at beam positions x, y [um]; NaN on walls."""
+    rows = OUTLINES[member["outline"]]
+    level = np.array([[{".": 0.0, "a": member["levels"][0], "b": member["levels"][1]}[c] for c in row] for row in rows])
+    cell, turn = member["width"] / max(level.shape), np.radians(member["turn"])
+    tan = np.tan(np.radians(member["incidence"]))
+    (x0, y0), shift = member["place"], 0.5 * max(member["height"], 0.0) * tan
+    out = np.full(np.shape(x), np.nan)
+    for z in sorted({0.0, *level.ravel().tolist()}):  # a higher level lies above what is behind it
+        u, v = x - z * tan - (x0 - shift), y - y0
+        column = np.floor((np.cos(turn) * u + np.sin(turn) * v) / cell + 0.5 * level.shape[1]).astype(int)
+        line = np.floor((np.cos(turn) * v - np.sin(turn) * u) / cell + 0.5 * level.shape[0]).astype(int)
+        inside = (column >= 0) & (column < level.shape[1]) & (line >= 0) & (line < level.shape[0])
+        here = level[np.clip(line, 0, level.shape[0] - 1), np.clip(column, 0, level.shape[1] - 1)]
+        out = np.where(np.where(inside, here, 0.0) == z, z, out)
+    return out

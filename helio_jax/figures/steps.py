@@ -6,7 +6,7 @@ import numpy as np
 
 from helio_jax.figures.canvas import COUNT_MAP, HEIGHT_MAP, Axes, Figure, draw_image, label_axes, line, new_figure
 from helio_jax.figures.plot_data import observed_counts, robust_range
-from helio_jax.inverse.mask_steps import BandRow, Step, Steps
+from helio_jax.inverse.step_records import BandRow, Step, Steps
 from helio_jax.micrograph import MicrographStack
 
 _INCH = 4.6

@@ -1,48 +1,33 @@
 """Length of the band beside an upper edge, and the wall's height from it, for one detector.
 
-Pixels beside an edge are data of their distance from it. First the edge's line is laid between lit and dark pixels of
-all detectors; then the height is fitted to each detector through `wall_signal`, with free signal levels. Heights
-follow from where signals change, not from how strong they are.
+Pixels beside an edge (`edge_place`) are data of their distance from it. The height is fitted to each detector through
+`wall_signal`, with free signal levels: heights follow from where signals change, not from how strong they are.
 """
 
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit, ndtr
+from scipy.special import ndtr
 
-from helio_jax.inverse.mask_edges import MIN_LENGTH, Edge
+from helio_jax.inverse.edge_place import MARGIN, MODEL_ERROR, Images, band_coordinates, pixel_gap
+from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.wall_signal import WallSignal
 
 _ABOVE = 2.6
 """Pixels of the upper side that are used, from the edge [pixels]."""
 _BEYOND = (0.25, 2.6)
 """Pixels beyond the far end that are used: fraction of the band, and pixels."""
-_MARGIN = (1.2, 0.2)
-"""Pixels left out at both ends of an edge: in pixels, and as a fraction of the distance from it."""
-_MODEL_ERROR = 0.015
-"""Error of the modelled signal, as a fraction of the signal of the level surface."""
 _BLUR = 0.15
 """Least standard deviation of the smoothing of sharp ends, which makes the model differentiable [pixels]."""
 _SHARP = 0.08
 """The same where the place of an edge is compared [pixels]."""
-_SOFT = 0.15
-"""Width of the transition between lit and dark pixels, with which an edge is laid [pixels]."""
-_CUT = 0.25
-"""Darkness up to which a pixel counts as lit, and from one minus which on as dark."""
 _SLANT = 0.35
 """Least cosine of the angle between an edge's normal and the direction of its band."""
-_RIGHT = 0.75
-"""Least fraction of pixels on the right side of an edge, near each of its points."""
 _SCATTER_STD = {"dark": 0.6, "lit": 0.6}
 """Prior standard deviation of multiple scattering, as a fraction of the prediction."""
 _BASE_STD = 0.04
 """Prior standard deviation of a constant on the lower level, where it is not the pedestal [signal of the level]."""
-_WIDTHS = np.array([0.1, 0.25, 0.4, 0.9, 1.3, 1.8, 2.5, 3.5])
-_ABRUPT = 0.6
-"""Widths of a fall that are compared, and the one above which it is gradual [pixels]."""
-_FUZZ = 0.15
-"""Error of the signal within the pixel at a sharp edge, in that of the level surface."""
 _SLOPE_STD = 0.1
 """Prior standard deviation of a slope of the lower level's signal, over the range of the data."""
 _OUTLIER = 3.0
@@ -57,6 +42,8 @@ _LOW = 0.85, 1.2
 """Signal of the lower level beside a free wall, in that of the upper level."""
 _STEEP = 0.13
 """Largest slope of the lower level's signal beside a free wall, over the range of the data."""
+_LEAST_SCATTERED = -0.5
+"""Least multiple scattering beside a free wall, in the prediction; 0 within its error where walls absorb."""
 _PENUMBRA = 20.0
 """Least change of chi2 by which a resolved penumbra must fit better than an abrupt end."""
 _FAR_MISFIT = 5.0
@@ -65,28 +52,6 @@ _LEAST_HEIGHT = 0.1
 """Least height that is looked for, in pixels of the band."""
 _SEARCH = 1.06, 1.01
 """Ratios of neighbouring heights of the first and the second search."""
-
-
-@dataclass(frozen=True)
-class Images:
-    """Data of a stack.
-
-    Attributes:
-        signal, variance: [detector, y, x]; NaN where not observed.
-        place: beam positions [y, x, 2], um.
-        lit, floor, floor_std: signals of `SignalLevels` [detector].
-        side: of a pixel [um].
-        spot: standard deviation of the beam's spot [um].
-    """
-
-    signal: np.ndarray
-    variance: np.ndarray
-    place: np.ndarray
-    lit: np.ndarray
-    floor: np.ndarray
-    floor_std: np.ndarray
-    side: float
-    spot: float
 
 
 @dataclass(frozen=True)
@@ -132,119 +97,6 @@ def kind_of(signal: WallSignal) -> str:
     return ""
 
 
-def band_coordinates(edge: Edge, images: Images, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute distance from the edge, and place along it of the point from which `drift` leads to a pixel [y, x]."""
-    rel = images.place - edge.middle
-    u, w = rel @ edge.normal, rel @ edge.along
-    return u, w - np.maximum(u, 0.0) * (drift @ edge.along) / (drift @ edge.normal)
-
-
-def lay_edge(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tuple[Edge, float] | None:
-    """Lay an edge between lit and dark pixels; return it with the gap between these along the normal [um].
-
-    Logistic regression of the darkness by the distance from a line: convex, and between separable pixels the line of
-    largest margin. Repeated, because pixels and signal levels are taken by their distance from the line.
-
-    Args:
-        edge: as found.
-        images: data.
-        dark: numbers of the detectors whose bands begin at the edge.
-        v: direction of each detector plus beam shift [detector, 2].
-    """
-    gap = images.side
-    for i in range(8):
-        if (laid := _lay_once(edge, images, dark, v)) is None:
-            return None
-        moved = float(np.abs((laid[0].middle - edge.middle) @ edge.normal))
-        edge, gap = laid
-        if moved < 0.02 * images.side and i > 1:
-            break
-        if i in (1, 4):
-            if (short := _trimmed(edge, images, dark, v)) is None:
-                return None
-            edge = short
-    return edge, gap
-
-
-def _trimmed(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> Edge | None:
-    """Cut an edge to its longest run, where lit pixels lie above dark ones."""
-    side = images.side
-    n = int(np.ceil(edge.length / side)) + 6
-    good, seen = np.zeros(n), np.zeros(n)
-    for k in dark:
-        u, w = band_coordinates(edge, images, v[k])
-        data = (images.signal[k] - images.floor[k]) / (images.lit[k] - images.floor[k])
-        near = (np.abs(u) > 0.3 * side) & (np.abs(u) < 1.2 * side) & np.isfinite(data)
-        top, low = near & (u < 0) & (np.abs(w) < 0.4 * edge.length), near & (u > 0) & (np.abs(w) < 0.4 * edge.length)
-        if top.sum() < 2 or low.sum() < 2:
-            continue
-        middle = 0.5 * (np.median(data[top]) + np.quantile(data[low], 0.3))
-        is_right = np.where(u < 0, data > middle, data < middle)
-        bins = np.floor(w / side + 0.5 * n).astype(int)
-        use = near & (bins >= 0) & (bins < n)
-        good += np.bincount(bins[use], is_right[use], n)
-        seen += np.bincount(bins[use], minlength=n)
-    share = np.convolve(good, np.ones(3), "same") / np.maximum(np.convolve(seen, np.ones(3), "same"), 1)
-    is_good = np.concatenate([[False], share > _RIGHT, [False]])
-    ends = np.flatnonzero(np.diff(is_good.astype(int)))
-    if not ends.size:
-        return None
-    first, last = max(zip(ends[::2], ends[1::2], strict=True), key=lambda run: run[1] - run[0])
-    if last - first < MIN_LENGTH:
-        return None
-    a, b = (np.array([first + 0.7, last - 0.7]) - 0.5 * n) * side
-    return replace(edge, start=edge.middle + a * edge.along, end=edge.middle + b * edge.along)
-
-
-def _lay_once(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tuple[Edge, float] | None:
-    side = images.side
-    us, ws, fs = [], [], []
-    for k in dark:
-        u, w = band_coordinates(edge, images, v[k])
-        data = (images.signal[k] - images.floor[k]) / (images.lit[k] - images.floor[k])
-        near = (np.abs(w) <= 0.5 * edge.length - 0.5 * side) & (np.abs(u) < 2.0 * side) & np.isfinite(data)
-        top, low = near & (u < -0.8 * side), near & (u > 0.4 * side) & (u < 1.4 * side)
-        if top.sum() < 2 or low.sum() < 2:
-            continue
-        lit, shade = np.median(data[top]), np.quantile(data[low], 0.3)
-        if lit - shade < 0.2:
-            continue
-        # a narrow band ends within the range: lit pixels beyond are not the upper level's
-        use = near & (u < 0.9 * side)
-        us.append(u[use])
-        ws.append(w[use])
-        # noise and unequal levels on either side are cut off: they would pull at the line
-        fs.append(np.clip(((lit - data[use]) / (lit - shade) - _CUT) / (1.0 - 2.0 * _CUT), 0.0, 1.0))
-    if not us:
-        return None
-    u, w, f = map(np.concatenate, (us, ws, fs))
-    design = np.stack([np.ones_like(w), w / max(0.5 * edge.length, side)], 1)
-    place = np.zeros(2)
-    for soft in (0.6, 0.3, _SOFT):
-        for _ in range(30):
-            p = expit((u - design @ place) / (soft * side))
-            slope = design.T @ (p - f) / (soft * side) * -1.0 + place * [0.0, 0.02] / side**2
-            curve = (design * (p * (1 - p))[:, None]).T @ design / (soft * side) ** 2 + np.diag([1e-6, 0.02]) / side**2
-            step = np.linalg.solve(curve + 1e-4 * np.trace(curve) * np.eye(2), slope)
-            size = np.abs(step).max()
-            place = place - step * min(1.0, 0.3 * side / max(size, 1e-12))
-            if size < 1e-3 * side:
-                break
-    shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / max(0.5 * edge.length, side)
-    laid = replace(edge, start=edge.start + shift[0] * edge.normal, end=edge.end + shift[1] * edge.normal)
-    away = u - design @ place
-    gap = _gap(away, 0.0, side)
-    return laid, gap
-
-
-def _gap(u: np.ndarray, at: float, side: float) -> float:
-    """Return the distance of the pixels next to a place on either side [um]: a sharp end within it looks the same."""
-    above, below = u[u >= at], u[u < at]
-    if not above.size or not below.size:
-        return side
-    return float(min(above.min() - below.max(), 2.0 * side))
-
-
 @dataclass
 class _Pixels:
     """Pixels of one detector beside an edge, in units of the signal of the level surface; distances u [um]."""
@@ -261,7 +113,7 @@ def _select(edge: Edge, images: Images, k: int, signal: WallSignal, drift: np.nd
     """Take the pixels of a detector that belong to an edge, up to the distance `far` [um]."""
     u, w = band_coordinates(edge, images, drift)
     side = images.side
-    room = 0.5 * edge.length - _MARGIN[0] * side - _MARGIN[1] * np.maximum(u, 0.0)
+    room = 0.5 * edge.length - MARGIN[0] * side - MARGIN[1] * np.maximum(u, 0.0)
     data, variance = images.signal[k], images.variance[k]
     use = (u > -_ABOVE * side) & (u < far) & (np.abs(w) <= room) & np.isfinite(data) & (variance > 0)
     if use.sum() < 8:
@@ -310,7 +162,7 @@ def _residuals(
     error = np.zeros(u.shape)
     for end in {0.0, s.strip * height}:
         error += ndtr(-np.abs(u - end) / blur) - ndtr(-np.abs(u - end) / spot)
-    sigma = np.sqrt(pixels.variance + _MODEL_ERROR**2 + error**2)
+    sigma = np.sqrt(pixels.variance + MODEL_ERROR**2 + error**2)
     more = (pixels.base_std, _SLOPE_STD) if kind == "dark" else (_SLOPE_STD, 2.0, 1.0)
     std = np.array([0.3, 0.3, _SCATTER_STD[kind], *more])
     a = np.concatenate([(columns / sigma).T, np.diag(1.0 / std)])
@@ -373,7 +225,7 @@ def fit_band(
     is_far = np.abs(pixels.u - end) < max(0.3 * end, 1.2 * side)
     spread = signal.q[-1] - max(signal.q[0], signal.shift, 0.0) if kind == "dark" else 0.0
     soft = np.hypot(0.3 * spread * height, images.spot)
-    end_std = _gap(pixels.u, end, side) / np.sqrt(12.0) * np.exp(-0.5 * (2.0 * np.pi * soft / side) ** 2)
+    end_std = pixel_gap(pixels.u, end, side) / np.sqrt(12.0) * np.exp(-0.5 * (2.0 * np.pi * soft / side) ** 2)
     birge = max(1.0, float(own @ own) / max(len(own) - 4, 1))
     return Band(
         kind=kind,
@@ -499,41 +351,6 @@ def _first_height(edge: Edge, images: Images, k: int, signal: WallSignal, drift:
     return max(length, _LEAST_HEIGHT * side) / max(signal.length, 0.1)
 
 
-def abruptness(edge: Edge, images: Images, k: int, v: np.ndarray, band: float) -> float:
-    """Return the probability that a signal falls abruptly at an edge, rather than over a pixel or more.
-
-    Likelihoods of an error function of any width below and above `_ABRUPT`, at the best widths.
-
-    Args:
-        edge: from `lay_edge`.
-        images: data.
-        k: number of the detector.
-        v: its direction plus the beam shift [2].
-        band: length of its band along the normal [um].
-    """
-    side = images.side
-    u, w = band_coordinates(edge, images, v)
-    lit = images.lit[k] - images.floor[k]
-    use = (np.abs(w) <= 0.5 * edge.length - _MARGIN[0] * side) & np.isfinite(images.signal[k])
-    use &= (u > -4.0 * side) & (u < min(2.5 * side, max(0.6 * band, side)))
-    data, variance = images.signal[k][use] / lit, images.variance[k][use] / lit**2 + _MODEL_ERROR**2
-    cost = []
-    for width in _WIDTHS * side:
-        best = np.inf
-        for shift in np.linspace(-0.5, 0.5, 5) * max(width, 0.3 * side):
-            shape = ndtr((u[use] - shift) / np.hypot(width, images.spot))
-            # half a pixel of freedom for where a sharp edge lies between the pixels
-            error = variance + (_FUZZ * np.exp(-0.5 * (u[use] / (0.35 * side)) ** 2)) ** 2
-            columns = np.stack([np.ones_like(shape), shape, shape * np.maximum(u[use], 0.0) / side], 1)
-            a = columns / np.sqrt(error)[:, None]
-            rest = data / np.sqrt(error) - a @ np.linalg.lstsq(a, data / np.sqrt(error), rcond=None)[0]
-            best = min(best, float(rest @ rest))
-        cost.append(best)
-    sharp, wide = min(np.array(cost)[_WIDTHS < _ABRUPT]), min(np.array(cost)[_WIDTHS >= _ABRUPT])
-    birge = max(1.0, min(sharp, wide) / max(use.sum() - 4, 1))
-    return float(expit(0.5 * (wide - sharp) / birge))
-
-
 def disturbance(band: Band) -> str:
     """Return how a band ends or is filled otherwise than beside a free wall: "interrupted", "no free wall", or "".
 
@@ -542,7 +359,7 @@ def disturbance(band: Band) -> str:
     """
     top, low, scattered, *rest = band.levels
     if band.kind == "dark":
-        is_odd = not _LOW[0] < low / top < _LOW[1] or scattered < 0.0 or abs(rest[1]) > _STEEP
+        is_odd = not _LOW[0] < low / top < _LOW[1] or scattered < _LEAST_SCATTERED or abs(rest[1]) > _STEEP
         is_abrupt = band.abrupt < (_PENUMBRA if band.penumbra > 1.5 else 0.0)
     else:
         is_odd, is_abrupt = not 0.7 < low / top < 1.4, False

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, label
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
@@ -21,8 +19,10 @@ MIN_LENGTH = 4.0
 """Shortest edge [pixels]."""
 _NEAR = 1.7
 """Largest distance of neighbouring points of an edge [pixels]."""
-_COS_TURN = np.cos(np.radians(30.0))
-"""Cosine of the largest angle between the normals of neighbouring points."""
+_SMOOTH = 2.0
+"""Distance over which normals are averaged [pixels]."""
+_COS_TURN = np.cos(np.radians(22.5))
+"""Cosine of the largest angle between a point's normal and the mean of its edge."""
 _STRAIGHT = 0.6
 """Largest distance of the points of an edge from its line [pixels]."""
 _ACROSS = 0.25
@@ -184,21 +184,43 @@ def straight_edges(points: np.ndarray, normals: np.ndarray, detector: np.ndarray
     """
     if len(points) < 2:
         return []
-    pairs = KDTree(points).query_pairs(_NEAR * side, output_type="ndarray")
-    pairs = pairs[np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], 1) >= _COS_TURN]
-    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    group = connected_components(links, directed=False)[1]
     edges = []
-    for number in range(group.max() + 1):
-        inside = np.flatnonzero(group == number)
-        for piece in _split(points, normals, inside, side):
+    for inside in _grown(points, normals, side):
+        for piece in _split(points, inside, side):
             edge = _edge(points[piece], normals[piece], detector[piece])
             if edge is not None and edge.length >= (MIN_LENGTH - 1.0) * side:
                 edges.append(edge)
     return edges
 
 
-def _split(points: np.ndarray, normals: np.ndarray, inside: np.ndarray, side: float) -> list[np.ndarray]:
+def _grown(points: np.ndarray, normals: np.ndarray, side: float) -> list[np.ndarray]:
+    """Grow chains of neighbouring points whose normals have nearly one direction [indices of the points of each].
+
+    Normals are averaged over neighbours first; the mean direction of a chain is updated after every ring of neighbours.
+    Source: von Gioi et al., IEEE PAMI 32 (2010) 722.
+    """
+    tree = KDTree(points)
+    normals = np.stack([np.mean(normals[near], 0) for near in tree.query_ball_point(points, _SMOOTH * side)])
+    normals /= np.maximum(np.hypot(normals[:, 0], normals[:, 1]), 1e-12)[:, None]
+    neighbours = [np.array(near) for near in tree.query_ball_point(points, _NEAR * side)]
+    is_free, chains = np.ones(len(points), bool), []
+    for seed in range(len(points)):
+        if not is_free[seed]:
+            continue
+        chain = ring = np.array([seed])
+        is_free[seed] = False
+        while ring.size:
+            mean = normals[chain].sum(0)
+            mean /= max(float(np.hypot(mean[0], mean[1])), 1e-12)
+            near = np.unique(np.concatenate([neighbours[i] for i in ring]))
+            ring = near[is_free[near] & (normals[near] @ mean >= _COS_TURN)]
+            is_free[ring] = False
+            chain = np.concatenate([chain, ring])
+        chains.append(chain)
+    return chains
+
+
+def _split(points: np.ndarray, inside: np.ndarray, side: float) -> list[np.ndarray]:
     """Split a chain of points until every part lies along a line [indices of the points of each part]."""
     if len(inside) < 3:
         return [inside]
@@ -219,7 +241,7 @@ def _split(points: np.ndarray, normals: np.ndarray, inside: np.ndarray, side: fl
     if not 2 < corner < len(order) - 3:
         return [inside]
     parts = inside[order[:corner]], inside[order[corner:]]
-    return [p for part in parts for p in _split(points, normals, part, side)]
+    return [p for part in parts for p in _split(points, part, side)]
 
 
 def _edge(points: np.ndarray, normals: np.ndarray, detector: np.ndarray) -> Edge | None:

@@ -10,7 +10,8 @@ from typing import Any
 from helio_jax.errors import SceneError
 from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.steps import step_panel
-from helio_jax.inverse.mask_steps import BandRow, Patch, Step, Steps, find_steps
+from helio_jax.inverse.mask_steps import find_steps
+from helio_jax.inverse.step_records import BandRow, Patch, Step, Steps
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.measure import Wanted
 
