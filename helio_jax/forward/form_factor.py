@@ -7,12 +7,12 @@ Rushmeier, Winget, SIGGRAPH 1989 (Lambert's formula).
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.forward.compiling import is_zero
 from helio_jax.forward.optics import Optics
 
 N_RIM = 32
@@ -54,16 +54,12 @@ def form_factor_at(optics: Optics, height: jax.Array) -> jax.Array:
 def _form_factor_jvp(primals, tangents):
     (optics, height), (d_optics, d_height) = primals, tangents
     value, slope = jax.jvp(lambda h: _contour_integral(optics, h), (height,), (jnp.ones_like(height),))
-    change = jnp.zeros_like(value) if _is_zero(d_height) else slope * d_height
-    leaves = jax.tree.leaves(d_optics, is_leaf=_is_zero)
-    if not all(map(_is_zero, leaves)):
-        d_optics = jax.tree.map(lambda o, d: jnp.zeros_like(o) if _is_zero(d) else d, optics, d_optics)
+    change = jnp.zeros_like(value) if is_zero(d_height) else slope * d_height
+    leaves = jax.tree.leaves(d_optics, is_leaf=is_zero)
+    if not all(map(is_zero, leaves)):
+        d_optics = jax.tree.map(lambda o, d: jnp.zeros_like(o) if is_zero(d) else d, optics, d_optics)
         change = change + jax.jvp(lambda o: _contour_integral(o, height), (optics,), (d_optics,))[1]
     return value, change
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
 
 
 _jitted = jax.jit(form_factor_at)

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import WALL_PITCHES
 from helio_jax.kernel import kernel
@@ -24,15 +24,23 @@ TINY = 1e-12
 BETWEEN, ACROSS, BESIDE, BEFORE = range(4)
 """Where the horizon stands: at the crossing; at a wall half-way between its two pixels, or half a step before both; at
 the crossing before."""
+_THREADED = 100_000
+"""Fewer points, of all slices together, are searched without threads, whose start takes as long."""
+_RING = 1.5
+"""Ratio of the distances between which the steepest possible slope is taken of the highest surface there."""
+_LEAST_DISTANCE = 1e-9
+"""Of a wall that may stand at the point itself [um]."""
+_PARTS = 4
+"""Parts per thread, so that threads end at about the same time."""
 
 
 class March(NamedTuple):
-    """Where the ray of one azimuth crosses the grid lines of the raster, by growing distance.
+    """Where the ray of one azimuth crosses the grid lines of the raster, by growing distance, as far as it is inside.
 
     `line` [step] is 2 n + axis of the n-th row (axis 0) or column (axis 1) that the ray meets. `first` and `second`
     [step, 2] are the raster positions (row, column), relative to the point, between which the height is interpolated.
-    `share` [step, 2] is that of the second one, as it is and rounded. `distance` [step, 4, um], infinite off the
-    raster, is for each of the places `BETWEEN` to `BEFORE`.
+    `share` [step, 2] is that of the second one, as it is and rounded. `distance` [step, 4, um] is for each of the
+    places `BETWEEN` to `BEFORE`.
     """
 
     line: np.ndarray
@@ -49,49 +57,56 @@ def steps_per_um(direction: Any, dx: Any, dy: Any) -> tuple[Any, Any]:
     return tuple(xp.where(abs(s) < TINY, TINY, s) for s in (rows, columns))
 
 
-def plan_march(direction: np.ndarray, shape: tuple[int, int], dx: float, dy: float) -> March:
+@kernel
+def _plan_march(x, y, ny, nx, dx, dy):
     """Compute the crossings of a ray with all grid lines, where the surface is linear between two pixels.
 
-    True of a triangulated and of a bilinear surface; what they do between the lines is where they differ.
-
-    Args:
-        direction: azimuth (x, y), unit.
-        shape: of the raster (y, x).
-        dx, dy: its pitch, um.
+    True of a triangulated and of a bilinear surface; what they do between the lines is where they differ. Arguments:
+    azimuth (x, y), unit; shape of the raster; its pitch, um.
     """
-    step = np.array(steps_per_um(direction, dx, dy))
-    parts = []
-    for axis in (0, 1):
-        number = np.arange(1, shape[axis])
-        distance = number / np.abs(step[axis])
-        across = distance * step[1 - axis]
+    per_um = y / dy, x / dx  # as `steps_per_um`
+    step = np.array([TINY if abs(v) < TINY else v for v in per_um])
+    shape, number, n = (ny, nx), np.array([1, 1]), ny + nx - 2
+    line, first, second = np.empty(n, np.int32), np.empty((n, 2), np.int32), np.empty((n, 2), np.int32)
+    share, distance = np.empty((n, 2)), np.empty((n, 4))
+    ahead = np.empty(2)
+    before = 0.0
+    for s in range(n):
+        for axis in range(2):
+            at = number[axis] / abs(step[axis])
+            is_inside = number[axis] < shape[axis] and abs(at * step[1 - axis]) <= shape[1 - axis] - 1
+            ahead[axis] = at if is_inside else np.inf
+        axis = 0 if ahead[0] <= ahead[1] else 1
+        at, own, other = ahead[axis], abs(step[axis]), abs(step[1 - axis])
+        if at == np.inf:
+            return line[:s], first[:s], second[:s], share[:s], distance[:s]
+        across = at * step[1 - axis]
         low = np.floor(across)
-        is_inside = np.abs(across) <= shape[1 - axis] - 1
-        first = np.stack([distance * step[axis], low], -1)[:, :: 1 - 2 * axis]
-        first = np.where(is_inside[:, None], np.rint(first), 0.0).astype(np.int32)
-        second = first + np.array([axis, 1 - axis], np.int32)
-        distance = np.where(is_inside, distance, np.inf)
-        share = np.stack([across - low, np.rint(across - low)], -1)
-        wall = distance - np.abs(share[:, 0] - 0.5) / np.abs(step[1 - axis]), distance - 0.5 / np.abs(step[axis])
-        parts.append((2 * number + axis, first, second, share, np.stack([distance, *wall, distance], -1)))
-    line, first, second, share, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.argsort(distance[:, BETWEEN])
-    distance = distance[order]
-    distance[:, BEFORE] = np.concatenate([[0.0], distance[:-1, BETWEEN]])
-    return March(line[order], first[order], second[order], share[order], distance)
+        line[s] = 2 * number[axis] + axis
+        first[s, axis], first[s, 1 - axis] = np.rint(at * step[axis]), low
+        second[s, axis], second[s, 1 - axis] = first[s, axis], first[s, 1 - axis] + 1
+        share[s, 0], share[s, 1] = across - low, np.rint(across - low)
+        distance[s, BETWEEN], distance[s, BEFORE] = at, before
+        distance[s, ACROSS] = at - abs(share[s, 0] - 0.5) / other
+        distance[s, BESIDE] = at - 0.5 / own
+        before = at
+        number[axis] += 1
+    return line, first, second, share, distance
 
 
 @kernel
-def _search(height, top, plate, far, rise, tail, line, first, second, share, distance, tall, beyond, found):
+def _search(height, top, steepest, plate, far, rise, tail, line, first, second, share, distance, tall, beyond, found):
     """Write the code of the crossing that each point sees steepest: 8 line + 2 place + (1 if rounded), 0: none."""
     ny, nx = height.shape
     for i in range(ny):
         for j in range(nx):
             here = before = height[i, j]
             best, sight = -np.inf, (plate - here) / far + rise - tail
+            if steepest[i, j] <= sight:
+                continue
             for s in range(distance.shape[0]):
                 ahead, least = distance[s, BETWEEN], max(best, sight)
-                if ahead == np.inf or (s > 0 and least > 0.0 and top[i, j] - here < least * (ahead - beyond)):
+                if s > 0 and least > 0.0 and top[i, j] - here < least * (ahead - beyond):
                     break
                 i1, j1, i2, j2 = i + first[s, 0], j + first[s, 1], i + second[s, 0], j + second[s, 1]
                 is_first_in, is_second_in = 0 <= i1 < ny and 0 <= j1 < nx, 0 <= i2 < ny and 0 <= j2 < nx
@@ -114,30 +129,74 @@ def _search(height, top, plate, far, rise, tail, line, first, second, share, dis
                 before = there
 
 
-def find_horizons(height: np.ndarray, slices: np.ndarray, tail: float, dx: float, dy: float) -> np.ndarray:
-    """Choose the crossing that each point sees steepest, for `masking` [slice, y, x].
+@kernel
+def _search_slices(height, top, steepest, slices, tail, pitch, tall, beyond, found, start, stop):
+    """Search the slices `start` to `stop` of all images, counted through: arrays as in `find_horizons`."""
+    n_slices, (ny, nx) = slices.shape[1], height.shape[1:]
+    for number in range(start, stop):
+        i, s = number // n_slices, number % n_slices
+        x, y, plate, far, rise = slices[i, s]
+        march = _plan_march(x, y, ny, nx, pitch[i, 1], pitch[i, 0])
+        _search(height[i], top[i], steepest[i], plate, far, rise, tail, *march, tall[i], beyond[i], found[i, s])
+
+
+def find_horizons(height: np.ndarray, slices: np.ndarray, tail: float, pitch: np.ndarray) -> np.ndarray:
+    """Choose the crossing that each point sees steepest, for `masking` [image, slice, y, x].
 
     What is seen below the aperture masks nothing: a crossing there may be any.
 
     Args:
-        height: heights [y, x], um.
+        height: heights [image, y, x], um.
         slices: of every slice: azimuth (x, y); height of the plate's plane above the point's own azimuthal centre, um;
-            how far the aperture reaches, um; slope of the plane along the slice [slice, 5].
+            how far the aperture reaches, um; slope of the plane along the slice [image, slice, 5].
         tail: how much below the aperture's far end a crossing still counts, in slope of sight.
-        dx, dy: raster pitch, um.
+        pitch: dy, dx of the rasters [image, 2], um.
     """
-    found = np.zeros((len(slices), *height.shape), np.int32)
-    tall, beyond = WALL_PITCHES * max(dx, dy), math.hypot(dx, dy)
+    n_images, n_slices = slices.shape[:2]
+    found = np.zeros((n_images, n_slices, *height.shape[1:]), np.int32)
+    tall, beyond = WALL_PITCHES * pitch.max(1), np.hypot(*pitch.T)
+    bounds = [_bound_horizons(*image, tail) for image in zip(height, slices, pitch, strict=True)]
+    top, steepest = (np.stack(bound) for bound in zip(*bounds, strict=True))
+
+    def search(start: int, stop: int) -> None:
+        _search_slices(height, top, steepest, slices, tail, pitch, tall, beyond, found, start, stop)
+
+    n, n_threads = n_images * n_slices, os.cpu_count() or 1
+    if found.size < _THREADED or n_threads == 1:
+        search(0, n)
+        return found
+    ends = np.linspace(0, n, min(n, _PARTS * n_threads) + 1).astype(int)
+    with ThreadPoolExecutor(n_threads) as pool:
+        list(pool.map(search, ends[:-1], ends[1:]))
+    return found
+
+
+def _bound_horizons(
+    height: np.ndarray, slices: np.ndarray, pitch: np.ndarray, tail: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bound what a point can see, so that a search may end: two fields [y, x].
+
+    Returns:
+        Highest surface within the distance from which anything can mask a point, um, and the largest possible slope up
+        to it: of the highest surface within each ring of distances, at the inner edge of the ring. Walls may stand up
+        to a cell's diagonal nearer than the crossing behind them.
+    """
+    if not np.isfinite(height).all():
+        unbounded = np.full(height.shape, np.inf)
+        return unbounded, unbounded
     plate, far, rise = slices[:, 2:].T
     sight = float(((plate - height.max()) / far + rise).min()) - tail
-    reach = np.ptp(height) / max(sight, 1e-9) + beyond
-    rows, columns = (int(min(math.ceil(reach / d), n)) for d, n in zip((dy, dx), height.shape, strict=True))
-    top = maximum_filter(height, [2 * rows + 1, 2 * columns + 1])
-
-    def search(s: int) -> None:
-        march = plan_march(slices[s, :2], height.shape, dx, dy)
-        _search(height, top, plate[s], far[s], rise[s], tail, *march, tall, beyond, found[s])
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(search, range(len(slices))))
-    return found
+    diagonal, tall = math.hypot(*pitch), WALL_PITCHES * max(pitch)
+    reach = min(np.ptp(height) / max(sight, 1e-9) + diagonal, math.hypot(*(pitch * height.shape)))
+    inner, steepest = min(pitch), np.zeros(height.shape)
+    while True:
+        outer = inner * _RING
+        size = [2 * int(min(math.ceil(outer / d), n)) + 1 for d, n in zip(pitch, height.shape, strict=True)]
+        top = maximum_filter(height, size)
+        has_walls = top - minimum_filter(height, size) > tall
+        nearest = np.where(has_walls, inner - diagonal, inner)
+        slope = (top - height) / np.maximum(nearest, _LEAST_DISTANCE)
+        steepest = np.maximum(steepest, slope)
+        if outer >= reach:
+            return top, steepest * (1.0 + 1e-9)
+        inner = outer

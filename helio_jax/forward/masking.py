@@ -11,12 +11,14 @@ differentiation; the smooth parts are derived, so that the derivative is exact a
 Source: own derivation, tests/physics/test_visibility.py.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.errors import SceneError
 from helio_jax.forward.horizon import ACROSS, BEFORE, BESIDE, OUTSIDE, find_horizons, steps_per_um
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.surface import Surface
@@ -90,7 +92,13 @@ def slice_apertures(optics: Optics, n_slices: int) -> Slices:
 
 
 def masked_form_factor(
-    surface: Surface, optics: Optics, raster: Raster, *, n_slices: int = N_SLICES, width: float = 0.0
+    surface: Surface,
+    optics: Optics,
+    raster: Raster,
+    *,
+    n_slices: int = N_SLICES,
+    width: float = 0.0,
+    horizons: jax.Array | None = None,
 ) -> jax.Array:
     """Compute the part of each aperture's vector form factor that lies below a point's horizon [detector, 3, y, x].
 
@@ -104,12 +112,14 @@ def masked_form_factor(
         raster: beam positions.
         n_slices: azimuth slices per aperture, static.
         width: smoothing of the mask's edge in slope of sight, static; 0 is exact.
+        horizons: from `choose_horizons` with the same arguments; default: chosen.
     """
     height, slope_x, slope_y = (jnp.asarray(f) for f in (surface.height, surface.slope_x, surface.slope_y))
     dtype, shape = height.dtype, height.shape
     optics, (dx, dy) = cast(optics, dtype), (jnp.asarray(d, dtype) for d in (raster.dx, raster.dy))
     slices = slice_apertures(optics, n_slices)
-    chosen = _choose(height, slices, dx, dy, _TAIL * width)
+    if horizons is None:
+        horizons = choose_horizons(surface, optics, raster, n_slices, width)
     padded = jnp.pad(height, [(n, n) for n in shape], mode="edge")
     shift = optics.beam_shift
 
@@ -120,30 +130,43 @@ def masked_form_factor(
         return _masked_in_slice(horizon, piece.plate - height, piece, shift, width)
 
     def add_slice(total, item):
-        return total + of_slice(*item), None
+        return jax.tree.map(jnp.add, total, of_slice(*item)), None
 
     def of_aperture(items):
-        return jax.lax.scan(add_slice, jnp.zeros((3, *shape), dtype), items)[0]
+        return jax.lax.scan(add_slice, (jnp.zeros(shape, dtype),) * 3, items)[0]
 
-    return jax.lax.map(of_aperture, (slices, chosen))
+    return jnp.stack(jax.lax.map(of_aperture, (slices, horizons)), 1)
 
 
-def _choose(height: jax.Array, slices: Slices, dx: Any, dy: Any, tail: float) -> jax.Array:
-    """Choose the horizons of all slices on the host [detector, slice, y, x], constant under differentiation."""
+def choose_horizons(
+    surface: Surface, optics: Optics, raster: Raster, n_slices: int = N_SLICES, width: float = 0.0
+) -> jax.Array:
+    """Choose the horizons of all slices on the host [detector, slice, y, x], constant under differentiation.
+
+    Arguments as those of `masked_form_factor`. A batch of surfaces or optics is searched in one call.
+
+    Raises:
+        SceneError: fewer than 2 x 2 beam positions, whose pitch is not known.
+    """
+    height = jnp.asarray(surface.height)
+    if min(height.shape) < 2:
+        raise SceneError(
+            f"masks need at least 2 x 2 beam positions, got {' x '.join(map(str, height.shape))}: enlarge the "
+            "raster, or render with corrections = 'none'"
+        )
+    slices, tail = slice_apertures(cast(optics, height.dtype), n_slices), _TAIL * width
+    dx, dy = (jnp.asarray(d, height.dtype) for d in (raster.dx, raster.dy))
     columns = [slices.direction[..., 0], slices.direction[..., 1], slices.plate, slices.far, slices.rise]
-    table, steps = jnp.stack(columns, -1), jnp.stack([dx, dy])
+    table, pitch = jnp.stack(columns, -1), jnp.stack([dy, dx])
     shape = (*slices.far.shape, *height.shape)
 
     def choose(*batch: Any) -> np.ndarray:
         heights, tables, pitches = (_from_bits(a) for a in batch)
-        lead = heights.shape[:-2]
-        out = np.empty((*lead, *shape), np.int32)
-        for i in np.ndindex(lead):
-            pieces = tables[i].reshape(-1, tables.shape[-1])
-            out[i] = find_horizons(heights[i], pieces, tail, *map(float, pitches[i])).reshape(shape)
-        return out
+        lead, n = heights.shape[:-2], math.prod(heights.shape[:-2])
+        images, pieces = heights.reshape(n, *heights.shape[-2:]), tables.reshape(n, -1, tables.shape[-1])
+        return find_horizons(images, pieces, tail, pitches.reshape(n, 2)).reshape(*lead, *shape)
 
-    operands = (_as_bits(jax.lax.stop_gradient(a)) for a in (height, table, steps))
+    operands = (_as_bits(jax.lax.stop_gradient(a)) for a in (height, table, pitch))
     return jax.pure_callback(choose, jax.ShapeDtypeStruct(shape, jnp.int32), *operands, vmap_method="broadcast_all")
 
 
@@ -183,8 +206,11 @@ def _slope_up(padded: jax.Array, height: jax.Array, direction: Any, dx: Any, dy:
     return jnp.where(found == 0, OUTSIDE, (there - height) / at)
 
 
-def _masked_in_slice(horizon, depth, piece: Slices, shift: jax.Array, width: float) -> jax.Array:
-    """Compute the vector form factor of the slice's part below the horizon slope [3, y, x]."""
+def _masked_in_slice(horizon, depth, piece: Slices, shift: jax.Array, width: float) -> tuple[jax.Array, ...]:
+    """Compute the vector form factor of the slice's part below the horizon slope, three components [y, x].
+
+    Stacked, they would be evaluated three times over: XLA does not share terms between parts of an array.
+    """
     low, high = (depth / edge + piece.rise for edge in (piece.far, piece.near))
     if width:
         above_low, above_high = (width * jax.nn.softplus((horizon - edge) / width) for edge in (low, high))
@@ -194,8 +220,8 @@ def _masked_in_slice(horizon, depth, piece: Slices, shift: jax.Array, width: flo
     toward = piece.direction[0] * shift[0] + piece.direction[1] * shift[1]
     across2 = 1.0 + shift[0] ** 2 + shift[1] ** 2 - toward**2
     up, out = (b - a for a, b in zip(*(_primitives(1.0 / s, toward, across2) for s in (cut, low)), strict=True))
-    part = [piece.direction[0] * out - shift[0] * up, piece.direction[1] * out - shift[1] * up, up]
-    return jnp.where(cut > low, jnp.stack(part) * (piece.weight / np.pi), 0.0)
+    parts = piece.direction[0] * out - shift[0] * up, piece.direction[1] * out - shift[1] * up, up
+    return tuple(jnp.where(cut > low, part * (piece.weight / np.pi), 0.0) for part in parts)
 
 
 def _primitives(u, toward, across2):

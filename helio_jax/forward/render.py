@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from helio_jax.errors import SceneError
+from helio_jax.forward.compiling import batched_in_chunks
 from helio_jax.forward.form_factor import form_factor_at
-from helio_jax.forward.masking import N_SLICES, masked_form_factor
+from helio_jax.forward.masking import N_SLICES, choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast, in_own_precision
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
 from helio_jax.forward.readout import Readout
@@ -144,37 +145,48 @@ def _planned(surface: Surface, optics: Optics, raster: Raster) -> Plan:
     return plan_radiosity(surface.height, surface.normals(np.asarray(optics.beam_shift)), optics, raster)
 
 
-@eqx.filter_jit
-def _corrections(surface, optics, raster, plan, kind: str, n_slices: int) -> Corrections:
+def _corrections(surface, optics, raster, plan, kind: str, n_slices: int, horizons: Any = None) -> Corrections:
     dtype = jnp.asarray(surface.height).dtype
     surface, optics, raster = (cast(part, dtype) for part in (surface, optics, raster))
     multiple = jnp.zeros((optics.n_detectors, *surface.height.shape), dtype)
     if kind == "none":
         return Corrections(jnp.stack([multiple] * 3, 1), multiple)
-    masked = masked_form_factor(surface, optics, raster, n_slices=n_slices)
+    masked = masked_form_factor(surface, optics, raster, n_slices=n_slices, horizons=horizons)
     if plan is not None:
         normals = jnp.moveaxis(unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift), 0, -1)
         multiple = radiosity(surface.height, normals, optics, raster, plan)
     return Corrections(masked, multiple)
 
 
+_jitted_corrections = eqx.filter_jit(_corrections)
+
+
 def masking_corrections(surface: Surface, optics: Optics, raster: Raster) -> Corrections:
     """Compute the masks of a surface, without multiple scattering, as NumPy arrays in float64."""
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _corrections(surface, optics, raster, None, "masking", N_SLICES))
+        return jax.tree.map(np.asarray, _jitted_corrections(surface, optics, raster, None, "masking", N_SLICES))
 
 
 def radiosity_corrections(surface: Surface, optics: Optics, raster: Raster, plan: Plan) -> Corrections:
     """Compute masks and multiple scattering of a surface by a plan, as NumPy arrays in float64."""
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _corrections(surface, optics, raster, plan, "radiosity", N_SLICES))
+        return jax.tree.map(np.asarray, _jitted_corrections(surface, optics, raster, plan, "radiosity", N_SLICES))
 
 
 @eqx.filter_jit
 def _rendered(surface, optics, raster, readout, corrections, albedo, exponent, kind: str, n_slices: int) -> jax.Array:
     dtype = jnp.asarray(surface.height).dtype
-    if not isinstance(corrections, Corrections):
-        corrections = _corrections(surface, optics, raster, corrections, kind, n_slices)
-    inputs = surface, optics, corrections, albedo, exponent
-    probability = detection_probability(*(cast(part, dtype) for part in inputs))
+    given, plan = (corrections, None) if isinstance(corrections, Corrections) else (None, corrections)
+    is_masked = given is None and kind != "none"
+    horizons = choose_horizons(surface, optics, raster, n_slices) if is_masked else None
+
+    def probability_of(surface, optics, raster, given, plan, albedo, exponent, horizons):
+        if given is None:
+            given = _corrections(surface, optics, raster, plan, kind, n_slices, horizons)
+        return detection_probability(surface, optics, given, albedo, exponent)
+
+    surface, optics, raster, given, plan, albedo, exponent = (
+        cast(part, dtype) for part in (surface, optics, raster, given, plan, albedo, exponent)
+    )
+    probability = batched_in_chunks(probability_of)(surface, optics, raster, given, plan, albedo, exponent, horizons)
     return probability if readout is None else cast(readout, dtype)(probability)

@@ -212,3 +212,33 @@ def test_a_ray_beside_a_wall_stays_finite(rise, turns):
         )
     assert np.all(np.isfinite(found)) and found[0, 2].max() > 0.0
     assert np.all(np.isfinite(response))
+
+
+@pytest.mark.parametrize("kind", ["smooth", "rough", "walls"])
+def test_bounds_leave_the_masks(monkeypatch, kind):
+    """A search that stops where nothing can mask gives the masks of one that never stops, bit by bit.
+
+    Smooth hills, random heights that mask one another, and random walls; unequal pitches, sharp and smoothed edges,
+    a tilted plate. Catches rings that miss a crossing.
+    """
+    rng, n = np.random.default_rng(5), 40
+    height = {
+        "smooth": 150.0 * np.exp(-0.01 * ((np.arange(n) - 15.0) ** 2 + (np.arange(n)[:, None] - 25.0) ** 2)),
+        "rough": 15.0 * rng.normal(size=(n, n)),
+        "walls": rng.uniform(60.0, 250.0, (n, n)) * (rng.random((n, n)) < 0.02),
+    }[kind]
+    surface, raster = Surface(height, *np.zeros((2, n, n))), Raster.regular((n, n), *PITCH)
+    plain = Optics.of(make_instrument())
+
+    def masks():
+        with jax.enable_x64(True):
+            cases = [(o, w) for o in (plain, plain.moved(tilt=(0.1, -0.2))) for w in (0.0, 0.02)]
+            return np.stack([masked_form_factor(surface, o, raster, width=w) for o, w in cases])
+
+    bounded = masks()
+    unbounded = (np.full((n, n), np.inf),) * 2
+    monkeypatch.setattr("helio_jax.forward.horizon._bound_horizons", lambda *args: unbounded)
+    exact = masks()
+    assert np.abs(exact[0]).max() > 1e-4
+    assert np.array_equal(bounded[::2], exact[::2])
+    assert np.abs(bounded - exact).max() < 1e-12
