@@ -110,6 +110,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   noise_bias          bias that the noise of the data causes
   quality             why a height is not valid
   verdict             whether the data support a height map
+  misfit_errors       errors of a photometric height map that its misfit shows
   instrument_report   what a fit found out about the instrument
   consistency         misfit of one surface to all images
 calibration/          background, gain, drift and noise

@@ -7,7 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -36,7 +36,7 @@ from helio_jax.inverse.quality import (
 from helio_jax.inverse.regions import find_plateaus, joined, unexplained
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
-from helio_jax.inverse.verdict import Trace, judged, residuals_of_fit, residuals_of_map
+from helio_jax.inverse.verdict import Misfit, Trace, judged, misfit_of_map, residuals_of_fit
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
@@ -88,12 +88,27 @@ def reconstruct_stack(
         )
     if settings.method == "refine":
         result, residuals = _refined(stack, settings, make_predict, report)
-    else:
-        result = photometric_heights(stack, settings, make_predict and make_predict(start_paths(stack, settings)))
-        residuals = partial(residuals_of_map, stack, result)
-    if not np.all(np.isfinite(result.height)):
+        _check_finite(result)
+        return judged(result, stack, partial(residuals, trace)) if trace else result
+
+    predict = make_predict and make_predict(start_paths(stack, settings))
+    result = photometric_heights(stack, settings, predict, partial(_tested, stack, trace) if trace else None)
+    _check_finite(result)
+    return result
+
+
+def _tested(stack: MicrographStack, trace: Trace, rec: Reconstruction) -> tuple[Reconstruction, Misfit | None]:
+    """Return a photometric height map with the verdict of its data, and its misfit unless it cannot be traced."""
+    _check_finite(rec)
+    misfit = cache(partial(misfit_of_map, stack, rec, trace))
+    tested = judged(rec, stack, lambda: misfit().residuals)
+    return tested, None if tested.chi_square is None else misfit()
+
+
+def _check_finite(rec: Reconstruction) -> None:
+    """Raise GuardError if a height is not finite."""
+    if not np.all(np.isfinite(rec.height)):
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
-    return judged(result, stack, partial(residuals, trace)) if trace else result
 
 
 def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
