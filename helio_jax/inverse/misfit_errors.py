@@ -1,9 +1,9 @@
 """Errors of a photometric height map that its misfit to the data shows: what error bars from noise alone leave out.
 
-A map is traced (`verdict`). Data minus traced micrographs, taken as a change of the data, change the heights by an
-estimate of their remaining systematic error. Where that misfit is larger than noise, slopes are wrong by what it
-implies, and heights by what accumulates along the path from the reference. Regions that only contradicted pixels join
-to the rest are tested as floating. The map itself stays as it is: signs of systematic errors are taken as unknown.
+A map is traced (`verdict`). Where the traced micrographs deviate from the data by more than noise, slopes are wrong by
+what that implies, and heights by what accumulates along the path from the reference. Regions that only contradicted
+pixels join to the rest are tested as floating. The map itself stays as it is: signs of systematic errors are taken as
+unknown. What the misfit does to the integration, patch by patch, is `bootstrap`'s matter.
 """
 
 import numpy as np
@@ -100,16 +100,17 @@ def path_error(
 ) -> np.ndarray:
     """Compute the common-mode error by slopes that the data contradict, relative to the reference [y, x], um.
 
-    The reference is the border where it is flat, else the largest valid region; the border's median is then 0.
+    The reference is the border where it is flat, else the largest valid region; the border's median is then 0. Slope
+    errors of one sign add up to a bound; a uniform distribution within it has the deviation bound / sqrt(3).
     """
     assert rec.chi_square is not None
     errors = excess_slope_errors(slope_errors(misfit, Optics.of(rec.instrument)), rec.chi_square, expected)
     frame = border_mask(rec.height.shape, settings.border_fraction)
     if settings.border == "flat":
         known = frame & rec.is_valid
-        return accumulated(errors, raster, known if known.any() else frame)
+        return accumulated(errors, raster, known if known.any() else frame) / np.sqrt(3.0)
     found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0)
-    return found - np.median(found[frame])
+    return (found - np.median(found[frame])) / np.sqrt(3.0)
 
 
 def flag_floating(rec: Reconstruction) -> Reconstruction:

@@ -4,9 +4,8 @@ linear: detection directions of the substrate (the published method). nearfield:
 masking and multiple scattering predicted on the result are subtracted from the data, once: more iterations help little,
 and oscillate where one of three detectors is masked. RMS errors without and with it: own spheres A and B 4.0, 1.8 % and
 6.0, 5.3 %, measured sphere A 10.8, 8.7 % (121 x 121). Error bars: noise, calibration and the misfit of the traced map,
-by patches, drawn (`bootstrap`), and three common-mode errors, of unknown sign: the change by a further correction; the
-change by the misfit; what slopes that the data contradict add up to (`misfit_errors`). Rotated scans come corrected,
-from their calibration.
+drawn (`bootstrap`), and two common-mode errors, of unknown sign: the change by a further correction, and what slopes
+that the data contradict add up to (`misfit_errors`). Rotated scans come corrected, from their calibration.
 """
 
 from collections.abc import Callable
@@ -189,7 +188,6 @@ def photometric_heights(
     if misfit is not None:
         assert rec.chi_square is not None
         expected = expected_chi_square(stack, rec, rec.chi_square)
-        modes.append(solver.height_of(data - misfit.difference) - height)
         modes.append(path_error(rec, misfit, Raster.of(stack), expected, settings))
     if not modes:
         return rec.replace(status=f"{rec.status}; no error bars{failure}")
