@@ -97,8 +97,23 @@ def plane_of(error: np.ndarray, rec: Reconstruction, use: np.ndarray) -> np.ndar
     return np.linalg.lstsq(design, error[use], rcond=None)[0]
 
 
+def without_plane(field: np.ndarray, rec: Reconstruction, use: np.ndarray) -> np.ndarray:
+    """Return a field [y, x] less the plane fitted to it where `use` holds."""
+    plane = plane_of(field, rec, use)
+    gx, gy = np.meshgrid(rec.raster_x, rec.raster_y)
+    return field - plane[0] - plane[1] * gx - plane[2] * gy
+
+
+def shape_std(rec: Reconstruction, use: np.ndarray) -> np.ndarray | None:
+    """Return the stated deviation of the shape [y, x]: of samples levelled as the error is, by a plane; um."""
+    if rec.height_samples is None:
+        return rec.height_std
+    return np.sqrt(np.mean([without_plane(s, rec, use) ** 2 for s in rec.height_samples], axis=0))
+
+
 def score(member: Member, truth: np.ndarray, rec: Reconstruction) -> Case:
     """Return the numbers of one reconstruction; errors over the relief of the true heights."""
+    std = rec.height_std
     error, valid = rec.height - truth, rec.is_valid
     relief, n = float(np.ptp(truth)), truth.size
     out: Case = {"relief_um": relief, "invalid": 1.0 - float(valid.mean()), "status": rec.status}
@@ -111,8 +126,8 @@ def score(member: Member, truth: np.ndarray, rec: Reconstruction) -> Case:
         plane = plane_of(error, rec, use)
         out["tilt_deg"] = float(np.degrees(np.hypot(*plane[1:])))
         out["level_error"] = float(np.median(error[use])) / relief
-        gx, gy = np.meshgrid(rec.raster_x, rec.raster_y)
-        error = error - plane[0] - plane[1] * gx - plane[2] * gy
+        error = without_plane(error, rec, use)
+        std = shape_std(rec, use)
     relative = error / relief
     out["rms_valid"] = float(np.sqrt(np.mean(relative[valid] ** 2))) if valid.any() else None
     out["rms_all"] = float(np.sqrt(np.mean(relative**2)))
@@ -120,8 +135,12 @@ def score(member: Member, truth: np.ndarray, rec: Reconstruction) -> Case:
     if valid.sum() > 9:
         slope = np.sum((centered[valid] + error[valid]) * centered[valid]) / np.sum(centered[valid] ** 2)
         out["recovered"] = float(slope)
-    if rec.height_std is not None:
-        std = np.maximum(rec.height_std, 1e-12)
+    if std is not None:
+        std = np.maximum(std, 1e-12)
+        if valid.any():
+            rms = max(float(np.sqrt(np.mean(error[valid] ** 2))), 1e-12)
+            out["std_over_rms"] = float(np.median(std[valid])) / rms
+            out["rms_std_over_rms"] = float(np.sqrt(np.mean(std[valid] ** 2))) / rms
         pull = np.abs(error / std)
         silent = valid & (np.abs(relative) > WRONG_SHARE) & (pull > WRONG_STD)
         out["silent"] = float(silent.sum()) / n
@@ -231,13 +250,18 @@ def summary(cases: list[Case]) -> list[str]:
             errors = [abs(s["error"]) for c in part for s in c["steps"] if s["valid"] > 0.5 and not c["told"]]
             flagged = sum(s["valid"] <= 0.5 or c["told"] for c in part for s in c["steps"])
             silent = [c["silent"] for c in part if "silent" in c and not c["told"]]
-            covers = [np.mean([c["coverage_all"][k] for c in part if "coverage_all" in c]) for k in (0, 1)]
+            covers = {
+                where: "/".join(f"{np.mean([c[where][k] for c in part if where in c] or [np.nan]):.0%}" for k in (0, 1))
+                for where in ("coverage_all", "coverage_hollow")
+            }
+            width = [c["std_over_rms"] for c in part if "std_over_rms" in c]
             rms = [c["rms_valid"] for c in part if c["rms_valid"] is not None]
             out.append(
                 f"{family:<10}{method:<10}{len(part):>3} members; step error median, worst unflagged "
                 f"{quantiles(errors)} ({flagged} flagged); RMS {quantiles(rms)}; silently wrong "
                 f"{np.mean(silent) if silent else np.nan:.2%}; invalid {np.mean([c['invalid'] for c in part]):.0%}; "
-                f"cover {covers[0]:.0%}/{covers[1]:.0%}; told {sum(c['told'] for c in part)}; "
+                f"cover {covers['coverage_all']}, hollows {covers['coverage_hollow']}, stated over actual error "
+                f"{np.median(width) if width else np.nan:.2f}; told {sum(c['told'] for c in part)}; "
                 f"worst time {max(c['seconds'] for c in part):.0f} s"
             )
             if family == "smooth" and method == "refine":

@@ -118,6 +118,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   quality             why a height is not valid
   anchors             what is known of many heights together
   verdict             whether the data support a height map
+  misfit_errors       errors of a photometric height map that its misfit shows
   instrument_report   what a fit found out about the instrument
   consistency         misfit of one surface to all images
 calibration/          background, gain, drift and noise

@@ -7,7 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -41,10 +41,11 @@ from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
 from helio_jax.inverse.verdict import (
     LIMIT,
+    Misfit,
     Trace,
     judged,
     local_chi_square,
-    residuals_of_map,
+    misfit_of_map,
     residuals_of_state,
 )
 from helio_jax.micrograph import MicrographStack
@@ -103,12 +104,27 @@ def reconstruct_stack(
         )
     if settings.method == "refine":
         result, residuals = _refined(stack, settings, make_predict, report)
-    else:
-        result = photometric_heights(stack, settings, make_predict and make_predict(start_paths(stack, settings)))
-        residuals = partial(residuals_of_map, stack, result)
-    if not np.all(np.isfinite(result.height)):
+        _check_finite(result)
+        return judged(result, stack, partial(residuals, trace)) if trace else result
+
+    predict = make_predict and make_predict(start_paths(stack, settings))
+    result = photometric_heights(stack, settings, predict, partial(_tested, stack, trace) if trace else None)
+    _check_finite(result)
+    return result
+
+
+def _tested(stack: MicrographStack, trace: Trace, rec: Reconstruction) -> tuple[Reconstruction, Misfit | None]:
+    """Return a photometric height map with the verdict of its data, and its misfit unless it cannot be traced."""
+    _check_finite(rec)
+    misfit = cache(partial(misfit_of_map, stack, rec, trace))
+    tested = judged(rec, stack, lambda: misfit().residuals)
+    return tested, None if tested.chi_square is None else misfit()
+
+
+def _check_finite(rec: Reconstruction) -> None:
+    """Raise GuardError if a height is not finite."""
+    if not np.all(np.isfinite(rec.height)):
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
-    return judged(result, stack, partial(residuals, trace)) if trace else result
 
 
 def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:

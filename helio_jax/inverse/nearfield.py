@@ -3,11 +3,13 @@
 linear: detection directions of the substrate (the published method). nearfield: those of the heights found so far;
 masking and multiple scattering predicted on the result are subtracted from the data, once: more iterations help little,
 and oscillate where one of three detectors is masked. RMS errors without and with it: own spheres A and B 4.0, 1.8 % and
-6.0, 5.3 %, measured sphere A 10.8, 8.7 % (121 x 121). The change by a further correction is an error bar (`bootstrap`).
-Rotated scans come corrected, from their calibration.
+6.0, 5.3 %, measured sphere A 10.8, 8.7 % (121 x 121). Error bars: noise, calibration and the misfit of the traced map,
+drawn (`bootstrap`), and two common-mode errors, of unknown sign: the change by a further correction, and what slopes
+that the data contradict add up to (`misfit_errors`). Rotated scans come corrected, from their calibration.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,11 +22,17 @@ from helio_jax.forward.surface import slopes_of_normal
 from helio_jax.inverse.bootstrap import SEED, bootstrap_heights, rescale_to_border, unmodelled_signal
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
+from helio_jax.inverse.misfit_errors import flag_floating, path_error
 from helio_jax.inverse.quality import reasons_from_data
-from helio_jax.inverse.samples import add_common_mode
+from helio_jax.inverse.samples import add_common_modes
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.verdict import Misfit, expected_chi_square
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
+
+Predict = Callable[[np.ndarray, np.ndarray], Corrections]
+"""(heights [y, x] um, unit normals [y, x, 3]) -> masks and multiple scattering."""
+_UNPREDICTED = "; masks and multiple scattering could not be predicted"
 
 
 def level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:
@@ -89,10 +97,64 @@ def limited(height: np.ndarray, optics: Optics) -> np.ndarray:
     return np.clip(height, -0.5 * d, 0.9 * d)
 
 
+@dataclass(frozen=True)
+class _Solver:
+    """A photometric method on the data of one stack.
+
+    Attributes:
+        stack, settings: as in `photometric_heights`.
+        optics: as stated.
+        signal, variance: data in units of the beam [detector, y, x].
+        is_corrected: whether the calibration subtracted the multiple scattering.
+    """
+
+    stack: MicrographStack
+    settings: ReconstructSettings
+    optics: Optics
+    signal: np.ndarray
+    variance: np.ndarray
+    is_corrected: bool
+
+    @classmethod
+    def of(cls, stack: MicrographStack, settings: ReconstructSettings) -> "_Solver":
+        is_corrected = stack.calibration is not None and stack.calibration.without_multiple
+        return cls(stack, settings, Optics.of(stack.instrument), *signal_of(stack), is_corrected)
+
+    @property
+    def iterations(self) -> int:
+        """Photometric solutions."""
+        return 1 if self.settings.method == "linear" else self.settings.rounds
+
+    @property
+    def n_corrections(self) -> int:
+        """How often predicted masks and multiple scattering are subtracted from the data."""
+        return 0 if self.is_corrected or self.settings.method == "linear" else self.settings.corrections
+
+    def solve(self, data, variance, optics, stride=1) -> tuple[np.ndarray, PhotometricSolution]:
+        """Solve for heights [y, x], um, by data of every `stride`-th pixel."""
+        raster = Raster.of(self.stack)
+        thinned = Raster.regular(data.shape[1:], stride * raster.dx, stride * raster.dy)
+        return solve_nearfield(data, variance, optics, thinned, self.settings, self.iterations)
+
+    def height_of(self, data: np.ndarray) -> np.ndarray:
+        """Solve for heights by other data [y, x], um."""
+        return self.solve(rescale_to_border(data, self.signal, self.settings), self.variance, self.optics)[0]
+
+    def unmodelled(self, height: np.ndarray, solution: PhotometricSolution, predict: Predict) -> np.ndarray:
+        """Predict the signal that the method does not model [detector, y, x]."""
+        near = limited(height, self.optics)
+        found = predict(near, solution.normals)
+        multiple = self.settings.refine.multiple_error * found.multiple if self.is_corrected else found.multiple
+        phi = form_factor(self.optics, near)
+        used = form_factor(self.optics, np.zeros_like(near)) if self.iterations == 1 else phi
+        return unmodelled_signal(solution, used, phi, Corrections(found.masked, multiple))
+
+
 def photometric_heights(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    predict: Callable[[np.ndarray, np.ndarray], Corrections] | None = None,
+    predict: Predict | None = None,
+    judge: Callable[[Reconstruction], tuple[Reconstruction, Misfit | None]] | None = None,
 ) -> Reconstruction:
     """Reconstruct heights by the method that the settings name, linear or nearfield, with error bars.
 
@@ -100,41 +162,47 @@ def photometric_heights(
         stack: three or more images of one scan.
         settings: method and options.
         predict: masks and multiple scattering of a surface (heights, normals); None: no corrections, no error bars.
+        judge: tests the heights against the data; error bars include what the misfit shows.
     """
-    is_corrected = stack.calibration is not None and stack.calibration.without_multiple
-    iterations = 1 if settings.method == "linear" else settings.rounds
-    n_corrections = 0 if is_corrected or settings.method == "linear" else settings.corrections
-    optics, raster = Optics.of(stack.instrument), Raster.of(stack)
-    signal, variance = signal_of(stack)
-
-    def solve(data, spread, optics, stride=1):
-        thinned = Raster.regular(data.shape[1:], stride * raster.dx, stride * raster.dy)
-        return solve_nearfield(data, spread, optics, thinned, settings, iterations)
-
-    def unmodelled(height, solution, predict):
-        near = limited(height, optics)
-        found = predict(near, solution.normals)
-        multiple = settings.refine.multiple_error * found.multiple if is_corrected else found.multiple
-        phi = form_factor(optics, near)
-        used = form_factor(optics, np.zeros_like(near)) if iterations == 1 else phi
-        return unmodelled_signal(solution, used, phi, Corrections(found.masked, multiple))
-
-    data, subtracted = signal, np.zeros(signal.shape)
-    height, solution = solve(data, variance, optics)
-    samples, note = None, ""
+    solver = _Solver.of(stack, settings)
+    data, subtracted = solver.signal, np.zeros(stack.counts.shape)
+    height, solution = solver.solve(data, solver.variance, solver.optics)
+    failure = ""
     try:
-        for _ in range(n_corrections if predict else 0):
-            subtracted = unmodelled(height, solution, predict)
-            data = rescale_to_border(signal - subtracted, signal, settings)
-            height, solution = solve(data, variance, optics)
-        if predict and settings.samples:
-            rest = unmodelled(height, solution, predict) - subtracted
-            again = rescale_to_border(data - rest if n_corrections else data + rest, signal, settings)
-            known = optics, stack.instrument.uncertainty, settings
-            samples = bootstrap_heights(data, variance, *known, lambda *drawn: solve(*drawn)[0])
-            samples = add_common_mode(samples, solve(again, variance, optics)[0] - height, SEED + 1)
+        for _ in range(solver.n_corrections if predict else 0):
+            subtracted = solver.unmodelled(height, solution, predict)  # type: ignore[arg-type]
+            data = rescale_to_border(solver.signal - subtracted, solver.signal, settings)
+            height, solution = solver.solve(data, solver.variance, solver.optics)
     except PredictionError as error:
-        note = f"; no error bars, for masks and multiple scattering could not be predicted: {error}"
+        failure = f"{_UNPREDICTED}: {error}"
+    rec = _without_error_bars(solver, height, solution)
+    rec, misfit = judge(rec) if judge else (rec, None)
+    if predict is None or not settings.samples:
+        return rec
+    modes = []
+    try:
+        rest = solver.unmodelled(height, solution, predict) - subtracted
+        modes.append(solver.height_of(data - rest if solver.n_corrections else data + rest) - height)
+    except PredictionError as error:
+        failure = failure or f"{_UNPREDICTED}: {error}"
+    if misfit is not None:
+        assert rec.chi_square is not None
+        expected = expected_chi_square(stack, rec, rec.chi_square)
+        modes.append(path_error(rec, misfit, Raster.of(stack), expected, settings))
+    if not modes:
+        return rec.replace(status=f"{rec.status}; no error bars{failure}")
+    known = solver.optics, stack.instrument.uncertainty, settings
+    difference = None if misfit is None else misfit.difference
+    samples = bootstrap_heights(data, solver.variance, *known, lambda *drawn: solver.solve(*drawn)[0], difference)
+    samples = add_common_modes(samples, modes, SEED + 1)
+    std = np.sqrt(np.mean(samples**2, axis=0))
+    rec = rec.replace(height_samples=samples, height_std=std, status=f"{rec.status}{failure}")
+    return rec if misfit is None else flag_floating(rec)
+
+
+def _without_error_bars(solver: _Solver, height: np.ndarray, solution: PhotometricSolution) -> Reconstruction:
+    """Make the result of a solution."""
+    stack, settings = solver.stack, solver.settings
     reason = reasons_from_data(stack)
     n_few = int(np.sum(stack.is_observed.sum(0) < MIN_IMAGES))
     few = f"{n_few} pixels in fewer than {MIN_IMAGES} images took the substrate's normal"
@@ -146,12 +214,10 @@ def photometric_heights(
         method=settings.method,
         normals=solution.normals,
         albedo=np.where(np.isfinite(solution.albedo), solution.albedo, 0.0),
-        height_std=None if samples is None else np.sqrt(np.mean(samples**2, axis=0)),
-        height_samples=samples,
         is_valid=reason == 0,
         reason=reason,
         residuals=solution.residuals,
         border=settings.border,
-        status=f"solved in {iterations} iteration(s); {few}{note}",
+        status=f"solved in {solver.iterations} iteration(s); {few}",
         provenance={"stack": dict(stack.provenance), "reconstruct": settings.model_dump(mode="json")},
     )

@@ -37,7 +37,7 @@ from helio_jax.inverse.residuals import (
     edge_scale,
     surface_of,
 )
-from helio_jax.inverse.samples import add_common_mode, on_raster
+from helio_jax.inverse.samples import add_common_modes, on_raster
 
 MAX_PIXELS = 8_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
@@ -173,7 +173,7 @@ class Posterior:
         """Add a fully correlated error with a standard-normal amplitude [y, x], um, independent of the others."""
         before = np.zeros((0, *error.shape)) if self.common_modes is None else self.common_modes
         modes = np.concatenate([before, error[None]])
-        return replace(self, samples=add_common_mode(self.samples, error, len(modes)), common_modes=modes)
+        return replace(self, samples=add_common_modes(self.samples, [error], len(modes)), common_modes=modes)
 
     def on_raster(self, shape: tuple[int, int], stride: int) -> "Posterior":
         """Resample to the full raster [y, x], by the nearest pixel."""

@@ -1,5 +1,7 @@
 """Samples of the heights, whatever their method: how far rasters are thinned for them, and errors of all as one."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -20,14 +22,20 @@ def on_raster(fields: np.ndarray, shape: tuple[int, ...], stride: int) -> np.nda
     return fields[..., row[:, None], column]
 
 
-def add_common_mode(samples: np.ndarray, error: np.ndarray, seed: int) -> np.ndarray:
-    """Add a fully correlated error with a standard-normal amplitude to samples [sample, y, x].
+def add_common_modes(samples: np.ndarray, errors: Sequence[np.ndarray], seed: int) -> np.ndarray:
+    """Add fully correlated errors, each with a standard-normal amplitude, to samples [sample, y, x].
+
+    The amplitudes have mean square 1 and, where there are as many samples as errors, no correlation: however few the
+    samples, errors that are alike neither cancel nor add up by chance.
 
     Args:
         samples: of the heights [sample, y, x], um.
-        error: [y, x], um.
-        seed: of the amplitudes; independent errors have different ones.
+        errors: independent of one another, each [y, x], um.
+        seed: of the amplitudes; independent errors of two calls need different ones.
     """
-    amplitude = np.random.default_rng(seed).standard_normal(len(samples))
-    amplitude /= np.sqrt(np.mean(amplitude**2))
-    return samples + amplitude[:, None, None] * error
+    drawn = np.random.default_rng(seed).standard_normal((len(errors), len(samples)))
+    if len(samples) >= len(errors):
+        orthogonal, triangle = np.linalg.qr(drawn.T)
+        drawn = (orthogonal * np.sign(np.diag(triangle))).T
+    drawn *= np.sqrt(len(samples)) / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return samples + np.einsum("es,eyx->syx", drawn, np.array(errors))

@@ -6,6 +6,7 @@ finished map, and nothing but counting noise, the tracer's error and what the be
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import jax
@@ -56,8 +57,30 @@ def local_chi_square(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarr
     return uniform_filter(square, 3, mode="constant", cval=1.0)
 
 
-def residuals_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) -> np.ndarray:
-    """Compute (model - data) / standard deviation of a photometric height map [detector, y, x].
+@dataclass(frozen=True)
+class Misfit:
+    """What the micrographs traced on a height map differ by from the data, in units of the beam.
+
+    Attributes:
+        difference: model minus data, NaN where not observed [detector, y, x].
+        std: standard deviation of the data about the model [detector, y, x].
+        form_factor: of the heights, without masks [detector, 3, y, x].
+        normals: of the heights [y, x, 3].
+    """
+
+    difference: np.ndarray
+    std: np.ndarray
+    form_factor: np.ndarray
+    normals: np.ndarray
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(model - data) / standard deviation [detector, y, x]."""
+        return self.difference / self.std
+
+
+def misfit_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) -> Misfit:
+    """Trace a photometric height map and compare it with the data.
 
     The normals are those of the heights, not of the photometric solution; albedo 1.
 
@@ -69,10 +92,11 @@ def residuals_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) 
     with jax.enable_x64(True):
         normals = surface_of_heights(rec.height, Raster.of(stack)).normals(optics.beam_shift)
     c = trace(rec.height, normals, rec.instrument)
-    visible = form_factor(optics, rec.height) - c.masked
+    phi = form_factor(optics, rec.height)
     is_subtracted = stack.calibration is not None and stack.calibration.without_multiple
-    model = single_scattering(visible, np.moveaxis(normals, -1, 0)) + (0.0 if is_subtracted else c.multiple)
-    return (model - signal) / data_std(variance, c)
+    single = single_scattering(phi - c.masked, np.moveaxis(normals, -1, 0))
+    model = single + (0.0 if is_subtracted else c.multiple)
+    return Misfit(model - signal, data_std(variance, c), phi, normals)
 
 
 def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
@@ -91,11 +115,19 @@ def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -
     return np.where(problem.is_observed, rest / data_std(problem.variance, state.held.corrections), 0.0)
 
 
+def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:
+    """Compute the chi-square of a right map: 1, or the median where misfit common to the image is not the map's.
+
+    It is that of the instrument or of the calibration, where the one is uncertain or the other had to be made.
+    """
+    is_uncertain = rec.instrument.uncertainty.is_stated or stack.calibration is not None
+    return max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
+
+
 def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], np.ndarray]) -> Reconstruction:
     """Return a height map with the verdict of its data: chi-square, reasons, and a sentence in its status.
 
-    Where the stated instrument is uncertain, or the counts had to be calibrated, misfit that is common to the image is
-    theirs: pixels must then deviate by more than `LIMIT` times the median.
+    Pixels must deviate by more than `LIMIT` times the chi-square of a right map (`expected_chi_square`).
 
     Args:
         rec: the height map.
@@ -110,9 +142,7 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
         said = "contradicts the data: no micrographs can be traced on a height map so rough or steep"
         return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
-    is_uncertain = rec.instrument.uncertainty.is_stated or stack.calibration is not None
-    scale = max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
-    is_worse = (rec.reason == 0) & (chi_square > LIMIT * scale)
+    is_worse = (rec.reason == 0) & (chi_square > LIMIT * expected_chi_square(stack, rec, chi_square))
     reason = np.where(is_worse, _CONTRADICTED, rec.reason)
     judged = rec.replace(chi_square=chi_square, reason=reason, is_valid=reason == 0)
     if not judged.is_contradicted:

@@ -13,7 +13,7 @@ from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.bootstrap import rescale_to_border, unmodelled_signal
 from helio_jax.inverse.linear import solve_linear
 from helio_jax.inverse.nearfield import photometric_heights
-from helio_jax.inverse.samples import add_common_mode
+from helio_jax.inverse.samples import add_common_modes
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
@@ -155,7 +155,7 @@ def test_data_are_brought_to_the_flat_only_where_there_is_one(bshem):
 def test_an_error_of_all_heights_has_deviation_one():
     """Its mean square is the error's, in however few samples."""
     error = np.arange(12.0).reshape(3, 4)
-    np.testing.assert_allclose(np.sqrt(np.mean(add_common_mode(np.zeros((3, 3, 4)), error, 5) ** 2, axis=0)), error)
+    np.testing.assert_allclose(np.sqrt(np.mean(add_common_modes(np.zeros((3, 3, 4)), [error], 5) ** 2, axis=0)), error)
 
 
 def test_one_correction_nears_the_sphere():
