@@ -95,6 +95,9 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edges               edges of the raster: smooth, kink or jump
   regions             segmentation of the images into regions behind depth jumps
   levels              level search of such regions
+  merging             segmentation of a noisy map by region merging
+  albedo_patches      parts of the surface of other albedo than the substrate's
+  albedo_search       such parts in a measurement
   occlusion           depth jumps where the surface leaves the beam
   mask_steps          hx.find_steps: step heights from the mask bands of the micrographs
   mask_edges          masked pixels, and the upper edges at which mask bands begin

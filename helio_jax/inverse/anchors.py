@@ -36,7 +36,8 @@ class Anchors:
             is_level: pixels that are at their region's level, no walls [y, x].
             margin: pixels beside other regions that do not count for the level of region 0.
         """
-        base = np.asarray((region == 0) & ~np.asarray(binary_dilation(region > 0, np.ones((3, 3)), iterations=margin)))
+        near = binary_dilation(region > 0, np.ones((3, 3)), iterations=margin)
+        base = (region == 0) & np.logical_not(near)
         weight, value = [], []
         for number, (height, std) in levels.items():
             inside = (region == number) & is_level

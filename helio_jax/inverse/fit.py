@@ -220,13 +220,13 @@ def _finish(
     limit, cut = s.robust_limits[-1], s.jump_limits[-1]
     edges_x, edges_y = edges_of(problem, state.surface, cut)
     with jax.enable_x64(True):
-        albedo = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
+        smooth = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
     return Fit(
         problem=problem,
         state=state,
         surface=surface,
         normals=surface.normals(problem.shift),
-        albedo=albedo,
+        albedo=smooth * problem.patches_at(parameters).albedo,
         gain=np.exp(s.gain_std * parameters.log_gain),
         offset=priors.offset * parameters.offset,
         instrument=problem.fitted_instrument(parameters),

@@ -29,6 +29,7 @@ def prior_stds(uncertainty: Uncertainty, distance_um: float, settings: RefineSet
         "log_multiple": (settings.multiple_error, "relative"),
         "drift": (settings.drift_std, "of the signal"),
         "law": (settings.law_std, "of the exponent"),
+        "patch": (settings.patch_albedo_std, "natural logarithm"),
         "distance": (distance_um, "um"),
         "tilt": (uncertainty.tilt_deg, "deg"),
         "polar": (uncertainty.polar_deg, "deg"),
@@ -53,6 +54,8 @@ def plain_name(name: str, detectors: tuple[str, ...]) -> str:
         return f"tilt {'xy'[parts[0]]}"
     if kind == "albedo":
         return f"albedo {parts}"
+    if kind == "patch":
+        return f"log albedo of patch {parts[0] + 1}"
     rest = f" {parts[1]}" if kind == "drift" else ""
     return f"{kind} {detectors[parts[0]]}{rest}"
 

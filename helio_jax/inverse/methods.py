@@ -18,9 +18,11 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.levels import SKIRT, Levels, Region, search_levels
+from helio_jax.inverse.levels import GAIN, SKIRT, Levels, Region, search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
@@ -108,15 +110,21 @@ def reconstruct_stack(
         return judged(result, stack, partial(residuals, trace)) if trace else result
 
     predict = make_predict and make_predict(start_paths(stack, settings))
-    result = photometric_heights(stack, settings, predict, partial(_tested, stack, trace) if trace else None)
+    test = None
+    if trace:
+        patches = search_albedo_patches(stack, settings, predict) if predict else AlbedoPatches.none(stack.shape[1:])
+        test = partial(_tested, stack, patches, trace)
+    result = photometric_heights(stack, settings, predict, test)
     _check_finite(result)
     return result
 
 
-def _tested(stack: MicrographStack, trace: Trace, rec: Reconstruction) -> tuple[Reconstruction, Misfit | None]:
+def _tested(
+    stack: MicrographStack, patches: AlbedoPatches, trace: Trace, rec: Reconstruction
+) -> tuple[Reconstruction, Misfit | None]:
     """Return a photometric height map with the verdict of its data, and its misfit unless it cannot be traced."""
     _check_finite(rec)
-    misfit = cache(partial(misfit_of_map, stack, rec, trace))
+    misfit = cache(partial(misfit_of_map, stack, rec, patches, trace))
     tested = judged(rec, stack, lambda: misfit().residuals)
     return tested, None if tested.chi_square is None else misfit()
 
@@ -133,11 +141,11 @@ def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
     return min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS))
 
 
-def _corrected(stack, settings, surface: Surface, normals: np.ndarray, predict) -> Surface:
-    """Solve photometrically with albedo 1 and the corrections predicted on a surface."""
-    signal, variance = signal_of(stack)
+def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
+    """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
+    signal, variance = (f / patches.albedo**n for n, f in enumerate(signal_of(stack), 1))
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
-    corrections = predict(surface.height, normals)
+    corrections = predict(surface.height, normals, **patches.known)
     sigma = prediction_std(corrections, normals, settings.refine)
     masked, multiple = linearised_in_normal(corrections, normals)
     visible = form_factor(optics, surface.height) - masked
@@ -185,6 +193,7 @@ def _with_levels(
     settings: ReconstructSettings,
     make_predict: "Callable[[int], Predict]",
     report: "Report | None",
+    patches: AlbedoPatches,
     start: Surface,
     smoothed: Surface,
 ) -> "tuple[Fit, np.ndarray]":
@@ -205,7 +214,7 @@ def _with_levels(
 
     def pose(surface: Surface, region: np.ndarray | None = None, anchors: Anchors | None = None) -> FitProblem:
         known = signal, variance, stack.instrument, raster, surface, settings, region
-        return FitProblem.of(*known, scan_order(stack), anchors=anchors)
+        return FitProblem.of(*known, scan_order(stack), patches=patches, anchors=anchors)
 
     def tested(fit: "Fit") -> np.ndarray:
         return residuals_of_state(fit.problem, fit.state, roughly)
@@ -246,7 +255,7 @@ def _with_levels(
                 break
             p = fit.parameters
             known = p.replaced(log_multiple=0.0 * p.log_multiple, occluded=np.zeros(()))
-            found = search(left, fit.surface, known if fit.problem.is_instrument_unknown else None)
+            found = search(left, fit.surface, known if fit.problem.is_instrument_unknown or patches else None)
             is_undecided |= covered(left, found.undecided)
             if not found.moved:
                 break
@@ -305,23 +314,57 @@ def labelled(labels: np.ndarray, regions: list[Region], numbers: Iterable[int]) 
     return out
 
 
-def _start(stack: MicrographStack, settings: ReconstructSettings, predict: "Predict") -> tuple[Surface, Surface]:
+def _start(
+    stack: MicrographStack, settings: ReconstructSettings, patches: AlbedoPatches, predict: "Predict"
+) -> tuple[Surface, Surface]:
     """Find the photometric solution that the fit starts from, and a smoother one."""
     optics, raster, shift = Optics.of(stack.instrument), Raster.of(stack), stack.instrument.beam_shift
     height, solution = solve_nearfield(*signal_of(stack), optics, raster, settings, settings.rounds)
 
     def correct(surface: Surface) -> Surface:
-        return _corrected(stack, settings, surface, surface.normals(shift), predict)
+        return _corrected(stack, settings, patches, surface, surface.normals(shift), predict)
 
     smoothed = Surface(*np.zeros((3, *height.shape)))
     try:
         near = Surface(limited(height, optics), *np.zeros((2, *height.shape)))
-        start = _corrected(stack, settings, near, solution.normals, predict)
+        start = _corrected(stack, settings, patches, near, solution.normals, predict)
     except PredictionError:
         start = correct(smoothed)
     for _ in range(settings.refine.photometric_rounds - 1):
         start, smoothed = _with_backtracking(correct, start, smoothed)
     return start, smoothed
+
+
+def _with_albedos(stack, settings, make_predict, report) -> "tuple[Fit, np.ndarray]":
+    """Fit with one albedo, that of the substrate; then with those of the patches that this fit does not explain.
+
+    Their albedos are kept where the data that are expected of the second fit explain the images better.
+    """
+    predict = make_predict(start_paths(stack, settings))
+
+    def fitted(patches: AlbedoPatches) -> "tuple[Fit, np.ndarray]":
+        start = _start(stack, settings, patches, predict)
+        return _with_levels(stack, settings, make_predict, report, patches, *start)
+
+    def tested(fit: "Fit") -> np.ndarray:
+        return squares(residuals_of_state(fit.problem, fit.state, predict))
+
+    if not settings.refine.albedo_patches:
+        return fitted(AlbedoPatches.none(stack.shape[1:]))
+    found = search_albedo_patches(stack, settings, predict)
+    plain = fitted(found.keeping([]))
+    if not found.objects or plain[0].is_interrupted:
+        return plain
+    try:
+        square = tested(plain[0])
+        left = found.keeping(found.unexplained(square.mean(0)))
+        if not left.objects:
+            return plain
+        other = fitted(left)
+        is_better = 0.5 * np.sum(square - tested(other[0])) > GAIN
+    except PredictionError:
+        return plain
+    return other if is_better else plain
 
 
 def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], np.ndarray]]:
@@ -333,8 +376,7 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    start, smoothed = _start(stack, settings, make_predict(start_paths(stack, settings)))
-    fit, is_floating = _with_levels(stack, settings, make_predict, report, start, smoothed)
+    fit, is_floating = _with_albedos(stack, settings, make_predict, report)
     fit = with_posterior(fit)
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:

@@ -35,7 +35,7 @@ def noise_bias(problem: FitProblem, state: FitState, n_pairs: int) -> tuple[Surf
         antithetic draws: Hammersley and Morton, Proc. Camb. Phil. Soc. 52 (1956) 449.
     """
     s, is_observed = problem.settings, problem.is_observed
-    truth = replace(state, parameters=problem.prior_means())
+    truth = replace(state, parameters=problem.prior_means().replaced(patch=state.parameters.patch))
     clean = expected(problem, truth, is_noisy=False)
     truth = replace(truth, residuals=np.zeros(clean.shape))
     rng = np.random.default_rng(zlib.crc32(problem.data.tobytes()))

@@ -16,6 +16,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument, Uncertainty
+from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.residuals import Parameters, Priors, moves_of
@@ -45,6 +46,7 @@ class FitProblem:
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
         median_signal: of every detector, 1 without data [detector].
         slope_noise: typical standard deviation of the slopes of one pixel.
+        patches: parts of the surface of other albedo, which is unknown.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
@@ -64,6 +66,7 @@ class FitProblem:
     drift_modes: np.ndarray
     median_signal: np.ndarray
     slope_noise: float
+    patches: AlbedoPatches
     instrument: Instrument | None = None
     stride: int = 1
 
@@ -79,11 +82,12 @@ class FitProblem:
         region: np.ndarray | None = None,
         order: ScanOrder = ScanOrder(),
         uncertainty: Uncertainty | None = None,
+        patches: AlbedoPatches | None = None,
         anchors: Anchors | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
-        `uncertainty` replaces the instrument's; optics alone are known exactly by default.
+        `uncertainty` replaces the instrument's; optics alone are known exactly by default. Default of `patches`: none.
         """
         given, optics = (None, instrument) if isinstance(instrument, Optics) else (instrument, Optics.of(instrument))
         stated = uncertainty or (Uncertainty() if given is None else given.uncertainty)
@@ -97,7 +101,8 @@ class FitProblem:
         problem = cls(
             signal, variance, optics, stated, raster, settings, order, is_held,
             is_free and not is_held, 0.0, anchors or Anchors.none(shape),
-            np.zeros(shape, int) if region is None else region, modes, median, noise, given,
+            np.zeros(shape, int) if region is None else region, modes, median, noise,
+            patches or AlbedoPatches.none(shape), given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -164,6 +169,7 @@ class FitProblem:
             "distance": held or stated.sample_distance_um,
             "tilt": math.radians(stated.tilt_deg),
             "aim": np.radians([stated.polar_deg, stated.azimuth_deg]),
+            "patch": s.patch_albedo_std,
         }
         return Priors(**{name: np.asarray(value, float) for name, value in numbers.items()})
 
@@ -185,8 +191,18 @@ class FitProblem:
             "distance": 1 if s.geometry and float(self.priors.distance) else 0,
             "tilt": 2 if s.geometry and stated.tilt_deg else 0,
             "aim": (k, 2) if is_aimed else 0,
+            "patch": len(self.patches.members),
         }
         return Parameters(**{name: np.zeros(shape) for name, shape in shapes.items()})
+
+    def start_parameters(self) -> Parameters:
+        """Make the parameters that a fit starts from: prior means, and the albedos of the patches as found."""
+        means, found = self.prior_means(), self.patches.log_albedo
+        return means.replaced(patch=np.pad(found, (0, means.patch.size - found.size)) / self.settings.patch_albedo_std)
+
+    def patches_at(self, parameters: Parameters) -> AlbedoPatches:
+        """Return the patches with the albedos of parameters."""
+        return self.patches.with_albedo(self.settings.patch_albedo_std * np.asarray(parameters.patch))
 
     @property
     def is_instrument_unknown(self) -> bool:
@@ -218,6 +234,7 @@ class FitProblem:
             order=self.order.thinned(thin),
             anchors=self.anchors.thinned(thin),
             region=self.region[thin],
+            patches=self.patches.thinned(thin),
             drift_modes=self.drift_modes[:, :, *thin],
             stride=stride,
         )

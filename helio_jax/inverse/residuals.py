@@ -38,6 +38,7 @@ class Parameters(eqx.Module):
         distance: of the sample from the plate [1].
         tilt: of the substrate [2: x, y].
         aim: polar angle and azimuth of the apertures [detector, 2].
+        patch: log albedo of the patches [patch].
     """
 
     log_gain: Any
@@ -51,6 +52,7 @@ class Parameters(eqx.Module):
     distance: Any
     tilt: Any
     aim: Any
+    patch: Any
 
     def free(self) -> tuple[str, ...]:
         """Names of the unknowns that have entries, without the scan lines.
@@ -79,7 +81,8 @@ class Unknowns(eqx.Module):
 
 class Priors(eqx.Module):
     """Prior standard deviations: relative gain; offset [detector]; scale of multiple scattering; albedo; drift and line
-    offsets [detector]; exponent of the law; distance [um]; tilt [rad]; polar angle and azimuth [2, rad]."""
+    offsets [detector]; exponent of the law; distance [um]; tilt [rad]; polar angle and azimuth [2, rad]; log albedo of
+    patches."""
 
     gain: Any
     offset: Any
@@ -91,6 +94,7 @@ class Priors(eqx.Module):
     distance: Any
     tilt: Any
     aim: Any
+    patch: Any
 
 
 class FormFactors(eqx.Module):
@@ -177,10 +181,12 @@ class FixedTerms(eqx.Module):
 
     Attributes:
         data: readings in units of the beam, 0 where not observed [detector, y, x].
+        patches: 1 in the pixels of each patch, 0 elsewhere [patch, y, x].
         inverse_sigma: robust weight over standard deviation, 0 where not observed [detector, y, x].
         form_factors: their expansion.
-        multiple: multiple scattering [detector, y, x].
-        occluded: change of the data by one standard deviation of where the occluded side stands [detector, y, x].
+        multiple: multiple scattering, per albedo of the own patch [detector, y, x].
+        occluded: change of the data by one standard deviation of where the occluded side stands, likewise
+            [detector, y, x].
         noise_bias: from `second_order_noise_bias` [detector, y, x].
         modes: how corrections follow common changes of the heights.
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
@@ -199,6 +205,7 @@ class FixedTerms(eqx.Module):
     """
 
     data: Any
+    patches: Any
     inverse_sigma: Any
     form_factors: FormFactors
     multiple: Any
@@ -230,6 +237,17 @@ def smooth_albedo(modes: jax.Array, shape: tuple[int, ...], std: Any) -> jax.Arr
     scale = std * jnp.sqrt(shape[0] * shape[1]) / jnp.maximum(rank, 1.0) ** 2
     spectrum = jnp.zeros(shape).at[:n, :n].set((modes * scale).at[0, 0].set(0.0))
     return jnp.exp(idctn(spectrum, norm="ortho"))
+
+
+def albedo_of_patches(log_albedo: Any, std: Any, patches: Any) -> jax.Array:
+    """Compute the albedo of every pixel's patch [y, x]: 1 outside of all patches.
+
+    Args:
+        log_albedo: of the patches, in prior standard deviations [patch].
+        std: prior standard deviation.
+        patches: 1 in the pixels of each patch, 0 elsewhere [patch, y, x].
+    """
+    return jnp.exp(jnp.tensordot(std * log_albedo, patches, 1))
 
 
 def surface_of(unknowns: Unknowns, fixed: FixedTerms) -> Surface:
@@ -275,6 +293,8 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
     multiple = fixed.multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
+    if parameters.patch.size:  # the first scattering of every order is by the own pixel
+        signal = albedo_of_patches(parameters.patch, p.patch, fixed.patches) * signal
     return readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)
 
 
@@ -323,13 +343,16 @@ def edge_scale(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> j
     Edges count in units of the slope noise that the data's noise makes, which falls with the gain and, near the
     plate, with the height: else a larger gain or level would explain the noise by smaller slopes, which the edges
     would prefer, however many pixels there are. For a level facet at the mean height, whose signal changes with its
-    slopes by the horizontal part of the form factor.
+    slopes by the horizontal part of the form factor. So does the mean albedo of patches.
     """
     weight = jnp.sqrt(jnp.mean(fixed.inverse_sigma**2, (1, 2)))[:, None]
     gain = jnp.exp(fixed.priors.gain * parameters.log_gain)[:, None]
     moves = moves_of(parameters, fixed.priors, len(fixed.data))
     here = fixed.form_factors.level_at(jnp.mean(surface.height), moves)
-    return jnp.sqrt(jnp.sum((weight * gain * here) ** 2) / jnp.sum((weight * fixed.form_factors.stated) ** 2))
+    scale = jnp.sqrt(jnp.sum((weight * gain * here) ** 2) / jnp.sum((weight * fixed.form_factors.stated) ** 2))
+    if parameters.patch.size:
+        scale = scale * jnp.mean(albedo_of_patches(parameters.patch, fixed.priors.patch, fixed.patches))
+    return scale
 
 
 def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> tuple[jax.Array, jax.Array]:

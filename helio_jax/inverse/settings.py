@@ -39,6 +39,10 @@ class RefineSettings(Settings):
     """Prior standard deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
+    patch_albedo_std: float = Field(default=0.3, gt=0.0, le=2.0)
+    """Prior standard deviation of the log albedo of patches, objects of other albedo than the substrate's."""
+    albedo_patches: bool = True
+    """Whether such patches are looked for; what is found is fitted where it explains the images better."""
     substrate_um: float | None = Field(default=None, gt=0.0, le=1e6)
     """Side of the substrate that scatters around the image [um]; default: as far beyond each border as the outermost
     aperture reaches, and once more the plate's distance."""

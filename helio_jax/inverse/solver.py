@@ -21,6 +21,8 @@ from helio_jax.inverse.residuals import (
     surface_of,
 )
 
+OF_SAMPLE = "albedo", "patch"
+"""Parameters that are free even while the instrument is held."""
 CG_TOLERANCE = 1e-2
 """Relative residual of the normal equations at which conjugate gradients stop."""
 
@@ -129,13 +131,21 @@ def free_parameters(parameters: Parameters) -> tuple[jax.Array, Callable[[jax.Ar
     return flat, lambda vector: parameters.replaced(**dict(zip(names, restore(vector), strict=True)))
 
 
+def _is_free(parameters: Parameters, is_instrument_free: Any) -> jax.Array:
+    """Make 1 for what is of the sample, `is_instrument_free` for all else, in the order of `free_parameters`."""
+    sizes = ((name, getattr(parameters, name).size) for name in parameters.free())
+    return jnp.concatenate([jnp.full(n, 1.0 if name in OF_SAMPLE else is_instrument_free) for name, n in sizes])
+
+
 @compiled
-def whitened_parameters(start: Unknowns, fixed: FixedTerms, is_level_free: np.ndarray) -> jax.Array:
+def whitened_parameters(
+    start: Unknowns, fixed: FixedTerms, is_level_free: np.ndarray, is_instrument_free: np.ndarray
+) -> jax.Array:
     """Compute the matrix whose columns are combinations of parameters and level, each one standard deviation apart.
 
     Gains, offsets, drift, angles and the level of all heights [um], the last row, have much the same effect on the
     data, and by far more than one pixel's height: as they are, conjugate gradients would take many steps for them
-    alone. The level takes part 1 or 0 times; a flat border holds it.
+    alone. The level takes part 1 or 0 times; a flat border holds it. So do the parameters of the instrument.
     """
     surface = surface_of(start, fixed)
     flat, restore = free_parameters(start.parameters)
@@ -146,7 +156,8 @@ def whitened_parameters(start: Unknowns, fixed: FixedTerms, is_level_free: np.nd
         parts = data_residuals(raised, parameters, fixed), border_residuals(raised, parameters, fixed)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    jacobian = jax.jacfwd(misfit)(jnp.append(flat, 0.0))
+    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), 1.0)
+    jacobian = jax.jacfwd(misfit)(jnp.append(flat, 0.0)) * is_free
     prior = jnp.ones(flat.size + 1).at[-1].add(-is_level_free)
     factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
     mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size + 1), lower=True).T
@@ -167,11 +178,8 @@ def solve(
     lines = start.parameters.lines
     seen = jnp.sum(fixed.inverse_sigma**2, 2 - fixed.slow_axis) * fixed.priors.lines[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
-    is_free = [
-        jnp.full(getattr(start.parameters, n).size, 1.0 if n == "albedo" else is_instrument_free)
-        for n in start.parameters.free()
-    ]
-    mixing = jnp.concatenate([*is_free, jnp.full(1, is_instrument_free)])[:, None] * mixing
+    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), is_instrument_free)
+    mixing = is_free[:, None] * mixing
     level_mode = jnp.sqrt(fixed.border.size) / fixed.whitening[0, 0]
 
     def decoded(variables: jax.Array) -> Unknowns:

@@ -24,7 +24,8 @@ from helio_jax.inverse.responses import Response, normal_slope, region_responses
 from helio_jax.inverse.settings import RefineSettings
 
 Predict = Callable[..., Corrections]
-"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown."""
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and
+the albedo [y, x], by its name, where it is not 1. The corrections are per albedo of the own pixel."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,9 @@ class FitState:
     def at(cls, problem: FitProblem, start: Surface) -> "FitState":
         """Start at a surface, parameters at their prior means, without corrections."""
         surface = Surface(*(np.asarray(f) for f in (start.height, start.slope_x, start.slope_y)))
-        held = _held(problem, Corrections.none(problem.signal.shape), surface, problem.prior_means())
-        return cls(surface, problem.prior_means(), np.zeros(problem.signal.shape), held)
+        parameters = problem.start_parameters()
+        held = _held(problem, Corrections.none(problem.signal.shape), surface, parameters)
+        return cls(surface, parameters, np.zeros(problem.signal.shape), held)
 
     def thinned(self, problem: FitProblem, stride: int) -> "FitState":
         """Keep every `stride`-th row and column, for `problem`, which is thinned."""
@@ -143,7 +145,8 @@ def _held(problem: FitProblem, corrections: Corrections, surface: Surface, param
     """Derive what a solve needs of corrections made for a surface, without responses."""
     normals, moved = surface.normals(problem.shift), problem.moves(parameters)
     masked, multiple = linearised_in_normal(corrections, normals)
-    variance = problem.variance + prediction_std(corrections, normals, problem.settings) ** 2
+    albedo = problem.patches_at(parameters).albedo
+    variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
     moves = np.zeros((len(moved), *corrections.masked.shape))
     return Held(corrections, surface, masked, multiple, sigma, moves, moved)
@@ -164,7 +167,8 @@ def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) 
     surface, p = state.surface, state.parameters
     is_geometry_known = not p.distance.size and not p.aim.size
     instrument = () if is_geometry_known else (problem.fitted_instrument(p),)
-    corrections = predict(surface.height, surface.normals(problem.shift), *instrument)
+    known = problem.patches_at(p).known
+    corrections = predict(surface.height, surface.normals(problem.shift), *instrument, **known)
     return set_corrections(problem, state, corrections, surface)
 
 

@@ -135,7 +135,7 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     """Expand form factors and estimate the noise bias at a state; `limit` as in `freeze`."""
     held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
     largest = _NOISY * noise * _steepness(*slopes)
-    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma
+    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
     corrections = held.masked, held.moves, held.moved
     with jax.enable_x64(True):
         factors = _form_factors(problem.optics, problem.moves(state.parameters), state.surface.height, corrections)
@@ -194,6 +194,7 @@ def freeze(
     occluded_std, anchors = held.corrections.occluded, problem.all_anchors.padded(MODE_BLOCK)
     fixed = FixedTerms(
         data=problem.data,
+        patches=problem.patches.members,
         inverse_sigma=inverse_sigma * problem.stride,
         form_factors=pixels.factors,
         multiple=held.multiple,
@@ -247,8 +248,9 @@ def step(
     start, fixed = freeze(problem, state, limit, cut, occluded)
     free = np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
-        if is_instrument_free and (problem.is_instrument_unknown or problem.is_level_free):
-            mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)))
+        is_mixed = problem.is_instrument_unknown or problem.is_level_free
+        if (is_instrument_free and is_mixed) or start.parameters.patch.size:
+            mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)), free)
         else:  # as they are, where they are held or little is unknown
             n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
             mixing = np.diag([1.0] * n + [0.0])

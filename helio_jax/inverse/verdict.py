@@ -18,6 +18,7 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import surface_of_heights
+from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.quality import squares
 from helio_jax.micrograph import MicrographStack
@@ -38,10 +39,13 @@ Trace = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3], instrument) -> masks and multiple scattering, both traced."""
 
 
-def data_std(variance: np.ndarray, corrections: Corrections) -> np.ndarray:
-    """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, occluded side."""
+def data_std(variance: np.ndarray, corrections: Corrections, albedo: np.ndarray) -> np.ndarray:
+    """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, occluded side.
+
+    The corrections are per albedo [y, x] of the own pixel.
+    """
     hidden = 0.0 if corrections.occluded is None else corrections.occluded
-    return np.sqrt(variance + (MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2)
+    return np.sqrt(variance + albedo**2 * ((MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2))
 
 
 def local_chi_square(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
@@ -79,10 +83,10 @@ class Misfit:
         return self.difference / self.std
 
 
-def misfit_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) -> Misfit:
+def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPatches, trace: Trace) -> Misfit:
     """Trace a photometric height map and compare it with the data.
 
-    The normals are those of the heights, not of the photometric solution; albedo 1.
+    The normals are those of the heights, not of the photometric solution; the albedo is that of the patches.
 
     Raises:
         PredictionError: the map is too rough or steep to be traced.
@@ -91,12 +95,12 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, trace: Trace) -> 
     optics = Optics.of(rec.instrument)
     with jax.enable_x64(True):
         normals = surface_of_heights(rec.height, Raster.of(stack)).normals(optics.beam_shift)
-    c = trace(rec.height, normals, rec.instrument)
+    c, albedo = trace(rec.height, normals, rec.instrument, **patches.known), patches.albedo
     phi = form_factor(optics, rec.height)
     is_subtracted = stack.calibration is not None and stack.calibration.without_multiple
     single = single_scattering(phi - c.masked, np.moveaxis(normals, -1, 0))
     model = single + (0.0 if is_subtracted else c.multiple)
-    return Misfit(model - signal, data_std(variance, c), phi, normals)
+    return Misfit(albedo * model - signal, data_std(variance, c, albedo), albedo * phi, normals)
 
 
 def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
@@ -111,8 +115,9 @@ def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -
     from helio_jax.inverse.steps import expected
 
     state = predict_corrections(problem, state, trace)
+    albedo = problem.patches_at(state.parameters).albedo
     rest = expected(problem, state, is_noisy=True) - problem.data
-    return np.where(problem.is_observed, rest / data_std(problem.variance, state.held.corrections), 0.0)
+    return np.where(problem.is_observed, rest / data_std(problem.variance, state.held.corrections, albedo), 0.0)
 
 
 def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:

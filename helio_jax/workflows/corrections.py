@@ -8,7 +8,7 @@ the beam does not see may stand anywhere between that sheet and below the rim: b
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -22,7 +22,9 @@ from helio_jax.forward.render import Corrections, masking_corrections, radiosity
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
+from helio_jax.scene.body import Body
 from helio_jax.scene.border import extend_border
+from helio_jax.scene.scattering import CosineLaw, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
@@ -89,18 +91,27 @@ def make_predictor(
         raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), lift, reach, border == "flat")
         return Optics.of(instrument), raster
 
-    def predict(height: np.ndarray, normals: np.ndarray, instrument: Instrument = stack.instrument) -> Corrections:
+    def predict(
+        height: np.ndarray,
+        normals: np.ndarray,
+        instrument: Instrument = stack.instrument,
+        *,
+        albedo: np.ndarray | None = None,
+    ) -> Corrections:
         optics, raster = prepared(instrument.model_dump_json())
         surface = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2])
         if multiple == "radiosity":
             plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * raster.reach)
-            return radiosity_corrections(surface, optics, Raster.of(stack), plan)
+            found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
+            return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
         smooth, smooth_normals = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
         sides = raster.sides(smooth, smooth_normals)
         branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
-        traced = [smooth_along_surface(side.multiple(settings, limit), smooth_normals, passes) for side in sides]
+        traced = [
+            smooth_along_surface(side.multiple(settings, limit, albedo), smooth_normals, passes) for side in sides
+        ]
         if masks_by == "rays":
             masked, freed = 0.0, [side.masked(np.ones(height.shape, bool)) for side in sides]
         else:
@@ -118,6 +129,11 @@ def make_predictor(
         return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals)
 
     return predict
+
+
+def _mean(albedo: np.ndarray) -> float:
+    """Compute the mean albedo of what scatters again, for radiosity, which knows no other."""
+    return float(np.mean(np.minimum(albedo, 1.0)))
 
 
 def _surroundings(instrument: Instrument) -> float:
@@ -150,12 +166,18 @@ class SurfaceHypothesis:
 
     raster: "_Raster"
     points: Hits
+    body: Body
+    grid_shape: tuple[int, ...]
     intersector: Intersector
 
-    def multiple(self, settings: TraceSettings, max_buried: float) -> np.ndarray:
-        """Trace the multiple scattering [detector, y, x]."""
+    def multiple(self, settings: TraceSettings, max_buried: float, albedo: np.ndarray | None = None) -> np.ndarray:
+        """Trace the multiple scattering [detector, y, x], per albedo of the own pixel; default: albedo 1 everywhere."""
         r = self.raster
-        experiment = make_experiment(self.intersector, r.instrument, settings)
+        if albedo is None:
+            intersector, laws, own = self.intersector, {}, 1.0
+        else:
+            intersector, laws, own = self._with_albedo(albedo)
+        experiment = make_experiment(intersector, r.instrument, settings, laws)
         x, y = r.x.ravel(), r.y.ravel()
         try:
             tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=max_buried)
@@ -165,7 +187,27 @@ class SurfaceHypothesis:
                 f"the surface of the fit is too rough or steep to trace multiple scattering from ({found}): check "
                 "background and gains, or use method = 'nearfield'"
             ) from e
-        return tally.probability()[0][1].reshape(-1, *r.x.shape)
+        return tally.probability()[0][1].reshape(-1, *r.x.shape) / own
+
+    def _with_albedo(self, albedo: np.ndarray) -> tuple[Intersector, dict[str, tuple[Term, ...]], float]:
+        """Give the faces the albedo [y, x] of their first point of the grid; those beyond it, that of its corner.
+
+        Relative albedos above 1 count as 1: no material reflects more atoms than it receives.
+
+        Returns:
+            The surface, its laws, and the albedo of the face that all paths are taken to start from.
+        """
+        pad = (int(self.grid_shape[0]) - albedo.shape[0]) // 2
+        on_grid = np.pad(np.minimum(albedo, 1.0), pad, mode="edge").ravel()
+        levels, index = np.unique(on_grid, return_inverse=True)
+        names = tuple(f"albedo {i}" for i in range(levels.size))
+        first = self.body.faces.min(axis=1)
+        material = np.where(first < on_grid.size, index[np.minimum(first, on_grid.size - 1)], index[0])
+        body = replace(self.body, materials=names, face_material=material)
+        intersector = Intersector(body)
+        start = int(intersector.material_of(np.zeros(1, np.int32))[0])
+        laws = {name: CosineLaw(albedo=float(a)).terms() for name, a in zip(names, levels, strict=True)}
+        return intersector, laws, float(levels[start])
 
     def masked(self, is_wanted: np.ndarray) -> np.ndarray:
         """Compute the masked vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
@@ -209,7 +251,7 @@ class _Raster:
             extended, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
             body = with_cavities(surface_body(*extended), extended, behind)
         point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
-        return SurfaceHypothesis(self, Hits.on_mesh(point, normal), Intersector(body))
+        return SurfaceHypothesis(self, Hits.on_mesh(point, normal), body, behind[0].shape, Intersector(body))
 
     def sides(self, height: np.ndarray, normals: np.ndarray) -> list[SurfaceHypothesis]:
         """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
