@@ -202,8 +202,8 @@ def _closed(choice: np.ndarray) -> np.ndarray:
     """Leave out parts of patches [y, x] that are smaller than a patch: they take the substrate's number, 0."""
     out = np.zeros_like(choice)
     for i in range(1, int(choice.max()) + 1):
-        parts, _ = label(choice == i)  # type: ignore[misc]  # SciPy's stubs take the result for a number
+        parts = np.asarray(label(choice == i)[0])  # type: ignore[index]  # SciPy's stubs take the result for a number
         is_large = np.bincount(parts.ravel()) >= LEAST_PIXELS
         is_large[0] = False
-        out[is_large[parts]] = i
+        out[np.isin(parts, np.flatnonzero(is_large))] = i
     return out

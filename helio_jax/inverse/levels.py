@@ -109,7 +109,7 @@ def at_level(
 
 @dataclass(frozen=True)
 class Region:
-    """A region whose level is in doubt.
+    """A region whose level is poorly determined.
 
     Attributes:
         inside: its pixels [y, x].

@@ -38,7 +38,7 @@ from helio_jax.inverse.quality import (
     regions,
     squares,
 )
-from helio_jax.inverse.regions import find_regions, in_doubt
+from helio_jax.inverse.regions import find_regions, poorly_determined
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
 from helio_jax.inverse.verdict import (
@@ -197,7 +197,7 @@ def _with_levels(
     start: Surface,
     smoothed: Surface,
 ) -> "tuple[Fit, np.ndarray]":
-    """Fit the heights from a start, or one nearer to a smoothed surface; then the levels of regions in doubt.
+    """Fit the heights from a start, or one nearer to a smoothed surface; then the levels of poorly determined regions.
 
     Regions at whose outlines the data contradict the fit are put to the levels that explain the data best, and all is
     fitted again, until nothing improves.
@@ -249,8 +249,8 @@ def _with_levels(
         for _ in range(0 if fit.is_interrupted else MAX_SEARCHES):
             is_contradicted = local_chi_square(residuals, stack.is_observed) > LIMIT
             reliefs = start.height, fit.surface.height
-            doubtful = in_doubt(find_regions(signal, variance, reliefs), is_contradicted)[:MAX_REGIONS]
-            left = [Region(inside, kinds=("as fitted",)) for inside in doubtful]
+            candidates = poorly_determined(find_regions(signal, variance, reliefs), is_contradicted)[:MAX_REGIONS]
+            left = [Region(inside, kinds=("as fitted",)) for inside in candidates]
             if not left:
                 break
             p = fit.parameters

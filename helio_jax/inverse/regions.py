@@ -1,4 +1,4 @@
-"""Regions whose level is in doubt: candidates for `levels`, outlined by the images.
+"""Regions whose level is poorly determined: candidates for `levels`, outlined by the images.
 
 Slopes say nothing about the height of what a depth jump parts from the substrate: a least-squares fit bridges the jump
 by slopes that the images contradict. Its heights still show roughly where the region is, and the images show its
@@ -25,7 +25,7 @@ MAX_SHARE = 0.6
 ALIKE = 0.9
 """Regions that share more than this of their union are one."""
 CONTRADICTED = 0.1
-"""Share of a region's outline that the data must contradict for its level to be in doubt."""
+"""Share of a region's outline that the data must contradict for its level to count as poorly determined."""
 _SCALE = 1.0
 """Width of the Gaussian whose derivative measures the change of the images [pixels]."""
 _DERIVATIVES: tuple[Any, ...] = (0, 0, 1), (0, 1, 0)
@@ -105,6 +105,6 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     return np.asarray(binary_dilation(mask, np.ones((3, 3)), iterations=pixels))
 
 
-def in_doubt(regions: list[np.ndarray], is_contradicted: np.ndarray) -> list[np.ndarray]:
+def poorly_determined(regions: list[np.ndarray], is_contradicted: np.ndarray) -> list[np.ndarray]:
     """Keep the regions at whose outlines the data contradict a fit [y, x]."""
     return [region for region in regions if is_contradicted[outline(region)].mean() > CONTRADICTED]
