@@ -255,7 +255,7 @@ def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Correcti
 
     def make_predict(n_rays: int):
         predict = make_predictor(stack, n_rays, chosen.refine.substrate_um)
-        return lambda height, normals: change(predict(height, normals))
+        return lambda *surface, **known: change(predict(*surface, **known))
 
     start = time.perf_counter()
     rec = reconstruct_stack(stack, chosen, make_predict)

@@ -13,7 +13,7 @@ from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.convergence import aitken, remaining_error
-from helio_jax.inverse.fit import fit_heights
+from helio_jax.inverse.fit import fit_heights, with_posterior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, set_corrections, update_corrections
@@ -145,7 +145,7 @@ def test_a_level_that_is_free_comes_to_rest(bshem):
     assert rec.provenance["height_changes_um"][-1] < 3.0
 
 
-def nothing_more(height, normals, *instrument):
+def nothing_more(height, normals, *instrument, **albedo):
     """Predict single scattering without masks."""
     return Corrections.none((3, *SHAPE))
 
@@ -159,7 +159,7 @@ def fitted(bshem, drift=0.0, order=ScanOrder(), border="flat", noise=0.01, state
     data = signal + drift * signal.mean()
     raster = Raster.regular(SHAPE, PITCH)
     problem = FitProblem.of(data, variance, stated or bshem, raster, surface, settings, order=order)
-    return fit_heights(problem, surface, nothing_more)
+    return with_posterior(fit_heights(problem, surface, nothing_more))
 
 
 def signal_of(instrument, surface):
