@@ -33,19 +33,26 @@ LIMIT = 2.5
 map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
 MULTIPLE_ERROR = 0.1
 """Assumed relative error of the traced multiple scattering: of paths, raster and what lies outside the image."""
+MODEL_ERROR = 0.01
+"""Assumed relative error of the traced signal: of facets as large as a pixel. Counts without noise need it."""
 _CONTRADICTED = REASONS.index("contradicts the data")
 
 Trace = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3], instrument) -> masks and multiple scattering, both traced."""
 
 
-def data_std(variance: np.ndarray, corrections: Corrections, albedo: np.ndarray) -> np.ndarray:
+def data_std(variance: np.ndarray, model: np.ndarray, corrections: Corrections, albedo: np.ndarray) -> np.ndarray:
     """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, occluded side.
 
-    The corrections are per albedo [y, x] of the own pixel.
+    Args:
+        variance: of the data [detector, y, x].
+        model: expected data [detector, y, x].
+        corrections: per albedo of the own pixel.
+        albedo: [y, x].
     """
     hidden = 0.0 if corrections.occluded is None else corrections.occluded
-    return np.sqrt(variance + albedo**2 * ((MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2))
+    traced = albedo**2 * ((MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2)
+    return np.sqrt(variance + (MODEL_ERROR * model) ** 2 + traced)
 
 
 def local_chi_square(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
@@ -100,7 +107,8 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPa
     is_subtracted = stack.calibration is not None and stack.calibration.without_multiple
     single = single_scattering(phi - c.masked, np.moveaxis(normals, -1, 0))
     model = single + (0.0 if is_subtracted else c.multiple)
-    return Misfit(albedo * model - signal, data_std(variance, c, albedo), albedo * phi, normals)
+    model = albedo * model
+    return Misfit(model - signal, data_std(variance, model, c, albedo), albedo * phi, normals)
 
 
 def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
@@ -116,8 +124,9 @@ def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -
 
     state = predict_corrections(problem, state, trace)
     albedo = problem.patches_at(state.parameters).albedo
-    rest = expected(problem, state, is_noisy=True) - problem.data
-    return np.where(problem.is_observed, rest / data_std(problem.variance, state.held.corrections, albedo), 0.0)
+    model = expected(problem, state, is_noisy=True)
+    std = data_std(problem.variance, model, state.held.corrections, albedo)
+    return np.where(problem.is_observed, (model - problem.data) / std, 0.0)
 
 
 def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:

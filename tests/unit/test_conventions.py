@@ -306,7 +306,7 @@ def test_reconstructed_normals_lean_downhill(bump, bump_height):
 
 
 def test_masks_say_what_true_means(bump):
-    """A pixel that one of three detectors did not record is not `is_valid`; all others are, but where the data contradict the map.
+    """A pixel that one of three detectors did not record is not `is_valid`; the others are, unless contradicted.
 
     Catches: inverted masks, a count in an unobserved pixel (here 1e9) that enters the fit.
     """
@@ -318,7 +318,7 @@ def test_masks_say_what_true_means(bump):
     others = np.delete(rec.reason.ravel(), 4 * 31 + 7)
     allowed = {0, REASONS.index("floating"), REASONS.index("contradicts the data")}
     assert not rec.is_valid[4, 7] and set(np.unique(others)) <= allowed
-    assert np.mean(others == 0) > 0.8 and np.array_equal(rec.is_valid, rec.reason == 0)
+    assert np.mean(others == 0) > 0.7 and np.array_equal(rec.is_valid, rec.reason == 0)
     assert REASONS[rec.reason[4, 7]] == "too few images"
     assert np.abs(rec.height[4, 7]) < 20.0  # on the flat
 
