@@ -93,8 +93,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_bilateral bilateral normal integration
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
-  regions             segmentation of the images into regions behind depth jumps
-  levels              level search of such regions
+  levels              level search of regions behind depth jumps
   merging             segmentation of a noisy map by region merging
   albedo_patches      parts of the surface of other albedo than the substrate's
   albedo_search       such parts in a measurement

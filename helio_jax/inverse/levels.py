@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.optimize import minimize_scalar
 
 from helio_jax.arrays import nearest_known
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.quality import FLOATING
-from helio_jax.inverse.regions import grown
 
 _LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Levels that are tried, up and down, in widths of the region ..."""
@@ -250,6 +249,11 @@ def without_skirt(inside: np.ndarray, others: np.ndarray, surface: Surface) -> S
         return surface
     nearest = nearest_known(is_known)
     return jax.tree.map(lambda f: np.where(skirt, f[nearest], f), surface)
+
+
+def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """Grow a mask [y, x] by so many pixels."""
+    return np.asarray(binary_dilation(mask, np.ones((3, 3)), iterations=pixels))
 
 
 def _differ(surface: Surface, other: Surface, inside: np.ndarray, surroundings: float) -> bool:

@@ -6,7 +6,6 @@ instrument from the stack, and, if the settings say so, that the border of the i
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.levels import GAIN, SKIRT, Levels, Region, search_levels
+from helio_jax.inverse.levels import GAIN, SKIRT, Region, search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
@@ -38,7 +37,6 @@ from helio_jax.inverse.quality import (
     regions,
     squares,
 )
-from helio_jax.inverse.regions import find_regions, poorly_determined
 from helio_jax.inverse.settings import LEAST_PATHS, ReconstructSettings
 from helio_jax.inverse.state import linearised_in_normal, prediction_std
 from helio_jax.inverse.verdict import (
@@ -56,9 +54,9 @@ from helio_jax.reconstruction import Reconstruction
 MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate ..."""
 SEARCH_THRIFT = 8
-"""... with this many times fewer paths per prediction than the fit ..."""
-MAX_SEARCHES, MAX_REGIONS = 2, 3
-"""... and so often, each time in so many regions and followed by a fit."""
+"""... with this many times fewer paths per prediction than the fit, which is tested so, too."""
+MIN_CONTRADICTED = 0.02
+"""Patches of another albedo are searched where the data contradict the fit without them in a larger share of pixels."""
 START_THRIFT = 4
 """The same for photometric solutions, but not fewer than the least number: from a noisier start the rim of sphere B is
 7 % worse."""
@@ -74,7 +72,6 @@ GEOMETRY_WARNING = (
 
 if TYPE_CHECKING:
     from helio_jax.inverse.fit import Fit, Report
-    from helio_jax.inverse.residuals import Parameters
     from helio_jax.inverse.state import Predict
 
 
@@ -141,6 +138,11 @@ def start_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
     return min(n_paths, max(n_paths // START_THRIFT, LEAST_PATHS))
 
 
+def search_paths(stack: MicrographStack, settings: ReconstructSettings) -> int:
+    """Choose the number of paths per prediction in a search and in the test of a fit."""
+    return max(settings.refine.paths(stack.counts[0].size) // SEARCH_THRIFT, 1000)
+
+
 def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
     """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
     signal, variance = (f / patches.albedo**n for n, f in enumerate(signal_of(stack), 1))
@@ -197,45 +199,36 @@ def _with_levels(
     start: Surface,
     smoothed: Surface,
 ) -> "tuple[Fit, np.ndarray]":
-    """Fit the heights from a start, or one nearer to a smoothed surface; then the levels of poorly determined regions.
-
-    Regions at whose outlines the data contradict the fit are put to the levels that explain the data best, and all is
-    fitted again, until nothing improves.
+    """Fit the heights from a start, or one nearer to a smoothed surface, with regions at the levels of their steps.
 
     Returns:
-        The fit, and where another level explains the images as well, or better but could not be fitted [y, x].
+        The fit, and where another level explains the images as well [y, x].
     """
     from helio_jax.inverse.fit import fit_heights, misfit_on, settled
     from helio_jax.inverse.problem import FitProblem
 
     signal, variance = signal_of(stack)
     raster, n_paths = Raster.of(stack), settings.refine.paths(signal[0].size)
-    predict, roughly = make_predict(n_paths), make_predict(max(n_paths // SEARCH_THRIFT, 1000))
+    predict, roughly = make_predict(n_paths), make_predict(search_paths(stack, settings))
 
     def pose(surface: Surface, region: np.ndarray | None = None, anchors: Anchors | None = None) -> FitProblem:
         known = signal, variance, stack.instrument, raster, surface, settings, region
         return FitProblem.of(*known, scan_order(stack), patches=patches, anchors=anchors)
 
-    def tested(fit: "Fit") -> np.ndarray:
-        return residuals_of_state(fit.problem, fit.state, roughly)
-
-    def search(regions: list[Region], surface: Surface, parameters: "Parameters | None") -> Levels:
-        return search_levels(
-            regions,
-            surface,
-            (raster.dy, raster.dx),
-            MAX_WIDTH * stack.instrument.sample_distance,
-            lambda trial: misfit_on(pose(trial), trial, roughly, parameters),
-            lambda trial: settled(pose(trial), trial, roughly, parameters),
-            stack.instrument.beam_shift,
-            lambda said: report(0, settings.refine.max_rounds, said) if report else None,
-        )
-
     labels, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
     anchors = None
     if steps := measured_regions(stack):
         try:
-            found = search(steps, start, None)
+            found = search_levels(
+                steps,
+                start,
+                (raster.dy, raster.dx),
+                MAX_WIDTH * stack.instrument.sample_distance,
+                lambda trial: misfit_on(pose(trial), trial, roughly),
+                lambda trial: settled(pose(trial), trial, roughly),
+                stack.instrument.beam_shift,
+                lambda said: report(0, settings.refine.max_rounds, said) if report else None,
+            )
             start, is_undecided = found.surface, covered(steps, found.undecided)
             labels = labelled(labels, steps, found.moved)
             anchors = level_anchors(labels, [steps[i] for i in found.moved], start)
@@ -244,32 +237,6 @@ def _with_levels(
     fit, _ = _with_backtracking(
         lambda surface: fit_heights(pose(surface, labels, anchors), surface, predict, report), start, smoothed
     )
-    try:
-        residuals = tested(fit)
-        for _ in range(0 if fit.is_interrupted else MAX_SEARCHES):
-            is_contradicted = local_chi_square(residuals, stack.is_observed) > LIMIT
-            reliefs = start.height, fit.surface.height
-            candidates = poorly_determined(find_regions(signal, variance, reliefs), is_contradicted)[:MAX_REGIONS]
-            left = [Region(inside, kinds=("as fitted",)) for inside in candidates]
-            if not left:
-                break
-            p = fit.parameters
-            known = p.replaced(log_multiple=0.0 * p.log_multiple, occluded=np.zeros(()))
-            found = search(left, fit.surface, known if fit.problem.is_instrument_unknown or patches else None)
-            is_undecided |= covered(left, found.undecided)
-            if not found.moved:
-                break
-            before, is_undecided = is_undecided, is_undecided | covered(left, found.moved)  # unless the fit goes on
-            trial = labelled(labels, left, found.moved)
-            again = fit_heights(pose(found.surface, trial, anchors), found.surface, predict, report)
-            anew = tested(again)
-            if np.sum(squares(anew)) > np.sum(squares(residuals)):
-                break
-            fit, residuals, labels, is_undecided = again, anew, trial, before
-    except KeyboardInterrupt:
-        fit = replace(fit, status=f"interrupted in the search for levels; before that: {fit.status}")
-    except PredictionError as e:
-        fit = replace(fit, status=f"{fit.status}; a better level was found that could not be fitted: {e}")
     return fit, is_undecided
 
 
@@ -341,22 +308,27 @@ def _with_albedos(stack, settings, make_predict, report) -> "tuple[Fit, np.ndarr
     Their albedos are kept where the data that are expected of the second fit explain the images better.
     """
     predict = make_predict(start_paths(stack, settings))
+    roughly = make_predict(search_paths(stack, settings))
 
     def fitted(patches: AlbedoPatches) -> "tuple[Fit, np.ndarray]":
         start = _start(stack, settings, patches, predict)
         return _with_levels(stack, settings, make_predict, report, patches, *start)
 
     def tested(fit: "Fit") -> np.ndarray:
-        return squares(residuals_of_state(fit.problem, fit.state, predict))
+        return squares(residuals_of_state(fit.problem, fit.state, roughly))
 
     if not settings.refine.albedo_patches:
         return fitted(AlbedoPatches.none(stack.shape[1:]))
-    found = search_albedo_patches(stack, settings, predict)
-    plain = fitted(found.keeping([]))
-    if not found.objects or plain[0].is_interrupted:
+    plain = fitted(AlbedoPatches.none(stack.shape[1:]))
+    if plain[0].is_interrupted:
         return plain
     try:
-        square = tested(plain[0])
+        residuals = residuals_of_state(plain[0].problem, plain[0].state, roughly)
+        if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
+            return plain
+        square, found = squares(residuals), search_albedo_patches(stack, settings, predict)
+        if not found.objects:
+            return plain
         left = found.keeping(found.unexplained(square.mean(0)))
         if not left.objects:
             return plain

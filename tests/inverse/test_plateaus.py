@@ -1,4 +1,4 @@
-"""Levels of regions: candidates from heights and images, put to the level a made-up misfit asks for, a real trench."""
+"""Levels of regions: put to the level a made-up misfit asks for, a real trench."""
 
 import jax
 import numpy as np
@@ -10,7 +10,6 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse import methods as solve
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
-from helio_jax.inverse.regions import contrast, find_regions, poorly_determined
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_height
@@ -25,50 +24,9 @@ def search(surface, misfit, beam_shift=(0.0, 0.0)):
     return search_levels([Region(INSIDE)], surface, (10.0, 10.0), 500.0, misfit, lambda s: (misfit(s), s), beam_shift)
 
 
-def images(change, seed=0, noise=0.04):
-    """Return three noisy images of mean 1, changed within the rectangle by the given amounts, and their variances."""
-    rng = np.random.default_rng(seed)
-    signal = 1.0 + np.asarray(change)[:, None, None] * INSIDE + noise * rng.normal(size=(3, *SHAPE))
-    return signal, np.full(signal.shape, noise**2)
-
-
-def overlap(region):
-    """Return the share of a region and the rectangle that both have."""
-    return (region & INSIDE).sum() / (region | INSIDE).sum()
-
-
 def blurred(height):
     """Return what a fit makes of a region at a height: right inside, with a skirt of three pixels."""
     return gaussian_filter(np.where(INSIDE, height, 0.0), 2.0)
-
-
-@pytest.mark.parametrize("height", [40.0, -40.0])
-def test_a_region_that_heights_and_two_detectors_show_is_outlined(height):
-    """The heights are blurred by two pixels; the outline is that of the images, to one pixel."""
-    found = find_regions(*images([-0.5, 0.3, 0.2]), [blurred(height)])
-    assert 1 <= len(found) <= 2 and all(overlap(region) > 0.8 for region in found)
-
-
-def test_the_edge_of_a_mask_has_no_contrast():
-    """Only one detector changes: what is left is noise. Rejects looking at the sum over all detectors."""
-    assert contrast(*images([-0.7, 0.0, 0.0])).max() < 6.0 < contrast(*images([-0.7, 0.5, 0.0])).max()
-
-
-def test_what_was_not_observed_hides_no_region():
-    """A lost corner and single lost data beside the region change nothing."""
-    signal, variance = images([-0.5, 0.3, 0.2])
-    signal[:, :8, :8] = np.nan
-    signal[1, 20, 45:48] = variance[2, 5, 30] = np.nan
-    found = find_regions(signal, variance, [blurred(40.0)])
-    assert any(overlap(region) > 0.8 for region in found)
-
-
-def test_only_contradicted_outlines_are_candidates():
-    """A region whose outline the fit explains stays; a fifth of the outline contradicted is enough."""
-    told = np.zeros(SHAPE, bool)
-    assert not poorly_determined([INSIDE], told)
-    told[10:32, 13:18] = True
-    assert poorly_determined([INSIDE], told)
 
 
 def test_the_skirt_of_a_region_is_taken_off():
