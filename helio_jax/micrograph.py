@@ -156,6 +156,11 @@ class MicrographStack:
         return self.counts - (self.background[:, None, None] if self.background.ndim == 1 else self.background)
 
     @property
+    def is_without_multiple(self) -> bool:
+        """Whether the calibration subtracted the predicted multiple scattering from the counts."""
+        return self.calibration is not None and self.calibration.without_multiple
+
+    @property
     def multiple(self) -> np.ndarray | None:
         """Counts of order 2 and above [detector, y, x], or None if the orders are unknown."""
         return None if self.by_order is None else self.by_order[1:].sum(0)

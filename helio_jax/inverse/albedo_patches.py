@@ -1,4 +1,4 @@
-"""AlbedoPatches: parts of the surface whose albedo is unlike 1, the albedo of the calibrated substrate.
+"""Patches: parts of the surface whose albedo is unlike 1, the albedo of the calibrated substrate.
 
 The photometric solution has an albedo of its own in every pixel. Where masks and multiple scattering are subtracted, an
 object of another material shows as a closed region of constant albedo; a wrong mask, a crevice or a limb does not stay
@@ -44,7 +44,7 @@ _LEAST_STD = 0.01
 
 @dataclass(frozen=True)
 class AlbedoPatches:
-    """AlbedoPatches and where their albedos start.
+    """Where patches of another albedo are, and the albedos that a fit starts from.
 
     Attributes:
         number: of the patch of every pixel, 0: albedo 1 [y, x].
@@ -131,18 +131,18 @@ def find_albedo_patches(log_albedo: np.ndarray, std: np.ndarray, border: float |
     limited = np.clip(value, middle - 1.0, middle + 1.0)
     region = merge_regions(limited, weight, _PENALTY)
     base = 0 if border is None else int(np.bincount(region[frame]).argmax())
-    ground = level_of(limited, weight, region == base)
-    noise = max(1.0, _scatter(limited, weight, region == base, ground))
-    found = [ground]
+    substrate = level_of(limited, weight, region == base)
+    noise = max(1.0, _scatter(limited, weight, region == base, substrate))
+    found = [substrate]
     for number in np.flatnonzero(np.bincount(region.ravel()) >= LEAST_PIXELS):
         inside = region == number
-        if number != base and _is_patch(limited, weight, inside, ground, noise):
+        if number != base and _is_patch(limited, weight, inside, substrate, noise):
             found.append(level_of(limited, weight, inside))
     levels = np.array(found)
     choice = _closed(_chosen(limited, weight, levels))
     levels = np.array([level_of(limited, weight, choice == i, level) for i, level in enumerate(levels)])
     kept = [i for i in range(1, levels.size) if np.sum(choice == i) >= LEAST_PIXELS]
-    is_common = border is not None and abs(ground) > LEAST_COMMON
+    is_common = border is not None and abs(substrate) > LEAST_COMMON
     found = AlbedoPatches(choice + 1, levels, True).keeping([i + 1 for i in kept])
     if is_common:
         return found
@@ -164,14 +164,14 @@ def _scatter(value: np.ndarray, weight: np.ndarray, inside: np.ndarray, level: f
     return float(np.mean(np.minimum(weight * (value - level) ** 2, _OUTLIER)[inside]))
 
 
-def _is_patch(value: np.ndarray, weight: np.ndarray, inside: np.ndarray, ground: float, noise: float) -> bool:
+def _is_patch(value: np.ndarray, weight: np.ndarray, inside: np.ndarray, substrate: float, noise: float) -> bool:
     """Whether a region differs from the substrate, is more than a rim, and of one albedo."""
     level = level_of(value, weight, inside)
-    significance = abs(level - ground) * np.sqrt(weight[inside].sum() / noise)
+    significance = abs(level - substrate) * np.sqrt(weight[inside].sum() / noise)
     core = binary_erosion(inside, np.ones((2, 2)))
     is_rim = core.sum() < 0.25 * inside.sum()
     is_constant = _scatter(value, weight, inside, level) < CONSTANCY * noise
-    is_other = LEAST_CHANGE < abs(level - ground) < LARGEST_CHANGE
+    is_other = LEAST_CHANGE < abs(level - substrate) < LARGEST_CHANGE
     return is_other and significance > SIGNIFICANCE and is_constant and not is_rim
 
 

@@ -42,7 +42,6 @@ def search_albedo_patches(stack: MicrographStack, settings: ReconstructSettings,
     """Find the patches of other albedo in micrographs; none where masks and multiple scattering are not predictable."""
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     signal, variance = signal_of(stack)
-    is_corrected = stack.calibration is not None and stack.calibration.without_multiple
     height, solution = solve_nearfield(signal, variance, optics, raster, settings, settings.rounds)
     border = settings.border_fraction if settings.border == "flat" else None
     patches = AlbedoPatches.none(height.shape)
@@ -52,7 +51,7 @@ def search_albedo_patches(stack: MicrographStack, settings: ReconstructSettings,
             found = predict(near, solution.normals, **patches.known)
         except PredictionError:
             return AlbedoPatches.none(height.shape)
-        multiple = settings.refine.multiple_error * found.multiple if is_corrected else found.multiple
+        multiple = settings.refine.multiple_error * found.multiple if stack.is_without_multiple else found.multiple
         phi = form_factor(optics, near)
         rest = unmodelled_signal(solution, phi, phi, Corrections(found.masked, multiple))
         sigma = prediction_std(found, solution.normals, settings.refine) * patches.albedo

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+
+from helio_jax.inverse.levels import grown
 
 
 @dataclass(frozen=True)
@@ -36,16 +37,14 @@ class Anchors:
             is_level: pixels that are at their region's level, no walls [y, x].
             margin: pixels beside other regions that do not count for the level of region 0.
         """
-        near = binary_dilation(region > 0, np.ones((3, 3)), iterations=margin)
-        base = (region == 0) & np.logical_not(near)
+        base = ~grown(region > 0, margin)
         weight, value = [], []
         for number, (height, std) in levels.items():
             inside = (region == number) & is_level
             if inside.any() and base.any():
                 weight.append((inside / inside.sum() - base / base.sum()) / std)
                 value.append(height / std)
-        none = cls.none(region.shape)
-        return cls(np.stack([*weight]), np.array(value)) if weight else none
+        return cls(np.stack(weight), np.array(value)) if weight else cls.none(region.shape)
 
     def and_also(self, other: "Anchors") -> "Anchors":
         """Join with others."""

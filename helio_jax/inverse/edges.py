@@ -27,6 +27,24 @@ def ranked(region: np.ndarray) -> np.ndarray:
     return rank[region]
 
 
+def neighbour_links(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """List the links of all pixels of a raster [y, x] to their eight neighbours, each once.
+
+    Returns:
+        The numbers of the two pixels, and the way between them: 0 along x, 1 along y, 2 diagonal [link].
+    """
+    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
+    pairs = (
+        (pixel[:, :-1], pixel[:, 1:], 0),
+        (pixel[:-1], pixel[1:], 1),
+        (pixel[:-1, :-1], pixel[1:, 1:], 2),
+        (pixel[:-1, 1:], pixel[1:, :-1], 2),
+    )
+    first = np.concatenate([a.ravel() for a, _, _ in pairs])
+    second = np.concatenate([b.ravel() for _, b, _ in pairs])
+    return first, second, np.concatenate([np.full(a.size, way) for a, _, way in pairs])
+
+
 def trapezoid_gap(height: Any, slope: Any, pitch: float, axis: int) -> Any:
     """Compute by how much every edge's slope, (height change) / pitch, exceeds the mean slope of its two ends."""
     before, after = along(height, axis)

@@ -106,35 +106,28 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
 
 
-def misfit_on(problem: FitProblem, surface: Surface, predict: Predict, parameters: Parameters | None = None) -> float:
-    """Compute half the chi-square of the data expected on a surface; a few data far off count for little.
-
-    Nothing is fitted; the instrument is at `parameters`, or at its prior means.
+def misfit_of(problem: FitProblem, state: FitState, predict: Predict) -> float:
+    """Compute half the chi-square of the data expected at a state; a few data far off count for little.
 
     Raises:
         PredictionError: nothing can be predicted of the surface.
     """
-    state = FitState.at(problem, surface)
-    if parameters is not None:
-        state = replace(state, parameters=parameters)
     return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict))))
 
 
-def settled(
-    problem: FitProblem, surface: Surface, predict: Predict, parameters: Parameters | None = None
-) -> tuple[float, Surface]:
-    """Fit a surface's relief to the data in a few steps; compute the misfit of what comes out, as `misfit_on` does.
+def short_fit(problem: FitProblem, surface: Surface, predict: Predict) -> tuple[float, Surface]:
+    """Fit a surface's relief to the data in a few steps, the instrument at its prior means.
+
+    Returns:
+        The misfit of what comes out (`misfit_of`), and its surface.
 
     Raises:
         PredictionError: nothing can be predicted of a surface.
     """
-    s, state = problem.settings, FitState.at(problem, surface)
-    if parameters is not None:
-        state = replace(state, parameters=parameters)
-    state = predict_corrections(problem, state, predict)
+    s, state = problem.settings, predict_corrections(problem, FitState.at(problem, surface), predict)
     for _ in range(s.reweightings):
         state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
-    return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict)))), state.surface
+    return misfit_of(problem, state, predict), state.surface
 
 
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:

@@ -7,7 +7,7 @@ the near field fix it; a region that something else explains about as well is un
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -39,7 +39,7 @@ KINDS = "flat", "as fitted", "flat, with a wall"
 
 Misfit = Callable[[Surface], float]
 """Half the chi-square of the data expected on a surface, nothing fitted."""
-Settle = Callable[[Surface], tuple[float, Surface]]
+ShortFit = Callable[[Surface], tuple[float, Surface]]
 """The same after a short fit from a surface, and the surface fitted."""
 
 
@@ -114,13 +114,11 @@ class Region:
         inside: its pixels [y, x].
         height: measured height, um; None: not known.
         std: standard deviation of that, um.
-        kinds: of relief that are tried.
     """
 
     inside: np.ndarray
     height: float | None = None
     std: float = 0.0
-    kinds: tuple[str, ...] = KINDS
 
     def heights(self, surroundings: float, pitch: tuple[float, float], max_width: float) -> list[float]:
         """Choose the heights to be tried, um; arguments as in `search_levels`."""
@@ -137,7 +135,6 @@ class _RegionSearch:
 
     name: str
     inside: np.ndarray
-    kinds: tuple[str, ...]
     base: Surface
     surroundings: float
     pitch: tuple[float, float]
@@ -169,7 +166,7 @@ class _RegionSearch:
     def search(self, levels: list[float]) -> list[Surface]:
         """Find the best level of each kind of relief."""
         out = []
-        for kind in self.kinds if any(self.beam_shift) else [k for k in self.kinds if k != KINDS[-1]]:
+        for kind in KINDS if any(self.beam_shift) else KINDS[:-1]:
             tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
             best = tried[i]
@@ -193,7 +190,7 @@ def search_levels(
     pitch: tuple[float, float],
     max_width: float,
     misfit: Misfit,
-    settle: Settle,
+    short_fit: ShortFit,
     beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
 ) -> Levels:
@@ -207,25 +204,25 @@ def search_levels(
         surface: to begin with.
         pitch: dy, dx, um.
         max_width: levels up to twice the width of a region are tried, and of this width at most, um.
-        misfit, settle: see `Misfit`, `Settle`.
+        misfit, short_fit: see `Misfit`, `ShortFit`.
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
     """
-    best, found = settle(surface)
+    best, found = short_fit(surface)
     moved, undecided = [], []
     for i, region in enumerate(regions):
         inside = region.inside
-        done = np.any([np.zeros_like(inside), *(regions[j].inside for j in moved)], axis=0) & ~inside
+        done = covered(regions, moved) & ~inside
         base = without_skirt(inside, done, found)
         around = grown(inside, SKIRT) & ~inside
         surroundings = float(np.median(base.height[around]))
         name = f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
-        search = _RegionSearch(name, inside, region.kinds, base, surroundings, pitch, beam_shift, misfit, report)
+        search = _RegionSearch(name, inside, base, surroundings, pitch, beam_shift, misfit, report)
         trials = search.search([level - surroundings for level in region.heights(surroundings, pitch, max_width)])
         explanations = [(best, found)]
         for trial in trials:
             with suppress(PredictionError):
-                explanations.append(settle(trial))
+                explanations.append(short_fit(trial))
         value, better = min(explanations, key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
@@ -233,6 +230,11 @@ def search_levels(
         if any(_differ(found, other, inside, surroundings) for value, other in explanations if value < best + GAIN):
             undecided.append(i)
     return Levels(found, moved, undecided)
+
+
+def covered(regions: Sequence[Region], numbers: Iterable[int]) -> np.ndarray:
+    """Mark the pixels of the regions of some numbers [y, x]."""
+    return np.any([np.zeros_like(regions[0].inside), *(regions[i].inside for i in numbers)], axis=0)
 
 
 def without_skirt(inside: np.ndarray, others: np.ndarray, surface: Surface) -> Surface:

@@ -16,9 +16,11 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from helio_jax.inverse.edges import ranked
+from helio_jax.inverse.edges import neighbour_links, ranked
 from helio_jax.inverse.mask_edges import Edge
 
+_WEIGHTS = 1.0, 1.0, 0.5
+"""Weight of a link along x, along y, and diagonal."""
 _ITERATIONS = 20
 _TOLERANCES = 0.3, 0.005
 """Difference of neighbouring pixels from which on it counts as a jump: first and last value, in the smallest step."""
@@ -41,17 +43,9 @@ _COMMON_STD = 0.006
 
 
 def _links(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the two pixels of every link between horizontal, vertical and diagonal neighbours, and its weight."""
-    pixel = np.arange(shape[0] * shape[1]).reshape(shape)
-    pairs = (
-        (pixel[:, :-1], pixel[:, 1:], 1.0),
-        (pixel[:-1], pixel[1:], 1.0),
-        (pixel[:-1, :-1], pixel[1:, 1:], 0.5),
-        (pixel[:-1, 1:], pixel[1:, :-1], 0.5),
-    )
-    first = np.concatenate([a.ravel() for a, _, _ in pairs])
-    second = np.concatenate([b.ravel() for _, b, _ in pairs])
-    return first, second, np.concatenate([np.full(a.size, weight) for a, _, weight in pairs])
+    """List the two pixels of every link to a neighbour, and its weight [link]."""
+    first, second, way = neighbour_links(shape)
+    return first, second, np.array(_WEIGHTS)[way]
 
 
 def likeness(signal: np.ndarray, variance: np.ndarray, is_dark: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ the current height. refine: the fit of the heights, started from nearfield. Take
 instrument from the stack, and, if the settings say so, that the border of the image is flat; no truth.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.levels import GAIN, SKIRT, Region, search_levels
+from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, photometric_heights, solve_nearfield
@@ -55,11 +55,11 @@ MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate ..."""
 SEARCH_THRIFT = 8
 """... with this many times fewer paths per prediction than the fit, which is tested so, too."""
-MIN_CONTRADICTED = 0.02
-"""Patches of another albedo are searched where the data contradict the fit without them in a larger share of pixels."""
 START_THRIFT = 4
 """The same for photometric solutions, but not fewer than the least number: from a noisier start the rim of sphere B is
 7 % worse."""
+MIN_CONTRADICTED = 0.02
+"""Patches of another albedo are searched where the data contradict the fit without them in a larger share of pixels."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
 MAX_BACKTRACKS = 3
@@ -204,8 +204,9 @@ def _with_levels(
     Returns:
         The fit, and where another level explains the images as well [y, x].
     """
-    from helio_jax.inverse.fit import fit_heights, misfit_on, settled
+    from helio_jax.inverse.fit import fit_heights, misfit_of, short_fit
     from helio_jax.inverse.problem import FitProblem
+    from helio_jax.inverse.state import FitState
 
     signal, variance = signal_of(stack)
     raster, n_paths = Raster.of(stack), settings.refine.paths(signal[0].size)
@@ -224,14 +225,15 @@ def _with_levels(
                 start,
                 (raster.dy, raster.dx),
                 MAX_WIDTH * stack.instrument.sample_distance,
-                lambda trial: misfit_on(pose(trial), trial, roughly),
-                lambda trial: settled(pose(trial), trial, roughly),
+                lambda trial: misfit_of(problem := pose(trial), FitState.at(problem, trial), roughly),
+                lambda trial: short_fit(pose(trial), trial, roughly),
                 stack.instrument.beam_shift,
                 lambda said: report(0, settings.refine.max_rounds, said) if report else None,
             )
             start, is_undecided = found.surface, covered(steps, found.undecided)
-            labels = labelled(labels, steps, found.moved)
-            anchors = level_anchors(labels, [steps[i] for i in found.moved], start)
+            if moved := [steps[i] for i in found.moved]:
+                labels = labelled(moved)
+                anchors = level_anchors(labels, moved, start)
         except PredictionError:
             pass  # the start is too rough for it: the fit begins at a smoother one
     fit, _ = _with_backtracking(
@@ -268,16 +270,11 @@ def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -
     return Anchors.of_levels(labels, known, is_level, SKIRT)
 
 
-def covered(regions: list[Region], numbers: Iterable[int]) -> np.ndarray:
-    """Mark the pixels of the regions of some numbers [y, x]."""
-    return np.any([np.zeros_like(regions[0].inside), *(regions[i].inside for i in numbers)], axis=0)
-
-
-def labelled(labels: np.ndarray, regions: list[Region], numbers: Iterable[int]) -> np.ndarray:
-    """Number the pixels of the regions of some numbers beyond the labels that there are [y, x]."""
-    out = labels.copy()
-    for i in numbers:
-        out[regions[i].inside] = out.max() + 1
+def labelled(regions: list[Region]) -> np.ndarray:
+    """Number the pixels of regions 1, 2, ... [y, x]; 0 outside of all."""
+    out = np.zeros(regions[0].inside.shape, int)
+    for number, region in enumerate(regions, 1):
+        out[region.inside] = number
     return out
 
 
@@ -315,25 +312,21 @@ def _with_albedos(stack, settings, make_predict, report) -> "tuple[Fit, np.ndarr
         return _with_levels(stack, settings, make_predict, report, patches, *start)
 
     def tested(fit: "Fit") -> np.ndarray:
-        return squares(residuals_of_state(fit.problem, fit.state, roughly))
+        return residuals_of_state(fit.problem, fit.state, roughly)
 
-    if not settings.refine.albedo_patches:
-        return fitted(AlbedoPatches.none(stack.shape[1:]))
     plain = fitted(AlbedoPatches.none(stack.shape[1:]))
-    if plain[0].is_interrupted:
+    if plain[0].is_interrupted or not settings.refine.albedo_patches:
         return plain
     try:
-        residuals = residuals_of_state(plain[0].problem, plain[0].state, roughly)
+        residuals = tested(plain[0])
         if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
             return plain
         square, found = squares(residuals), search_albedo_patches(stack, settings, predict)
-        if not found.objects:
-            return plain
         left = found.keeping(found.unexplained(square.mean(0)))
         if not left.objects:
             return plain
         other = fitted(left)
-        is_better = 0.5 * np.sum(square - tested(other[0])) > GAIN
+        is_better = 0.5 * np.sum(square - squares(tested(other[0]))) > GAIN
     except PredictionError:
         return plain
     return other if is_better else plain

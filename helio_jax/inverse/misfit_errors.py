@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from helio_jax.arrays import border_mask
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import slopes_of_normal
-from helio_jax.inverse.edges import ranked
+from helio_jax.inverse.edges import neighbour_links, ranked
 from helio_jax.inverse.quality import MIN_REGION, floating
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import Misfit
@@ -71,21 +71,13 @@ def accumulated(slope_error: np.ndarray, raster: Raster, is_reference: np.ndarra
     Source: shortest paths: Dijkstra, Numer. Math. 1 (1959) 269; that errors accumulate along them: own derivation,
         benchmarks/families.py.
     """
-    shape, pixel = slope_error.shape, np.arange(slope_error.size).reshape(slope_error.shape)
-    pairs = (
-        (pixel[:, :-1], pixel[:, 1:], raster.dx),
-        (pixel[:-1], pixel[1:], raster.dy),
-        (pixel[:-1, :-1], pixel[1:, 1:], np.hypot(raster.dx, raster.dy)),
-        (pixel[:-1, 1:], pixel[1:, :-1], np.hypot(raster.dx, raster.dy)),
-    )
-    start = np.concatenate([pair[0].ravel() for pair in pairs])
-    end = np.concatenate([pair[1].ravel() for pair in pairs])
-    length = np.concatenate([np.full(pair[0].size, float(pair[2])) for pair in pairs])
+    start, end, way = neighbour_links((slope_error.shape[0], slope_error.shape[1]))
+    length = np.array([raster.dx, raster.dy, np.hypot(raster.dx, raster.dy)], float)[way]
     error = slope_error.ravel()
     least = 1e-12 * length  # a stored zero is no edge
     graph = coo_matrix((0.5 * (error[start] + error[end]) * length + least, (start, end)), shape=(error.size,) * 2)
     found = dijkstra(graph.tocsr(), directed=False, indices=np.flatnonzero(is_reference.ravel()), min_only=True)
-    return found.reshape(shape)
+    return found.reshape(slope_error.shape)
 
 
 def valid_regions(is_valid: np.ndarray) -> np.ndarray:

@@ -105,7 +105,6 @@ class _Solver:
         stack, settings: as in `photometric_heights`.
         optics: as stated.
         signal, variance: data in units of the beam [detector, y, x].
-        is_corrected: whether the calibration subtracted the multiple scattering.
     """
 
     stack: MicrographStack
@@ -113,12 +112,10 @@ class _Solver:
     optics: Optics
     signal: np.ndarray
     variance: np.ndarray
-    is_corrected: bool
 
     @classmethod
     def of(cls, stack: MicrographStack, settings: ReconstructSettings) -> "_Solver":
-        is_corrected = stack.calibration is not None and stack.calibration.without_multiple
-        return cls(stack, settings, Optics.of(stack.instrument), *signal_of(stack), is_corrected)
+        return cls(stack, settings, Optics.of(stack.instrument), *signal_of(stack))
 
     @property
     def iterations(self) -> int:
@@ -128,7 +125,7 @@ class _Solver:
     @property
     def n_corrections(self) -> int:
         """How often predicted masks and multiple scattering are subtracted from the data."""
-        return 0 if self.is_corrected or self.settings.method == "linear" else self.settings.corrections
+        return 0 if self.stack.is_without_multiple or self.settings.method == "linear" else self.settings.corrections
 
     def solve(self, data, variance, optics, stride=1) -> tuple[np.ndarray, PhotometricSolution]:
         """Solve for heights [y, x], um, by data of every `stride`-th pixel."""
@@ -144,7 +141,9 @@ class _Solver:
         """Predict the signal that the method does not model [detector, y, x]."""
         near = limited(height, self.optics)
         found = predict(near, solution.normals)
-        multiple = self.settings.refine.multiple_error * found.multiple if self.is_corrected else found.multiple
+        multiple = (
+            self.settings.refine.multiple_error * found.multiple if self.stack.is_without_multiple else found.multiple
+        )
         phi = form_factor(self.optics, near)
         used = form_factor(self.optics, np.zeros_like(near)) if self.iterations == 1 else phi
         return unmodelled_signal(solution, used, phi, Corrections(found.masked, multiple))

@@ -104,10 +104,8 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPa
         normals = surface_of_heights(rec.height, Raster.of(stack)).normals(optics.beam_shift)
     c, albedo = trace(rec.height, normals, rec.instrument, **patches.known), patches.albedo
     phi = form_factor(optics, rec.height)
-    is_subtracted = stack.calibration is not None and stack.calibration.without_multiple
     single = single_scattering(phi - c.masked, np.moveaxis(normals, -1, 0))
-    model = single + (0.0 if is_subtracted else c.multiple)
-    model = albedo * model
+    model = albedo * (single + (0.0 if stack.is_without_multiple else c.multiple))
     return Misfit(model - signal, data_std(variance, model, c, albedo), albedo * phi, normals)
 
 
