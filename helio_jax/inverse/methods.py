@@ -218,7 +218,7 @@ def _with_levels(
 
     labels, is_undecided = np.zeros(stack.shape[1:], int), np.zeros(stack.shape[1:], bool)
     anchors = None
-    if steps := measured_regions(stack):
+    if steps := measured_regions(stack, start):
         try:
             found = search_levels(
                 steps,
@@ -242,18 +242,21 @@ def _with_levels(
     return fit, is_undecided
 
 
-def measured_regions(stack: MicrographStack) -> list[Region]:
-    """Find the patches whose steps the mask bands show, the largest first; none where steps cannot be measured."""
+def measured_regions(stack: MicrographStack, start: Surface) -> list[Region]:
+    """Find the patches whose steps the mask bands show, the largest first; none where steps cannot be measured.
+
+    Steps are measured from the substrate, which the start puts at any height where the border is free.
+    """
     try:
         found = find_steps(stack)
     except SceneError:
         return []
-    patches = sorted(found.patches[1:], key=lambda patch: -patch.pixels)
+    substrate = float(np.median(start.height[found.patch == 0]))
     return [
-        Region(found.patch == p.number, p.level_um, p.level_std_um)
+        Region(found.patch == p.number, p.level_um, p.level_std_um, substrate)
         if p.is_determined
         else Region(found.patch == p.number)
-        for p in patches
+        for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels)
     ]
 
 

@@ -51,6 +51,22 @@ def test_anchors_hold_the_level_of_a_region():
     assert anchors.padded(4).weight.shape == (4, *SHAPE) and not anchors.padded(4).weight[1:].any()
 
 
+def test_a_measured_step_is_tried_above_the_substrate_of_the_start():
+    """Where the border is free the substrate is at any height. Rejects steps taken for heights above 0."""
+    ground = Surface(np.full(SHAPE, 70.0), *np.zeros((2, *SHAPE)))
+    region = Region(INSIDE, height=20.0, std=0.3, substrate=70.0)
+    assert region.heights(70.0, (10.0, 10.0), 500.0) == [90.0]
+    found = search_levels(
+        [region],
+        ground,
+        (10.0, 10.0),
+        500.0,
+        misfit := lambda s: 1e4 + 0.3 * (s.height[INSIDE].mean() - 90.0) ** 2,
+        lambda s: (misfit(s), s),
+    )
+    assert found.moved == [0] and found.surface.height[INSIDE].mean() == pytest.approx(90.0, abs=2.0)
+
+
 @pytest.mark.parametrize("best", [-130.0, 45.0])
 def test_search_finds_the_level_of_least_misfit(best):
     """A misfit of two valleys, the deeper one at `best`. Rejects descending into the nearer valley."""
