@@ -93,6 +93,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_bilateral bilateral normal integration
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
+  explanations        competing explanations of the micrographs, each fitted; the best is kept
+  objects             objects on a flat substrate: their outlines and levels
   levels              level search of regions behind depth jumps
   merging             segmentation of a noisy map by region merging
   albedo_patches      parts of the surface of other albedo than the substrate's

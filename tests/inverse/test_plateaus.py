@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse import methods as solve
+from helio_jax.inverse import explanations as solve
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
 from helio_jax.workflows import pipeline
