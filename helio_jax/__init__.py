@@ -19,6 +19,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
 .                     nouns and rules
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
+  spelling            near matches of a misspelt name
   settings            base class of all settings tables
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
