@@ -190,6 +190,8 @@ formats/              the only door to files
 workflows/            what joins the stages
   pipeline            simulate, calibrate, align, reconstruct, evaluate, run
   scene_file          scene files: TOML -> Scene
+  shipped             scenes and instruments that come with the program, by name
+  merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans

@@ -14,7 +14,6 @@ _SIGNS = {"greater_than": (">", "gt"), "greater_than_equal": (">=", "ge"), "less
 _SIGNS["less_than_equal"] = ("<=", "le")
 _KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "string": "a text in quotes"}
 _KINDS |= {"tuple": "a list in brackets", "model": "a table", "finite": "a finite number", "dict": "a table"}
-_NEAR_WORD = 0.5  # a choice among few words
 MAX_SHOWN = 50
 """Largest number of errors listed."""
 
@@ -63,7 +62,7 @@ def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, A
     elif kind in ("literal_error", "union_tag_invalid"):
         value = value if kind == "literal_error" else context["tag"]
         expected = context["expected"] if kind == "literal_error" else context["expected_tags"]
-        question = did_you_mean(str(value), re.findall(r"'([^']*)'", expected), _NEAR_WORD)
+        question = did_you_mean(str(value), re.findall(r"'([^']*)'", expected), 0.5)
         where = where if kind == "literal_error" else f"{where}.kind"
         yield f"{where} = {_show(value)}: must be one of {expected}" + (f": {question}" if question else "")
     elif kind == "union_tag_not_found":
