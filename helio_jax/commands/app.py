@@ -30,7 +30,11 @@ app = _Helio(
 )
 
 
-SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml"), Reads(names_files=True)]
+SceneArg = Annotated[
+    Path,
+    typer.Argument(help="Scene file (TOML), or a name that helio scenes lists.", metavar="SCENE"),
+    Reads(names_files=True),
+]
 HDF5 = Writes("HDF5", HDF5_SUFFIXES)
 """Mark of what is written as HDF5."""
 HTML = Writes("HTML", (".html", ".htm"), beside=(".png",))
@@ -45,6 +49,7 @@ COLUMNS = Writes("a table", (".csv", ".npz"))
 """Mark of options that name a table of columns to write."""
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]
