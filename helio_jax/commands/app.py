@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from helio_jax import __version__
 from helio_jax.commands.door import Command, Reads, Writes
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
@@ -26,8 +27,23 @@ app = _Helio(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich alone takes 0.4 s to import
-    help="Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map.",
 )
+
+
+def _show_version(wanted: bool) -> None:
+    """Print the version and end, if that is wanted."""
+    if wanted:
+        print(f"helio_jax {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map."""
 
 
 SceneArg = Annotated[
