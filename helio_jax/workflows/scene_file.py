@@ -194,7 +194,7 @@ def _read_layers(path: Path) -> tuple[dict[str, Any], dict[str, Any], Path | Non
     if "extends" in base:
         raise SceneError(
             f"{path}: extends = {name!r}: that file extends {base['extends']!r} itself; only one level is allowed: "
-            "merge the two files"
+            "merge the two files, or change a copy"
         )
 
     def relative_to_scene(name: str) -> str:

@@ -60,6 +60,8 @@ def test_files(tmp_path):
     path.write_text(f'extends = "bshem_wd4"\n{FOURTH}')
     assert load_instrument(path).detector_names == ("forward", "right", "left", "above")
     assert replaced_lists(path) == []
+    path.write_text('extends = "bshem_wd4"\ndetector.1.name = "other"\n')
+    assert load_instrument(path).detector_names == ("forward", "other", "left")
     path.write_text(FOURTH)
     with pytest.raises(SceneError, match=r"i\.toml: append adds to the lists of another file: name it with extends"):
         load_instrument(path)
