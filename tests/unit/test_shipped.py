@@ -10,7 +10,7 @@ import pytest
 
 import helio_jax as hx
 from helio_jax.errors import SceneError
-from helio_jax.workflows import pipeline, shipped
+from helio_jax.workflows import pipeline, provenance, shipped
 from helio_jax.workflows.scene_file import files_read
 from helio_jax.workflows.shipped import ALIASES, find_shipped, list_shipped, locate
 
@@ -91,6 +91,22 @@ def test_simulation_by_name(empty):
     small = {"scan.nx": 3, "scan.ny": 3, "trace.rays": 8}
     stack = pipeline.simulate_file("step", empty / "s.h5", overrides=small)
     assert stack is not None and stack.stacks[0].provenance["scene_file"] == "step.toml"
+
+
+def test_commit_is_that_of_a_clone(tmp_path, monkeypatch):
+    """A clone states its commit, an installed package that of no repository above it.
+
+    Catches a project of the user's, in whose environment the program is installed, taken for the program's own.
+    """
+    is_clone = (ROOT / ".git").exists() and Path(hx.__file__).is_relative_to(ROOT)
+    assert bool(provenance.git_commit()) == is_clone
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    commit = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-q", "--allow-empty", "-m", "mine"]
+    subprocess.run(commit, cwd=tmp_path, check=True)
+    inside = tmp_path / "site-packages" / "helio_jax" / "workflows"
+    inside.mkdir(parents=True)
+    monkeypatch.setattr(provenance, "__file__", str(inside / "provenance.py"))
+    assert provenance.git_commit() == ""
 
 
 def test_instrument_is_no_scene():
