@@ -2,33 +2,19 @@
 
 import json
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from helio_jax.commands.app import TOML, AsJson, Force, app
 from helio_jax.commands.door import Reads, Writes
-
-
-class Action(StrEnum):
-    """What `scenes` does."""
-
-    list = "list"
-    copy = "copy"
-
-
-class Kind(StrEnum):
-    """What `init` begins."""
-
-    scene = "scene"
-    instrument = "instrument"
+from helio_jax.workflows.shipped import Kind, list_shipped
 
 
 @app.command()
 def scenes(
-    action: Annotated[Action, typer.Argument(help="List them, or copy one.")] = Action.list,
+    action: Annotated[Literal["list", "copy"], typer.Argument(help="List them, or copy one.")] = "list",
     name: Annotated[str | None, typer.Argument(help="Which one to copy.")] = None,
     folder: Annotated[
         Path | None, typer.Argument(help="Where to copy it (default: here)."), Writes("scenes", within=())
@@ -37,9 +23,7 @@ def scenes(
     as_json: AsJson = False,
 ) -> None:
     """List the scenes and instruments that come with helio; copy one with the files that it reads, to change it."""
-    from helio_jax.workflows.shipped import list_shipped
-
-    if action is Action.copy:
+    if action == "copy":
         _copy(name, folder or Path(), force, as_json)
         return
     files = list_shipped()
@@ -75,8 +59,8 @@ def init(
     """Write a starting file of a scene or an instrument that works as it is, with every key and its meaning."""
     from helio_jax.workflows.starting_file import write_starting_file
 
-    path = file or Path(f"{kind.value}.toml")
-    write_starting_file(kind.value, path, force=force)
+    path = file or Path(f"{kind}.toml")
+    write_starting_file(kind, path, force=force)
     print(f"{path}: check it with helio validate {path}")
 
 

@@ -11,6 +11,8 @@ from typing import Literal
 from helio_jax.errors import SceneError
 from helio_jax.spelling import did_you_mean
 
+Kind = Literal["scene", "instrument"]
+"""What a file describes; a scene contains an instrument."""
 ALIASES = {"bshem": "bshem_wd3", "ashem": "ashem_normal"}
 """Short names of the instruments that measured scans come from."""
 
@@ -20,7 +22,7 @@ class Shipped:
     """One file that comes with the program."""
 
     name: str
-    kind: Literal["scene", "instrument"]
+    kind: Kind
     path: Path
 
     @property

@@ -6,7 +6,6 @@ What a person has to decide has a value. Every other key is a comment with its d
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 from helio_jax.calibration.noise import NoiseSettings
 from helio_jax.detector import Detector
@@ -19,8 +18,8 @@ from helio_jax.scene.shapes import Sphere, SpheresSample
 from helio_jax.scores.settings import TruthSettings
 from helio_jax.settings import Settings
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows.shipped import Kind
 
-Kind = Literal["scene", "instrument"]
 INSTRUMENT = Instrument(
     beam=Beam(incidence_deg=30.0, azimuth_deg=0.0),
     plate=Plate(kind="transparent", working_distance_um=4000.0),

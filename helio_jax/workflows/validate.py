@@ -17,7 +17,7 @@ from helio_jax.workflows.scene_file import (
     read_tables,
     replaced_lists,
 )
-from helio_jax.workflows.shipped import locate
+from helio_jax.workflows.shipped import Kind, locate
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Checked:
     """
 
     file: str
-    kind: str
+    kind: Kind
     instrument: dict[str, Any]
     image: dict[str, int] | None = None
     body: dict[str, Any] | None = None
