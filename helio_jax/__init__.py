@@ -19,6 +19,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
 .                     nouns and rules
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
+  spelling            near matches of a misspelt name
   settings            base class of all settings tables
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
@@ -191,6 +192,10 @@ formats/              the only door to files
 workflows/            what joins the stages
   pipeline            simulate, calibrate, align, reconstruct, evaluate, run
   scene_file          scene files: TOML -> Scene
+  shipped             scenes and instruments that come with the program, by name
+  copy_scene          copies of those
+  starting_file       starting files of a scene and an instrument
+  merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans
@@ -203,6 +208,7 @@ workflows/            what joins the stages
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
   spot                the beam's spot
+  validate            what helio validate checks
   provenance          how a result was made
   compilation_cache   keeps what JAX compiles
   doctor              checks the installation
@@ -212,7 +218,8 @@ commands/             the command line; no logic of its own
   simulating          run, simulate, rays, resume, study, spot, plate
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  about               info, validate, schema, doctor, fetch-data, cite
+  scenes              scenes, init, validate, schema
+  about               info, doctor, fetch-data, cite
 ```
 """
 

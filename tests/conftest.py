@@ -13,8 +13,18 @@ FAST = {
     "physics": ("formfactor", "render", "tracer"),
     "unit": (
         *("align", "arrays", "away_facets", "calibrate", "conventions", "edge_rule", "figures", "instrument"),
-        *("instrument_file", "language", "materials", "measure", "metrics", "placement", "project_files", "report"),
-        *("response", "sample", "scans", "scene", "settings", "units", "walls", "widening"),
+        *(
+            "instrument_file",
+            "language",
+            "materials",
+            "measure",
+            "merge",
+            "metrics",
+            "placement",
+            "project_files",
+            "report",
+        ),
+        *("response", "sample", "scans", "scene", "settings", "shipped", "units", "walls", "widening"),
     ),
 }
 """Modules tests/FOLDER/test_NAME.py whose tests, but for slow ones, are marked `fast`; so is test_architecture.py."""

@@ -37,7 +37,9 @@ def import_files(
     ],
     output: H5File,
     instrument: Annotated[
-        Path | None, typer.Option(help="Instrument or scene file, for files that lack it."), Reads(names_files=True)
+        Path | None,
+        typer.Option(help="Instrument or scene, file or name, for files that lack it."),
+        Reads(names_files=True),
     ] = None,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
