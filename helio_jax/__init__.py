@@ -181,7 +181,18 @@ formats/              the only door to files
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold
-  export              writes the reference simulator's layout
+  export              hx.export: writes files of other programs; the suffix selects the format
+  export_formats      the table of these formats: what each holds
+  layers              named arrays on one raster, which every writer takes
+  write_arrays        MAT, NPZ, CSV
+  write_gwyddion      GWY, GSF
+  write_meshes        STL, PLY, OBJ
+  write_netcdf        NetCDF
+  write_png           PNG, 16-bit grey
+  write_reference     the reference simulator's layout (.mat)
+  write_sdf           SDF (ISO 25178-71)
+  write_tiff          TIFF
+  write_x3p           X3P (ISO 25178-72)
   columns             tables of columns (.csv, .npz)
   points              control points (.csv)
   toml                writes instrument files
@@ -250,6 +261,7 @@ _HOME = {
     "read": "formats.hdf5",
     "write": "formats.hdf5",
     "import_micrographs": "formats.matlab",
+    "export": "formats.export",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

@@ -25,6 +25,7 @@ from helio_jax.commands.app import (
     set_options,
 )
 from helio_jax.commands.door import Reads, Writes
+from helio_jax.formats.export_formats import SUFFIXES, help_text
 
 COMPARISON = ("comparison.json", "comparison.png", "effects.png")
 """What `compare` writes in its folder (comparison.py)."""
@@ -52,21 +53,25 @@ def import_files(
     print(f"written to {output}")
 
 
-@app.command()
+@app.command(epilog=f"\b\n{help_text()}\n\nWhat each file holds, frames and units: docs/exports.md.")
 def export(
-    file: Annotated[Path, typer.Argument(help="Micrographs (.h5)."), Reads()],
+    file: Annotated[Path, typer.Argument(help="Micrographs or heights (.h5)."), Reads()],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help="File to write: .mat (the reference's layout)."),
-        Writes("MATLAB", (".mat",)),
+        typer.Option("--output", "-o", help=f"File to write: {' '.join(SUFFIXES)}."),
+        Writes("a file of another program", SUFFIXES),
     ],
     view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
+    detector: Annotated[str | None, typer.Option(help="Only the micrograph of this detector.")] = None,
+    invalid: Annotated[
+        str, typer.Option(help="Heights that are not valid: nan (missing), keep (as they are), fill (interpolated).")
+    ] = "nan",
 ) -> None:
-    """Write micrographs in the layout of another program, by the suffix of the file."""
+    """Write micrographs or heights for another program; the suffix of the file selects the format."""
+    from helio_jax import export as write_foreign
     from helio_jax import read
-    from helio_jax.formats.export import export as write_foreign
 
-    left_out = write_foreign(read(file), output, view)
+    left_out = write_foreign(read(file), output, view=view, detector=detector, invalid=invalid)
     print(output)
     for what in left_out:
         print(f"  not written: {what}")
