@@ -15,14 +15,17 @@ class HeightMap:
     Attributes:
         height: height above the substrate [y, x], um; NaN where unknown.
         x, y: grid positions in the sample frame [um], increasing, equally spaced.
+        height_std: standard deviation of each height [y, x], um; None: unknown.
     """
 
     height: np.ndarray
     x: np.ndarray
     y: np.ndarray
+    height_std: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         set_float_arrays(self, {"x": (None,), "y": (None,)}, InputFileError)
         check_axis("x", self.x, InputFileError)
         check_axis("y", self.y, InputFileError)
-        set_float_arrays(self, {"height": (self.y.size, self.x.size)}, InputFileError)
+        shape = (self.y.size, self.x.size)
+        set_float_arrays(self, {"height": shape, "height_std": shape}, InputFileError)

@@ -51,7 +51,7 @@ def export(
         if not (reason := why_not(stack)):
             with atomic_path(path) as part:
                 return write_reference(stack, part)
-        note = [f"the layout of the reference simulator: {reason}; the file holds arrays [y, x, detector] instead"]
+        note = [f"the layout of the reference simulator: {reason}; the file holds arrays under names of their own"]
     layers = _chosen(layers_of(stack, invalid), form, detector, path)
     module, _, name = form.writer.partition(":")
     writer = getattr(importlib.import_module(f"helio_jax.formats.{module}"), name)

@@ -1,8 +1,10 @@
 """Write all layers as named arrays: MAT (MATLAB level 5), NPZ (NumPy), CSV (a row for each pixel).
 
-Lengths are um. Row 0 of an array is the lowest y. In MATLAB an array is [y, x, detector], elsewhere [detector, y, x].
+Lengths are um. Row 0 of an array is the lowest y. In MATLAB several images are cells, counts{detector} or
+by_order{order}{detector}; elsewhere the arrays are [detector, y, x].
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,14 @@ from helio_jax.formats.columns import write_columns
 from helio_jax.formats.layers import Layers
 
 _MAT_HEADER_BYTES = 116
+
+
+def cells(images: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    """Convert images to a MATLAB cell array of one row; those of two indices to cells of cells."""
+    out = np.empty((1, len(images)), dtype=object)
+    for i, image in enumerate(images):
+        out[0, i] = image if np.ndim(image) <= 2 else cells(image)
+    return out
 
 
 def save_mat(path: Path, tree: dict[str, Any]) -> None:
@@ -53,9 +63,7 @@ def write_mat(layers: Layers, path: Path) -> None:
     texts = _texts(layers)
     texts["detectors"] = np.array(layers.detectors, dtype=object)
     arrays = {name: values.reshape(1, -1) if values.ndim == 1 else values for name, values in _axes_of(layers).items()}
-    for layer in layers.layers:
-        # MATLAB squeezes nothing: an image must be its first two indices
-        arrays[layer.name] = np.moveaxis(layer.values, (-2, -1), (0, 1))
+    arrays |= {layer.name: layer.values if layer.values.ndim == 2 else cells(layer.values) for layer in layers.layers}
     save_mat(path, arrays | texts)
 
 

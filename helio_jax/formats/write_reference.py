@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.arrays import pitch
-from helio_jax.formats.write_arrays import save_mat
+from helio_jax.formats.write_arrays import cells, save_mat
 from helio_jax.micrograph import MicrographStack
 
 _SOURCES = {"uniform": "Uniform", "gaussian": "Gaussian", "pencil": "Infinite"}
@@ -46,14 +46,14 @@ def reference_tree(stack: MicrographStack) -> dict[str, dict[str, Any]]:
     instrument, beam = stack.instrument, stack.instrument.beam
     t = math.radians(beam.incidence_deg)
     orders = {"single": stack.by_order[0], "multiple": stack.multiple}  # type: ignore[index]
-    im: dict[str, Any] = {name: _cells(_compact(image[:, :, ::-1])) for name, image in orders.items()}  # type: ignore[index]
+    im: dict[str, Any] = {name: cells(_compact(image[:, :, ::-1])) for name, image in orders.items()}  # type: ignore[index]
     im["raster_movement_x"] = pitch(stack.x) * math.cos(t) / 1000
     im["raster_movement_y"] = pitch(stack.y) / 1000
     im["helio_center_um"] = np.array([0.5 * (a[0] + a[-1]) for a in (stack.x, stack.y)])
     apertures = instrument.apertures()
     param = {
-        "detector_position": _cells([np.array([a.center[0], 0.0 - a.center[1]]) / 1000 for a in apertures]),
-        "detector_axes": _cells([2 * np.array(a.semi_axes) / 1000 for a in apertures]),
+        "detector_position": cells([np.array([a.center[0], 0.0 - a.center[1]]) / 1000 for a in apertures]),
+        "detector_axes": cells([2 * np.array(a.semi_axes) / 1000 for a in apertures]),
         "z_sample_to_detector": instrument.sample_distance / 1000,
         "rays_per_pixel": stack.n_rays,
     }
@@ -92,11 +92,3 @@ def _compact(images: np.ndarray) -> list[np.ndarray]:
         kind = next(k for k in (np.uint8, np.uint16, np.uint32) if images.max() <= np.iinfo(k).max)
         return list(images.astype(kind))
     return list(images)
-
-
-def _cells(items: list[np.ndarray]) -> np.ndarray:
-    """Convert to a MATLAB cell array (one row)."""
-    cells = np.empty((1, len(items)), dtype=object)
-    for i, item in enumerate(items):
-        cells[0, i] = item
-    return cells

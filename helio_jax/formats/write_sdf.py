@@ -36,9 +36,7 @@ def write_sdf(layers: Layers, path: Path) -> None:
     texts = np.where(np.isfinite(layers.main.values), layers.main.values.astype(str), "BAD")
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.write("aISO-1.0\n")
-        file.writelines(
-            f"{key} = {value!r}\n" if key != "ManufacID" else f"{key} = {value}\n" for key, value in header.items()
-        )
+        file.writelines(f"{key} = {value}\n" for key, value in header.items())
         file.write("*\n")
         file.writelines(" ".join(row) + "\n" for row in texts)
         file.write("*\n*\n")
