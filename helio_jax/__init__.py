@@ -146,6 +146,7 @@ scores/               errors against something known
   agreement           agreement of a simulation with measured micrographs
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
+  sample_grid         heights of an oblique beam on a regular grid of the sample frame
   roughness           ISO 25178 parameters, profiles, steps
   spectrum            power spectra of regions
   ripple              wavelength and amplitude of a ripple
@@ -181,7 +182,7 @@ formats/              the only door to files
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold
-  export              hx.export: writes files of other programs; the suffix selects the format
+  export              writes files of other programs; the suffix selects the format
   export_formats      the table of these formats: what each holds
   layers              named arrays on one raster, which every writer takes
   write_arrays        MAT, NPZ, CSV
@@ -209,6 +210,7 @@ workflows/            what joins the stages
   measure             what helio measure prints
   steps               what helio measure --steps prints
   study               sweeps of scene values
+  export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
   spot                the beam's spot
@@ -261,7 +263,7 @@ _HOME = {
     "read": "formats.hdf5",
     "write": "formats.hdf5",
     "import_micrographs": "formats.matlab",
-    "export": "formats.export",
+    "export": "workflows.export",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

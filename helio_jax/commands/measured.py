@@ -66,12 +66,15 @@ def export(
     invalid: Annotated[
         str, typer.Option(help="Heights that are not valid: nan (missing), keep (as they are), fill (interpolated).")
     ] = "nan",
+    grid: Annotated[
+        float | None, typer.Option(help="Heights on a regular grid of this pitch in the sample frame [um].")
+    ] = None,
 ) -> None:
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
     from helio_jax import export as write_foreign
     from helio_jax import read
 
-    left_out = write_foreign(read(file), output, view=view, detector=detector, invalid=invalid)
+    left_out = write_foreign(read(file), output, view=view, detector=detector, invalid=invalid, grid=grid)
     print(output)
     for what in left_out:
         print(f"  not written: {what}")

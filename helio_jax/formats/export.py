@@ -23,22 +23,7 @@ def export(
     detector: str | None = None,
     invalid: Literal["nan", "keep", "fill"] = "nan",
 ) -> list[str]:
-    """Write micrographs or heights to a file of another program. What each suffix can hold: docs/exports.md.
-
-    Args:
-        obj: result of `read`, `simulate` or `reconstruct`, or a height map.
-        path: target file; its suffix selects the format.
-        view: index of the stack in a set, from 0; required for several stacks.
-        detector: name of the only detector to write; required where the format holds one image.
-        invalid: what becomes of heights that are not valid and counts that were not observed: "nan": missing values;
-            "keep": written as they are; "fill": interpolated from their neighbours.
-
-    Returns:
-        Data of the object that the file does not hold, each with a reason.
-
-    Raises:
-        SceneError: the format is unknown, or cannot hold this object; the file cannot be written.
-    """
+    """Write micrographs or heights as they are; see workflows/export.py for the arguments, the result and errors."""
     stack = _one_of(obj, view, path)
     form = find_format(Path(path).suffix)
     if form is None:

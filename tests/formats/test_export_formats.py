@@ -284,3 +284,17 @@ def test_refusals(tmp_path, rec, stack):
     with pytest.raises(SceneError, match="a dict cannot be exported"):
         hx.export({}, tmp_path / "a.tif")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_grid_in_the_sample_frame(tmp_path, rec, stack):
+    """`grid` writes heights where they are in the sample, and says what it leaves behind. Catches a grid ignored."""
+    plane = rec.replace(height=2.0 + 0.1 * np.broadcast_to(rec.raster_x, (NY, NX)), is_valid=np.ones((NY, NX)))
+    assert any("belong to the raster" in line for line in hx.export(plane, tmp_path / "a.nc", grid=0.5))
+    found = READERS[".nc"](tmp_path / "a.nc")
+    shift = rec.instrument.beam_shift[0]
+    x = found.first[0] + 0.5 * np.arange(found.images["height"].shape[1])
+    expected = (2.0 + 0.1 * x) / (1 - 0.1 * shift)  # h = 2 + X / 10 with X = x + h tan t
+    np.testing.assert_allclose(found.images["height"], np.broadcast_to(expected, found.images["height"].shape))
+    assert not any("beside their pixels" in line for line in hx.export(plane, tmp_path / "a.sdf", grid=0.5))
+    with pytest.raises(SceneError, match="--grid resamples reconstructed heights, this is a MicrographStack"):
+        hx.export(stack, tmp_path / "a.nc", grid=0.5)
