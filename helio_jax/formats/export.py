@@ -57,8 +57,9 @@ def _one_of(obj: Any, view: int | None, path: str | os.PathLike) -> Any:
 def _chosen(layers: Layers, form: Format, detector: str | None, path: str | os.PathLike) -> Layers:
     """Return the layers of the detector that was asked for, after a check that the format can hold them."""
     if layers.kind not in form.kinds:
+        instead = "reconstruct them first, or " if layers.kind == "micrographs" else ""
         raise SceneError(
-            f"{path}: {form.name} holds {' and '.join(form.kinds)}, these are {layers.kind}: choose one of "
+            f"{path}: {form.name} holds {' and '.join(form.kinds)}, these are {layers.kind}: {instead}choose one of "
             f"{suffixes_for(layers.kind)}"
         )
     if layers.is_list and not form.has_points:

@@ -7,10 +7,12 @@ heights that equal themselves under no rotation or mirror, and pixels without a 
 import numpy as np
 import pytest
 from second_readers import READERS
+from typer.testing import CliRunner
 
 import helio_jax as hx
+from helio_jax.__main__ import app
 from helio_jax.errors import SceneError
-from helio_jax.formats.export_formats import FORMATS, SUFFIXES
+from helio_jax.formats.export_formats import FORMATS, SUFFIXES, help_text
 from helio_jax.heightmap import HeightMap
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
@@ -263,7 +265,9 @@ def test_refusals(tmp_path, rec, stack):
     wrong = tmp_path / "a.jpg"
     with pytest.raises(SceneError, match=r"no format has the suffix '.jpg': known are .x3p .sdf"):
         hx.export(rec, wrong)
-    with pytest.raises(SceneError, match=r"X3P holds heights, these are micrographs: choose one of .gwy"):
+    with pytest.raises(
+        SceneError, match=r"X3P holds heights, these are micrographs: reconstruct them first, or choose one of .gwy"
+    ):
         hx.export(stack, tmp_path / "a.x3p")
     with pytest.raises(SceneError, match=r"GSF holds one image, the scan has 3: give --detector forward or right"):
         hx.export(stack, tmp_path / "a.gsf")
@@ -298,3 +302,30 @@ def test_grid_in_the_sample_frame(tmp_path, rec, stack):
     assert not any("beside their pixels" in line for line in hx.export(plane, tmp_path / "a.sdf", grid=0.5))
     with pytest.raises(SceneError, match="--grid resamples reconstructed heights, this is a MicrographStack"):
         hx.export(stack, tmp_path / "a.nc", grid=0.5)
+
+
+def test_command(tmp_path, rec, stack):
+    """The command writes what Python writes and prints what is left out; its help is the table of formats.
+
+    Catches an option that is not passed on, and a suffix that is only found to be wrong after the file was read.
+    """
+    hx.write(rec, tmp_path / "h.h5")
+    hx.write(MicrographSet((stack, stack.replace(counts=stack.counts + 1))), tmp_path / "s.h5")
+
+    def helio(*words: str) -> tuple[int, str]:
+        found = CliRunner().invoke(app, ["export", *words])
+        code = getattr(found.exception, "exit_code", found.exit_code)
+        return code, f"{found.output} {found.exception or ''}"
+
+    code, text = helio(str(tmp_path / "h.h5"), "-o", str(tmp_path / "h.gwy"), "--invalid", "keep", "--grid", "0.5")
+    assert code == 0 and "not written: albedo" in text
+    hx.export(hx.read(tmp_path / "h.h5"), tmp_path / "same.gwy", invalid="keep", grid=0.5)
+    assert (tmp_path / "h.gwy").read_bytes() == (tmp_path / "same.gwy").read_bytes()
+    name = stack.instrument.detector_names[2]
+    code, _ = helio(str(tmp_path / "s.h5"), "-o", str(tmp_path / "s.gsf"), "--view", "1", "--detector", name)
+    image = READERS[".gsf"](tmp_path / "s.gsf").images[f"counts_{name}"]
+    assert code == 0 and np.array_equal(image, stack.counts[2] + 1)
+    code, text = helio(str(tmp_path / "missing.h5"), "-o", str(tmp_path / "a.jpg"))
+    assert code == 2 and ".x3p" in text and "missing.h5" not in text
+    code, text = helio("--help")
+    assert code == 0 and all(line.strip() in text for line in help_text().splitlines())
