@@ -23,6 +23,7 @@ from helio_jax.commands.app import (
     print_table,
     say,
     set_options,
+    warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads, Writes
 from helio_jax.formats.export_formats import SUFFIXES, help_text
@@ -71,11 +72,15 @@ def export(
     ] = None,
 ) -> None:
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
+    from helio_jax import Reconstruction, read
     from helio_jax import export as write_foreign
-    from helio_jax import read
 
-    left_out = write_foreign(read(file), output, view=view, detector=detector, invalid=invalid, grid=grid)
+    found = read(file)
+    left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore
     print(output)
+    if isinstance(found, Reconstruction):
+        print(f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
+        warn_if_contradicted(found.is_contradicted, strict=False)
     for what in left_out:
         print(f"  not written: {what}")
 

@@ -93,6 +93,8 @@ def _left_out(layers: Layers, form: Format) -> list[str]:
             f"positions of the surface points, up to {distance:.4g} um beside their pixels (the raster is that of an "
             "oblique beam): --grid PITCH resamples, .csv and meshes hold each point's own position"
         )
+    if not form.has_text and (status := layers.about.get("status")):
+        out.append(f"status ({status}): {form.name} has no place for text")
     if layers.elsewhere:
         out.append(f"{', '.join(layers.elsewhere)}: they stay in the .h5 file")
     return out

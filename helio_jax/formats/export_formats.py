@@ -26,6 +26,7 @@ class Format:
         missing: how a missing value is stored.
         first_row: where the file's first row of pixels lies, as its readers draw it.
         has_origin: whether it holds the position of the grid.
+        has_text: whether it holds the status and what else is known as text.
         has_points: whether it holds the position of each point, so that no raster is needed.
         note: what else its users want to know.
     """
@@ -40,6 +41,7 @@ class Format:
     missing: str
     first_row: Literal["bottom", "top", ""] = ""
     has_origin: bool = True
+    has_text: bool = True
     has_points: bool = False
     note: str = ""
 
@@ -133,6 +135,7 @@ FORMATS = (
         unit="um",
         numbers="float32",
         missing="hole",
+        has_text=False,
         has_points=True,
         note="binary; the format has no unit: choose um in the other program",
     ),
@@ -181,6 +184,7 @@ FORMATS = (
         unit="um",
         numbers="text, exact",
         missing="nan",
+        has_text=False,
         has_points=True,
         note="a row for each pixel; units in the names of the columns",
     ),

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from helio_jax.arrays import fill_gaps
+from helio_jax.arrays import fill_gaps, pitch
 from helio_jax.errors import SceneError
 from helio_jax.formats.export_formats import Kind
 from helio_jax.formats.nexus import RECONSTRUCTION_FIELDS, STACK_FIELDS
@@ -73,11 +73,11 @@ class Layers:
         layers: arrays; the first `n_core` ones are heights or counts, then their error and their mask, if known.
         is_known: where the first layer is valid, of its shape.
         n_core: see `layers`.
+        time: when the data were made; now, where not known.
         detectors: names of the detectors.
         is_list: the positions are a list, no raster.
         about: what else is known, as text.
         elsewhere: data of the object that no layer holds.
-        time: when the data were made; now, where not known.
     """
 
     kind: Kind
@@ -89,16 +89,17 @@ class Layers:
     layers: tuple[Layer, ...]
     is_known: np.ndarray
     n_core: int
+    time: datetime
     detectors: tuple[str, ...] = ()
     is_list: bool = False
     about: Mapping[str, str] = field(default_factory=dict)
     elsewhere: tuple[str, ...] = ()
-    time: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @property
     def comment(self) -> str:
-        """What is known of the data, as one line."""
-        return "; ".join([self.title, *(f"{key}: {value}" for key, value in self.about.items() if value)])
+        """What is known of the data, as one line of ASCII text."""
+        text = "; ".join([self.title, *(f"{key}: {value}" for key, value in self.about.items() if value)])
+        return " ".join(text.encode("ascii", "replace").decode().split())
 
     @property
     def main(self) -> Layer:
@@ -110,8 +111,7 @@ class Layers:
         """Largest distance of a known surface point from its pixel [um]; 0 where not worth a remark."""
         far = np.hypot(self.point_x - self.x, self.point_y - self.y[:, None])
         far = far[np.isfinite(far) & self.is_known.reshape(-1, *far.shape).any(0)].max(initial=0.0)
-        pitch = min([axis[1] - axis[0] for axis in (self.x, self.y) if axis.size > 1], default=1.0)
-        return float(far) if far > _MAX_BESIDE * pitch else 0.0
+        return float(far) if far > _MAX_BESIDE * min(pitch(self.x), pitch(self.y)) else 0.0
 
     def images(self, layers: Sequence[Layer] | None = None) -> list[Image]:
         """Split layers into images; default: heights or counts, their error and their mask."""
@@ -156,6 +156,11 @@ def _with_gaps(values: np.ndarray, is_known: np.ndarray, invalid: str, what: str
     return out
 
 
+def _errors(values: np.ndarray, is_known: np.ndarray, invalid: str) -> np.ndarray:
+    """Treat the errors of missing values: what is filled has none."""
+    return values if invalid == "keep" else np.where(is_known, values, np.nan)
+
+
 def _layer(name: str, values: Any, axes: tuple[str, ...], unit: str | None = None) -> Layer:
     """Make a layer with the unit and meaning of the HDF5 files."""
     known = _ABOUT.get(name)
@@ -163,13 +168,13 @@ def _layer(name: str, values: Any, axes: tuple[str, ...], unit: str | None = Non
     return Layer(name, np.asarray(values), axes, (known.unit if known else "") if unit is None else unit, meaning)
 
 
-def _time_of(provenance: Mapping[str, Any]) -> dict[str, datetime]:
-    """Return when the data were simulated, if that is known, as an argument of `Layers`."""
+def _time_of(provenance: Mapping[str, Any]) -> datetime:
+    """Return when the data were simulated; now, if that is not known."""
     stack = provenance.get("stack", provenance)
     try:
-        return {"time": datetime.strptime(stack["time"], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)}
+        return datetime.strptime(stack["time"], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
     except (KeyError, TypeError, ValueError):
-        return {}
+        return datetime.now(UTC)
 
 
 def layers_of(obj: MicrographStack | Reconstruction | HeightMap, invalid: Literal["nan", "keep", "fill"]) -> Layers:
@@ -195,7 +200,7 @@ def _layers_of_stack(stack: MicrographStack, invalid: str) -> Layers:
     unit, is_known = stack.unit, stack.is_observed
     core = [_layer("counts", _with_gaps(stack.counts, is_known, invalid, stack.name), axes, unit)]
     if stack.std_error is not None:
-        core.append(_layer("std_error", np.where(is_known, stack.std_error, np.nan), axes, unit))
+        core.append(_layer("std_error", _errors(stack.std_error, is_known, invalid), axes, unit))
     core.append(_layer("is_observed", is_known, axes))
     more = []
     if stack.background is not None:
@@ -226,47 +231,47 @@ def _layers_of_stack(stack: MicrographStack, invalid: str) -> Layers:
         is_list=stack.positions is not None,
         about={"noise": stack.noise, "fast_axis": stack.fast_axis, "invalid": invalid},
         elsewhere=("instrument", "history"),
-        **_time_of(stack.provenance),
+        time=_time_of(stack.provenance),
     )
 
 
 def _layers_of_heights(obj: Reconstruction | HeightMap, invalid: str) -> Layers:
     """Convert a reconstruction or a height map."""
     axes = ("y", "x")
-    is_map = isinstance(obj, HeightMap)
-    is_known = np.isfinite(obj.height) if is_map else obj.is_valid & np.isfinite(obj.height)
+    is_known = np.isfinite(obj.height) & (True if isinstance(obj, HeightMap) else obj.is_valid)
     core = [_layer("height", _with_gaps(obj.height, is_known, invalid, "heights"), axes)]
     if obj.height_std is not None:
-        std = obj.height_std if invalid == "keep" else np.where(is_known, obj.height_std, np.nan)
-        core.append(_layer("height_std", std, axes))
+        core.append(_layer("height_std", _errors(obj.height_std, is_known, invalid), axes))
     core.append(_layer("is_valid", is_known, axes))
-    if is_map:
-        point_x, point_y = np.meshgrid(obj.x, obj.y)
-        common: dict[str, Any] = {"title": "height", "x": obj.x, "y": obj.y, "about": {"invalid": invalid}}
-        more = []
+    about = {"status": obj.status, "invalid": invalid}
+    more, detectors, elsewhere = [], (), ()
+    if isinstance(obj, HeightMap):
+        x, y, (shift_x, shift_y) = obj.x, obj.y, (0.0, 0.0)
     else:
-        shift_x, shift_y = obj.instrument.beam_shift
-        height = core[0].values  # a point moves with its height: as written
-        point_x, point_y = obj.raster_x - height * shift_x, obj.raster_y[:, None] - height * shift_y
-        more = [_layer("reason", obj.reason, axes), _layer("albedo", obj.albedo, axes)]
-        more.append(_layer("normals", np.moveaxis(obj.normals, -1, 0), ("component", *axes)))
-        more += [
-            _layer(name, getattr(obj, name), where)
-            for name, where in (("chi_square", axes), ("residuals", ("detector", *axes)))
-            if getattr(obj, name) is not None
+        x, y, (shift_x, shift_y) = obj.raster_x, obj.raster_y, obj.instrument.beam_shift
+        more = [
+            _layer("reason", obj.reason, axes),
+            _layer("albedo", obj.albedo, axes),
+            _layer("normals", np.moveaxis(obj.normals, -1, 0), ("component", *axes)),
         ]
-        about = {"method": obj.method, "status": obj.status, "border": obj.border, "invalid": invalid}
-        common = {"title": "height", "x": obj.raster_x, "y": obj.raster_y, "about": about}
-        common["detectors"] = tuple(obj.instrument.detector_names)
-        samples = () if obj.height_samples is None else ("height_samples",)
-        common["elsewhere"] = (*samples, "instrument", "history")
-        common |= _time_of(obj.provenance)
+        optional = (("chi_square", axes), ("residuals", ("detector", *axes)))
+        more += [_layer(name, getattr(obj, name), a) for name, a in optional if getattr(obj, name) is not None]
+        about |= {"method": obj.method, "border": obj.border}
+        detectors = tuple(obj.instrument.detector_names)
+        elsewhere = (*(() if obj.height_samples is None else ("height_samples",)), "instrument", "history")
+    height = core[0].values  # as written: a point moves with its height
     return Layers(
         kind="heights",
-        point_x=point_x,
-        point_y=point_y,
+        title="height",
+        x=x,
+        y=y,
+        point_x=x - height * shift_x,
+        point_y=y[:, None] - height * shift_y,
         layers=(*core, *more),
         is_known=is_known,
         n_core=len(core),
-        **common,
+        detectors=detectors,
+        about=about,
+        elsewhere=elsewhere,
+        time=_time_of(obj.provenance),
     )

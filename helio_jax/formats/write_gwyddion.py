@@ -50,6 +50,7 @@ def write_gsf(layers: Layers, path: Path) -> None:
         "XYUnits": "m",
         "ZUnits": unit,
         "Title": image.name,
+        "Comment": layers.comment,
     }
     header = "Gwyddion Simple Field 1.0\n" + "".join(f"{key} = {value}\n" for key, value in fields.items())
     text = header.encode()
@@ -61,14 +62,14 @@ def write_gwy(layers: Layers, path: Path) -> None:
 
     Gwyddion's images hold numbers everywhere: a missing value is that of the nearest pixel, below the channel's mask.
     """
-    parts = []
+    parts, n_shown = [], len(layers.images([layers.main]))
     for number, image in enumerate(layers.images()):
         values, unit = _scaled(image)
         is_missing = ~image.is_known[::-1]
         parts += [
             _object(f"/{number}/data", "GwyDataField", _field(layers, _without_nan(values, image.name), unit)),
             _text(f"/{number}/data/title", image.name),
-            _packed(f"/{number}/data/visible", "b", struct.pack("<?", image.meaning == layers.main.meaning)),
+            _packed(f"/{number}/data/visible", "b", struct.pack("<?", number < n_shown)),
         ]
         if is_missing.any():
             mask = _field(layers, is_missing.astype(np.float64), "")

@@ -11,6 +11,7 @@ import numpy as np
 from helio_jax.errors import SceneError
 from helio_jax.formats.layers import Layers
 
+_UNIT = "helio_jax heights, lengths in um"
 _PLY_TYPES = {"<f8": "double", "|u1": "uchar"}
 
 
@@ -41,7 +42,7 @@ def write_stl(layers: Layers, path: Path) -> None:
     records = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     records["normal"], records["corners"] = normals, corners
     with path.open("wb") as file:
-        file.write(b"helio_jax heights, lengths in um".ljust(80))
+        file.write(_UNIT.encode().ljust(80))
         file.write(np.uint32(len(triangles)).astype("<u4").tobytes())
         file.write(records.tobytes())
 
@@ -59,7 +60,7 @@ def write_ply(layers: Layers, path: Path) -> None:
     faces = np.zeros(len(triangles), [("n", "|u1"), ("corners", "<i4", 3)])
     faces["n"], faces["corners"] = 3, triangles
     header = [
-        *("ply", "format binary_little_endian 1.0", "comment helio_jax heights, lengths in um"),
+        *("ply", "format binary_little_endian 1.0", f"comment {_UNIT}", f"comment {layers.comment}"),
         f"element vertex {len(points)}",
         *(f"property {_PLY_TYPES[kind]} {name}" for name, kind in kinds),
         *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"),
@@ -74,6 +75,6 @@ def write_obj(layers: Layers, path: Path) -> None:
     """Write a Wavefront OBJ file."""
     vertices, triangles, _ = _mesh(layers)
     with path.open("w", encoding="ascii", newline="\n") as file:
-        file.write("# helio_jax heights, lengths in um\n")
+        file.write(f"# {_UNIT}\n# {layers.comment}\n")
         file.writelines("v " + " ".join(row) + "\n" for row in vertices.astype(str))
         file.writelines("f " + " ".join(row) + "\n" for row in (triangles + 1).astype(str))

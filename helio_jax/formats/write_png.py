@@ -29,6 +29,7 @@ def write_png(layers: Layers, path: Path) -> None:
     texts = {
         "Title": image.name,
         "Software": "helio_jax",
+        "Comment": layers.comment,
         "Scale": "value = low + (grey - 1) * (high - low) / 65534; grey 0: missing",
         "low": repr(low),
         "high": repr(high),

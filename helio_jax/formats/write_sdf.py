@@ -1,7 +1,7 @@
 """Write heights as SDF (ISO 25178-71) in its text form; a missing height is BAD.
 
 Lengths are metres: heights are written in um, of which the header gives the scale. Profiles follow in the order of
-increasing y. The format has no field for the position of the grid.
+increasing y. The trailer holds what is known of the data; no field, the position of the grid.
 """
 
 from pathlib import Path
@@ -39,4 +39,4 @@ def write_sdf(layers: Layers, path: Path) -> None:
         file.writelines(f"{key} = {value}\n" for key, value in header.items())
         file.write("*\n")
         file.writelines(" ".join(row) + "\n" for row in texts)
-        file.write("*\n*\n")
+        file.write(f"*\n{layers.comment.replace('*', ' ')}\n*\n")

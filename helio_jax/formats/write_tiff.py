@@ -7,7 +7,7 @@ the pages, in OME-XML. Lengths are um; missing values are NaN.
 import struct
 from fractions import Fraction
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 from helio_jax.arrays import pitch
 from helio_jax.errors import SceneError
@@ -102,7 +102,8 @@ def _ome(layers: Layers, images: list[Image]) -> str:
     pages = "".join(f'<TiffData FirstC="{k}" IFD="{k}" PlaneCount="1"/>' for k in range(len(images)))
     return (
         '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
-        f'<Image ID="Image:0" Name={quoteattr(layers.title)}><Pixels ID="Pixels:0" DimensionOrder="XYCZT" '
+        f'<Image ID="Image:0" Name={quoteattr(layers.title)}><Description>{escape(layers.comment)}</Description>'
+        f'<Pixels ID="Pixels:0" DimensionOrder="XYCZT" '
         f'Type="float" BigEndian="false" SizeX="{nx}" SizeY="{ny}" SizeC="{len(images)}" SizeZ="1" SizeT="1" '
         f'PhysicalSizeX="{pitch(layers.x)!r}" PhysicalSizeXUnit="\u00b5m" '
         f'PhysicalSizeY="{pitch(layers.y)!r}" PhysicalSizeYUnit="\u00b5m">{names}{pages}</Pixels></Image></OME>'

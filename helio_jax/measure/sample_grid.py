@@ -59,7 +59,14 @@ def resample_heights(rec: Reconstruction, grid_pitch: float, *, use_all: bool = 
         std = np.where(meets & np.isfinite(height), found_std, std)
         is_open &= ~meets
         level_above, gap_above = level, gap
-    return HeightMap(height, x, y, None if rec.height_std is None else std)
+    return HeightMap(
+        height=height,
+        x=x,
+        y=y,
+        height_std=None if rec.height_std is None else std,
+        status=rec.status,
+        provenance={**rec.provenance},
+    )
 
 
 def _axis(values: np.ndarray, step: float) -> np.ndarray:

@@ -198,14 +198,19 @@ def test_micrographs(tmp_path, stack, suffix):
 
 def test_units_flags_and_status_are_in_the_file(tmp_path, rec):
     """Units, the meaning of flags, and the status that states whether to trust the heights. Catches bare numbers."""
-    for suffix in (".nc", ".mat", ".npz", ".x3p"):
-        hx.export(rec, tmp_path / f"a{suffix}")
+    lists = {suffix: hx.export(rec, tmp_path / f"a{suffix}") for suffix in SUFFIXES}
+    for form in FORMATS:
+        path = tmp_path / f"a{form.suffixes[0]}"
+        is_packed = form.name in ("X3P", "MAT", "NPZ")  # read below
+        assert is_packed or (b"converged, in" in path.read_bytes()) == form.has_text
+        assert any("converged, in" in line for line in lists[form.suffixes[0]]) != form.has_text
     found = {suffix: READERS[suffix](tmp_path / f"a{suffix}").texts for suffix in (".nc", ".mat", ".npz", ".x3p")}
     for suffix in (".nc", ".mat", ".npz"):
         assert found[suffix]["units"]["height"] == found[suffix]["units"]["height_std"] == "um"
     assert found[".nc"]["flags"]["is_valid"] == ["no", "yes"] and "depth_jump" in found[".nc"]["flags"]["reason"]
     assert found[".nc"]["about"]["status"] == found[".mat"]["about"]["status"] == rec.status
     assert rec.status in found[".x3p"]["comment"]
+    assert READERS[".gwy"](tmp_path / "a.gwy").texts["shown"] == [True, False, False]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -224,7 +229,7 @@ def test_height_map_becomes_a_sample(tmp_path):
 
     height = np.arange(12.0).reshape(3, 4) ** 2
     made = HeightMap(height, 2.0 * np.arange(4), 5.0 + np.arange(3))
-    assert hx.export(made, tmp_path / "a.npz") == []
+    assert hx.export(made, tmp_path / "a.npz") == []  # nothing is left out
     back = read_height_map(tmp_path / "a.npz", 1.0, None)
     for name in ("x", "y", "height"):
         assert np.array_equal(getattr(back, name), getattr(made, name))
@@ -295,6 +300,7 @@ def test_grid_in_the_sample_frame(tmp_path, rec, stack):
     plane = rec.replace(height=2.0 + 0.1 * np.broadcast_to(rec.raster_x, (NY, NX)), is_valid=np.ones((NY, NX)))
     assert any("belong to the raster" in line for line in hx.export(plane, tmp_path / "a.nc", grid=0.5))
     found = READERS[".nc"](tmp_path / "a.nc")
+    assert found.texts["about"]["status"] == rec.status
     shift = rec.instrument.beam_shift[0]
     x = found.first[0] + 0.5 * np.arange(found.images["height"].shape[1])
     expected = (2.0 + 0.1 * x) / (1 - 0.1 * shift)  # h = 2 + X / 10 with X = x + h tan t
