@@ -113,6 +113,13 @@ class Layers:
         far = far[np.isfinite(far) & self.is_known.reshape(-1, *far.shape).any(0)].max(initial=0.0)
         return float(far) if far > _MAX_BESIDE * min(pitch(self.x), pitch(self.y)) else 0.0
 
+    @property
+    def points(self) -> dict[str, np.ndarray]:
+        """Positions of the points [y, x], um, where they are not those of the pixels."""
+        if self.is_list or self.distance_beside:
+            return {"point_x": self.point_x, "point_y": self.point_y}
+        return {}
+
     def images(self, layers: Sequence[Layer] | None = None) -> list[Image]:
         """Split layers into images; default: heights or counts, their error and their mask."""
         out = []

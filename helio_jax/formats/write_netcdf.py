@@ -7,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from helio_jax.formats.layers import Layers
+from helio_jax.formats.layers import Layer, Layers
 from helio_jax.reconstruction import REASONS
-
-_FLAGS = {"reason": REASONS}
-_NO_YES = ("no", "yes")
 
 
 def write_netcdf(layers: Layers, path: Path) -> None:
@@ -19,41 +16,39 @@ def write_netcdf(layers: Layers, path: Path) -> None:
     from scipy.io import netcdf_file
 
     with netcdf_file(path, "w", version=2) as file:
-        for name, value in {
-            "Conventions": "CF-1.8",
-            "title": layers.title,
-            "source": "helio_jax",
-            **layers.about,
-        }.items():
-            setattr(file, name, value.encode() or b"-")
+        about = {"Conventions": "CF-1.8", "title": layers.title, "source": "helio_jax", **layers.about}
+        for name, text in about.items():
+            setattr(file, name, text.encode() or b"-")
         for layer in layers.layers:
             for axis, n in zip(layer.axes, layer.values.shape, strict=True):
                 if axis not in file.dimensions:
                     file.createDimension(axis, n)
-        for axis, values in (("x", layers.x), ("y", layers.y)):
-            if not layers.is_list:
-                about = {"units": "um", "long_name": f"position {axis} of the pixel", "axis": axis.upper()}
-                _put(file, axis, values, (axis,), about)
-        if layers.is_list or layers.distance_beside:
-            for axis, values in (("x", layers.point_x), ("y", layers.point_y)):
-                _put(
-                    file,
-                    f"point_{axis}",
-                    values,
-                    ("y", "x"),
-                    {"units": "um", "long_name": f"position {axis} of the point"},
-                )
+        _put_positions(file, layers)
         _put_detectors(file, layers)
         for layer in layers.layers:
-            about = {"long_name": layer.meaning, "units": "1" if layer.unit in ("", "counts") else layer.unit}
-            names = _FLAGS.get(layer.name, _NO_YES)
-            if layer.values.dtype.kind in "bu":
-                about |= {"flag_values": np.arange(len(names), dtype=np.int8)}
-                about |= {"flag_meanings": " ".join(name.replace(" ", "_") for name in names)}
-                _put(file, layer.name, layer.values.astype(np.int8), layer.axes, about)
-            else:
-                about |= {"_FillValue": np.float64(np.nan)}
-                _put(file, layer.name, layer.values.astype(np.float64), layer.axes, about)
+            _put_layer(file, layer)
+
+
+def _put_layer(file, layer: Layer) -> None:
+    """Write one layer; whole numbers are flags."""
+    about: dict = {"long_name": layer.meaning, "units": "1" if layer.unit in ("", "counts") else layer.unit}
+    if layer.values.dtype.kind not in "bu":
+        _put(file, layer.name, layer.values.astype(np.float64), layer.axes, about | {"_FillValue": np.float64(np.nan)})
+        return
+    names = REASONS if layer.name == "reason" else ("no", "yes")
+    about["flag_values"] = np.arange(len(names), dtype=np.int8)
+    about["flag_meanings"] = " ".join(name.replace(" ", "_") for name in names)
+    _put(file, layer.name, layer.values.astype(np.int8), layer.axes, about)
+
+
+def _put_positions(file, layers: Layers) -> None:
+    """Write the positions of columns and rows, and those of the points where these are elsewhere."""
+    if not layers.is_list:
+        for axis, values in (("x", layers.x), ("y", layers.y)):
+            about = {"units": "um", "long_name": f"position {axis} of the pixel", "axis": axis.upper()}
+            _put(file, axis, values, (axis,), about)
+    for name, values in layers.points.items():
+        _put(file, name, values, ("y", "x"), {"units": "um", "long_name": f"position {name[-1]} of the point"})
 
 
 def _put(file, name: str, values: np.ndarray, axes: tuple[str, ...], about: dict) -> None:

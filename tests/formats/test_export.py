@@ -7,6 +7,7 @@ from scale import SCENE
 from typer.testing import CliRunner
 
 from helio_jax.__main__ import app
+from helio_jax.detector import Detector
 from helio_jax.errors import SceneError
 from helio_jax.formats.export import export
 from helio_jax.formats.hdf5 import write
@@ -89,8 +90,14 @@ def test_command_and_refusals(tmp_path, stacks):
     assert result.exit_code == 0 and (tmp_path / "a.mat").stat().st_size > 500, result.output
     stack, scene = stacks["expected"], load_scene(SCENE, SMALL)
     noisy = record(scene, stack)
+    cones = [
+        Detector(name=name, polar_deg=40.0, azimuth_deg=120.0 * k, half_angle_deg=5.0)
+        for k, name in enumerate(stack.instrument.detector_names)
+    ]
+    with_cones = stack.instrument.model_copy(update={"detector": cones})
     for other, reason in (
         (noisy, "both are expectations while the counts have noise"),
+        (stack.replace(instrument=with_cones), "detectors are cones"),
         (stack.replace(by_order=None), "which these micrographs do not"),
     ):
         assert reason in export(other, tmp_path / "other.mat")[0]
