@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.arrays import pitch
-from helio_jax.detector import Aperture
+from helio_jax.errors import SceneError
 from helio_jax.formats.write_arrays import cells, save_mat
 from helio_jax.micrograph import MicrographStack
 
@@ -80,12 +80,14 @@ def why_not(stack: MicrographStack) -> str:
         )
     if stack.instrument.beam.azimuth_deg != 0.0:
         return f"in it the beam travels along x, here beam.azimuth_deg is {stack.instrument.beam.azimuth_deg:g}"
-    if not all(isinstance(opening, Aperture) for opening in stack.instrument.openings()):
-        return "it holds ellipses in the plate, here detectors are cones or parts of a mesh"
     if stack.positions is not None:
         return f"it holds rasters, these micrographs are a list of {nx} positions"
     if n < 2 or min(ny, nx) < 2:
         return f"it holds at least 2 x 2 pixels and 2 detectors, got {nx} x {ny} and {n}"
+    try:
+        stack.instrument.apertures()
+    except SceneError as e:
+        return str(e)
     return ""
 
 

@@ -91,13 +91,13 @@ def test_command_and_refusals(tmp_path, stacks):
     stack, scene = stacks["expected"], load_scene(SCENE, SMALL)
     noisy = record(scene, stack)
     cones = [
-        Detector(name=name, polar_deg=40.0, azimuth_deg=120.0 * k, half_angle_deg=5.0)
+        Detector(name=name, polar_deg=40.0, azimuth_deg=120.0 * k, half_angle_deg=5.0, at_infinity=True)
         for k, name in enumerate(stack.instrument.detector_names)
     ]
     with_cones = stack.instrument.model_copy(update={"detector": cones})
     for other, reason in (
         (noisy, "both are expectations while the counts have noise"),
-        (stack.replace(instrument=with_cones), "detectors are cones"),
+        (stack.replace(instrument=with_cones), "is at infinity"),
         (stack.replace(by_order=None), "which these micrographs do not"),
     ):
         assert reason in export(other, tmp_path / "other.mat")[0]
