@@ -36,7 +36,8 @@ def export(
         if not (reason := why_not(stack)):
             with atomic_path(path) as part:
                 return write_reference(stack, part)
-        note = [f"the layout of the reference simulator: {reason}; the file holds arrays under names of their own"]
+        if stack.noise != "measured":  # that layout is for simulations
+            note = [f"the layout of the reference simulator: {reason}; the file holds arrays under names of their own"]
     layers = _chosen(layers_of(stack, invalid), form, detector, path)
     module, _, name = form.writer.partition(":")
     writer = getattr(importlib.import_module(f"helio_jax.formats.{module}"), name)
