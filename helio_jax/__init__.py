@@ -149,6 +149,7 @@ scores/               errors against something known
   agreement           agreement of a simulation with measured micrographs
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
+  sample_grid         heights of an oblique beam on a regular grid of the sample frame
   roughness           ISO 25178 parameters, profiles, steps
   spectrum            power spectra of regions
   ripple              wavelength and amplitude of a ripple
@@ -184,7 +185,18 @@ formats/              the only door to files
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold
-  export              writes the reference simulator's layout
+  export              writes files of other programs; the suffix selects the format
+  export_formats      the table of these formats: what each holds
+  layers              named arrays on one raster, which every writer takes
+  write_arrays        MAT, NPZ, CSV
+  write_gwyddion      GWY, GSF
+  write_meshes        STL, PLY, OBJ
+  write_netcdf        NetCDF
+  write_png           PNG, 16-bit grey
+  write_reference     the reference simulator's layout (.mat)
+  write_sdf           SDF (ISO 25178-71)
+  write_tiff          TIFF
+  write_x3p           X3P (ISO 25178-72)
   columns             tables of columns (.csv, .npz)
   points              control points (.csv)
   toml                writes instrument files
@@ -205,6 +217,7 @@ workflows/            what joins the stages
   measure             what helio measure prints
   steps               what helio measure --steps prints
   study               sweeps of scene values
+  export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
   spot                the beam's spot
@@ -259,6 +272,7 @@ _HOME = {
     "read": "formats.hdf5",
     "write": "formats.hdf5",
     "import_micrographs": "formats.matlab",
+    "export": "workflows.export",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

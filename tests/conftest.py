@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 FAST = {
-    "formats": ("export", "hdf5", "matlab"),
+    "formats": ("export", "export_formats", "hdf5", "matlab"),
     "inverse": ("edges", "integrate"),
     "physics": ("formfactor", "render", "tracer"),
     "unit": (
