@@ -52,11 +52,13 @@ class Explanation(NamedTuple):
         fit: without error bars.
         is_undecided: where another level explains the images as well [y, x].
         objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
+        has_steps: whether regions are at the levels of measured steps.
     """
 
     fit: Fit
     is_undecided: np.ndarray
     objects: np.ndarray | None = None
+    has_steps: bool = False
 
 
 def explain(
@@ -180,11 +182,12 @@ class _Fits:
                     anchors = level_anchors(labels, moved, start)
             except PredictionError:
                 pass  # the start is too rough for it: the fit begins at a smoother one
-        return Explanation(self.fitted(start, smoothed, patches, labels, anchors), is_undecided)
+        fit = self.fitted(start, smoothed, patches, labels, anchors)
+        return Explanation(fit, is_undecided, has_steps=anchors is not None and anchors.value.size > 0)
 
-    def from_objects(self, *_: Any) -> Explanation | None:
-        """Fit from objects on a flat substrate; None where there are none, or the border is not flat."""
-        if self.settings.border != "flat" or not self.settings.refine.objects:
+    def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
+        """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
+        if self.settings.border != "flat" or not self.settings.refine.objects or best.has_steps:
             return None
         none = AlbedoPatches.none(self.stack.shape[1:])
         relief, smoothed = _start(self.stack, self.settings, none, self.predict_start)
