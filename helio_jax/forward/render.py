@@ -35,12 +35,15 @@ class Corrections(eqx.Module):
         occluded: change of the probabilities by one standard deviation of where the side of the sample that the beam
             does not see stands, or None where not known. It errs as one: no number of pixels averages it.
         normals: unit normals that `multiple` is for, where they are not the surface's own.
+        surroundings: change of the probabilities by one standard deviation of how the sample goes on beyond the image,
+            or None where known. It errs as one, too.
     """
 
     masked: Float[Any, "detector 3 y x"]
     multiple: Float[Any, "detector y x"]
     occluded: Float[Any, "detector y x"] | None = None
     normals: Float[Any, "y x 3"] | None = None
+    surroundings: Float[Any, "detector y x"] | None = None
 
     @classmethod
     def none(cls, shape: tuple[int, int, int]) -> "Corrections":

@@ -48,7 +48,7 @@ def plain_name(name: str, detectors: tuple[str, ...]) -> str:
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = kind_of(name)
-    if kind in ("distance", "occluded", "law"):
+    if kind in ("distance", "occluded", "surroundings", "law"):
         return kind
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"

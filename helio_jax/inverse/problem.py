@@ -184,6 +184,7 @@ class FitProblem:
             "offset": k,
             "log_multiple": k,
             "occluded": (),
+            "surroundings": 1 if self.reconstruct_settings.border == "free" else 0,
             "albedo": (n, n),
             "drift": (k, self.drift_modes.shape[1]),
             "lines": (k, lines),

@@ -31,6 +31,7 @@ class Parameters(eqx.Module):
     Attributes:
         log_gain, offset, log_multiple: gain, offset, scale of the multiple scattering [detector].
         occluded: where the side of the sample that the beam does not see stands [].
+        surroundings: how the sample goes on beyond a free border [1].
         albedo: cosine modes of the smooth albedo [mode, mode].
         drift: slow drift [detector, mode].
         lines: offsets of the scan lines [detector, line].
@@ -45,6 +46,7 @@ class Parameters(eqx.Module):
     offset: Any
     log_multiple: Any
     occluded: Any
+    surroundings: Any
     albedo: Any
     drift: Any
     lines: Any
@@ -187,6 +189,8 @@ class FixedTerms(eqx.Module):
         multiple: multiple scattering, per albedo of the own patch [detector, y, x].
         occluded: change of the data by one standard deviation of where the occluded side stands, likewise
             [detector, y, x].
+        surroundings: change of the data by one standard deviation of how the sample goes on beyond the image, likewise
+            [detector, y, x].
         noise_bias: from `second_order_noise_bias` [detector, y, x].
         modes: how corrections follow common changes of the heights.
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
@@ -210,6 +214,7 @@ class FixedTerms(eqx.Module):
     form_factors: FormFactors
     multiple: Any
     occluded: Any
+    surroundings: Any
     noise_bias: Any
     modes: CommonModes
     drift_modes: Any
@@ -293,6 +298,8 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
     multiple = fixed.multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
+    if parameters.surroundings.size:
+        signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
     if parameters.patch.size:  # the first scattering of every order is by the own pixel
         signal = albedo_of_patches(parameters.patch, p.patch, fixed.patches) * signal
     return readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)

@@ -90,6 +90,7 @@ class FitState:
                 c.multiple[:, *thin],
                 None if c.occluded is None else c.occluded[:, *thin],
                 None if c.normals is None else c.normals[thin],
+                None if c.surroundings is None else c.surroundings[:, *thin],
             ),
             jax.tree.map(lambda f: f[thin], h.surface),
             self.parameters,

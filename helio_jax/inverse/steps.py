@@ -148,6 +148,11 @@ def _steepness(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
     return 1.0 + slope_x**2 + slope_y**2
 
 
+def _or_nothing(image: np.ndarray | None, problem: FitProblem) -> np.ndarray:
+    """Return a change of the data [detector, y, x]: 0 where there is none."""
+    return np.zeros(problem.signal.shape) if image is None else image
+
+
 def freeze(
     problem: FitProblem,
     state: FitState,
@@ -191,14 +196,15 @@ def freeze(
         state.parameters,
     )
     inverse_sigma, priors = cauchy_weight(state.residuals, limit) / held.sigma, problem.priors
-    occluded_std, anchors = held.corrections.occluded, problem.all_anchors.padded(MODE_BLOCK)
+    anchors = problem.all_anchors.padded(MODE_BLOCK)
     fixed = FixedTerms(
         data=problem.data,
         patches=problem.patches.members,
         inverse_sigma=inverse_sigma * problem.stride,
         form_factors=pixels.factors,
         multiple=held.multiple,
-        occluded=np.zeros(problem.signal.shape) if occluded_std is None else occluded_std,
+        occluded=_or_nothing(held.corrections.occluded, problem),
+        surroundings=_or_nothing(held.corrections.surroundings, problem),
         noise_bias=pixels.noise_bias,
         modes=_common_modes(held, np.exp(priors.gain * state.parameters.log_gain)),
         drift_modes=problem.drift_modes,

@@ -42,7 +42,7 @@ Trace = Callable[..., Corrections]
 
 
 def data_std(variance: np.ndarray, model: np.ndarray, corrections: Corrections, albedo: np.ndarray) -> np.ndarray:
-    """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, occluded side.
+    """Compute the standard deviation of data about a traced map [detector, y, x]: noise, tracer, what is not seen.
 
     Args:
         variance: of the data [detector, y, x].
@@ -50,8 +50,8 @@ def data_std(variance: np.ndarray, model: np.ndarray, corrections: Corrections, 
         corrections: per albedo of the own pixel.
         albedo: [y, x].
     """
-    hidden = 0.0 if corrections.occluded is None else corrections.occluded
-    traced = albedo**2 * ((MULTIPLE_ERROR * corrections.multiple) ** 2 + hidden**2)
+    unseen = [image for image in (corrections.occluded, corrections.surroundings) if image is not None]
+    traced = albedo**2 * ((MULTIPLE_ERROR * corrections.multiple) ** 2 + sum(image**2 for image in unseen))
     return np.sqrt(variance + (MODEL_ERROR * model) ** 2 + traced)
 
 

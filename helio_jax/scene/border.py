@@ -1,11 +1,13 @@
-"""Extrapolation of a surface beyond its image: the border falls to the substrate, a terrace continues level.
+"""Extrapolation of a surface beyond its image, in two ways between which the truth may lie.
 
-An image often ends on a flank. The surface beyond it is not imaged but scatters atoms into the image. Continued at the
-height of the border, it would lie above the true substrate, nearer to the apertures, and scatter too much.
+`extend_border`: the border falls to the substrate, a terrace continues level. An image often ends on a flank. The
+surface beyond it is not imaged but scatters atoms into the image. Continued at the height of the border, it would lie
+above the true substrate, nearer to the apertures, and scatter too much. `mirror_border`: relief goes on as it is
+inside, as that of a rough or wavy surface or a wall across the image does.
 """
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import gaussian_filter1d, map_coordinates, median_filter
 
 MAX_TERRACE_SLOPE = 0.2
 """A terrace slopes outwards by less than this. Any other border falls with its own slope, by at least this slope.
@@ -17,6 +19,11 @@ _SLOPE_PIXELS = 4
 """Pixels from the border over which its slope is measured."""
 _MEDIAN_PIXELS = 9
 """Pixels along the border whose slopes are reduced to their median."""
+_CONTOUR_PIXELS = 10
+"""Pixels inwards over which the direction of contours is averaged, and twice the Gaussian width along the border."""
+_MIN_COHERENCE, _MIN_CROSSING = 0.5, 0.3
+"""Contours have a direction where the eigenvalues of the structure tensor differ by more than this share of their sum;
+they cross the border where its sine exceeds this."""
 
 
 def extend_border(
@@ -46,8 +53,7 @@ def _extend_columns(
     for side in (-1, 1):
         edge, inner = (0, inward) if side < 0 else (-1, -1 - inward)
         at, height = fields[0][:, edge], fields[2][:, edge]
-        slope = (fields[2][:, inner] - height) / np.maximum(side * (at - fields[0][:, inner]), pitch)
-        slope = median_filter(slope, _MEDIAN_PIXELS, mode="nearest") * np.sign(height - level)
+        slope = _falling_slope(height, fields[2][:, inner], np.maximum(side * (at - fields[0][:, inner]), pitch), level)
         far = max(reach, float(np.max(side * at)) + 2.0 * pitch)
         run = np.abs(height - level) / np.maximum(slope, MAX_TERRACE_SLOPE)
         distance = np.clip(run, pitch, 0.5 * (far - side * at))
@@ -58,3 +64,62 @@ def _extend_columns(
             for field, ring in zip(fields, rings, strict=True)
         )
     return fields  # type: ignore[return-value]
+
+
+def mirror_border(z: np.ndarray, pitch: tuple[float, float], level: float, pixels: int) -> np.ndarray:
+    """Continue heights beyond the border by so many pixels, as they are inside [y + 2 pixels, x + 2 pixels].
+
+    Each point beyond the border takes the height of a point as far inside: where contours run across the border, the
+    one on the same contour, so that waves, steps and walls go on straight; elsewhere its mirror image, but a flank
+    falls to the substrate.
+
+    Args:
+        z: heights [y, x], um.
+        pitch: dy, dx of the raster, um.
+        level: height of the substrate, um.
+        pixels: fewer than there are rows and columns.
+    """
+    wide = _mirror_columns(z, pitch[1], pitch[0], level, pixels)
+    return _mirror_columns(wide.T, pitch[0], pitch[1], level, pixels).T
+
+
+def _mirror_columns(z: np.ndarray, dx: float, dy: float, level: float, pixels: int) -> np.ndarray:
+    """Add columns on either side."""
+    inward, steps = min(_SLOPE_PIXELS, z.shape[1] - 1), np.arange(1, pixels + 1)
+    beyond = []
+    for outwards in (z[:, ::-1], z):  # as if the border were on the right
+        height = outwards[:, -1]
+        slope = _falling_slope(height, outwards[:, -1 - inward], np.full(len(z), inward * dx), level)
+        along = _contour(outwards, dx, dy)
+        row = np.arange(len(z))[:, None] - 2.0 * (dx / dy) * along[:, None] * steps
+        found = map_coordinates(outwards, np.broadcast_arrays(row, z.shape[1] - 1 - steps), order=1, mode="nearest")
+        fall = np.maximum(height[:, None] - slope[:, None] * dx * steps, level)
+        is_flank = (slope > MAX_TERRACE_SLOPE) & (height > level) & (along == 0.0)
+        beyond.append(np.where(is_flank[:, None], np.minimum(found, fall), found))
+    return np.column_stack([beyond[0][:, ::-1], z, beyond[1]])
+
+
+def _contour(z: np.ndarray, dx: float, dy: float) -> np.ndarray:
+    """Compute y per x along the contours at the right border [y]; 0 where none crosses it.
+
+    From the structure tensor, averaged over `_CONTOUR_PIXELS` inwards and along the border.
+    """
+    gy, gx = np.gradient(z[:, -_CONTOUR_PIXELS:], dy, dx)
+    xx, xy, yy = (gaussian_filter1d(f.mean(1), 0.5 * _CONTOUR_PIXELS) for f in (gx * gx, gx * gy, gy * gy))
+    steepest = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    coherence = np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, np.finfo(float).tiny)
+    across, along = -np.sin(steepest), np.cos(steepest)
+    crosses = (coherence > _MIN_COHERENCE) & (np.abs(across) > _MIN_CROSSING)
+    return np.where(crosses, along / np.where(crosses, across, 1.0), 0.0)
+
+
+def _falling_slope(border: np.ndarray, inner: np.ndarray, distance: np.ndarray, level: float) -> np.ndarray:
+    """Compute the slopes by which a border falls outwards to the substrate [pixel].
+
+    Args:
+        border, inner: heights at the border and further inside [pixel], um.
+        distance: between them [pixel], um.
+        level: height of the substrate, um.
+    """
+    slope = median_filter((inner - border) / distance, _MEDIAN_PIXELS, mode="nearest")
+    return slope * np.sign(border - level)

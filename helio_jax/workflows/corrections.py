@@ -23,7 +23,7 @@ from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
-from helio_jax.scene.border import extend_border
+from helio_jax.scene.border import extend_border, mirror_border
 from helio_jax.scene.scattering import CosineLaw, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.trace import masks
@@ -44,8 +44,16 @@ MAX_SMOOTHING_STEP = 0.5
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
 for the test of a result, which is to be traced even where it is bad."""
+CONTINUATIONS = "level", "mirrored"
+"""How the surface goes on beyond a free border: `extend_border`, `mirror_border`."""
+MIRRORED = 0.5
+"""Share of the image that is mirrored at each border."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
+
+
+Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""x, y, z of points [y, x], um."""
 
 
 def make_predictor(
@@ -64,8 +72,8 @@ def make_predictor(
     neither `n_rays` nor `seed` and knows of the occluded side only the sheet along the beam.
 
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
-    with a `flat` border by the flat z = 0, with a `free` one by `extend_border`
-    (in radiosity by the flat in either case).
+    with a `flat` border by the flat z = 0, with a `free` one in both ways of `scene/border.py` (in radiosity by the
+    flat in either case). Their mean is expected, and half their difference is one more unknown of the fit.
     `masks_by` rays, masks are traced on the mesh instead of computed by the horizon march, for a test of the result
     that shares neither with the fit.
 
@@ -105,28 +113,34 @@ def make_predictor(
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
         smooth, smooth_normals = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
-        sides = raster.sides(smooth, smooth_normals)
-        branches = min(max(1, round(n_rays / height.size / RAYS / len(sides))), MAX_BRANCHES)
+        either_way = [raster.sides(smooth, smooth_normals, way) for way in raster.continuations]
+        sides, n_traced = either_way[0], len(either_way) * len(either_way[0])
+        branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
-        traced = [
-            smooth_along_surface(side.multiple(settings, limit, albedo), smooth_normals, passes) for side in sides
-        ]
+        images = np.array(
+            [
+                [smooth_along_surface(s.multiple(settings, limit, albedo), smooth_normals, passes) for s in way]
+                for way in either_way
+            ]
+        )
+        traced, found = list(images.mean(0)), images.mean((0, 1))
+        surroundings = 0.5 * (images[1] - images[0]).mean(0) if len(images) > 1 else None
         if masks_by == "rays":
             masked, freed = 0.0, [side.masked(np.ones(height.shape, bool)) for side in sides]
         else:
             masked = masking_corrections(surface, optics, Raster.of(stack)).masked
             if len(sides) == 1:
-                return Corrections(masked, traced[0], normals=smooth_normals)
+                return Corrections(masked, found, None, smooth_normals, surroundings)
             is_masked = np.any(masked != 0.0, axis=(0, 1))
             sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
             freed = [side.masked(is_masked) - sheet for side in sides]
         if len(sides) == 1:
-            return Corrections(freed[0], traced[0], normals=smooth_normals)
+            return Corrections(freed[0], found, None, smooth_normals, surroundings)
         normal = np.moveaxis(normals, -1, 0)
         either = [m - single_scattering(f, normal) for m, f in zip(traced, freed, strict=True)]
-        found, occluded = np.mean(traced, axis=0), 0.5 * np.subtract(*either)
-        return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals)
+        occluded = 0.5 * np.subtract(*either)
+        return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals, surroundings)
 
     return predict
 
@@ -238,23 +252,44 @@ class _Raster:
     reach: float
     has_flat_surroundings: bool
 
-    def side(self, height: np.ndarray, normals: np.ndarray, share: float) -> SurfaceHypothesis:
-        """Make the surface with its occluded side at a share of the way back."""
+    @property
+    def continuations(self) -> tuple[str, ...]:
+        """Ways in which the surface may go on beyond the image."""
+        return CONTINUATIONS[:1] if self.has_flat_surroundings else CONTINUATIONS
+
+    def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
+        """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`."""
         shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
-        at = *self.instrument.surface_position(self.x, self.y, height), height
+        seen = at = *self.instrument.surface_position(self.x, self.y, height), height
         behind = occluded_vertices(*at, normals, shift, share)
         if self.has_flat_surroundings:
             body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
             body = with_cavities(body, at, behind)
         else:
             level = substrate_level(height)
+            if way == "mirrored":
+                at, behind = self.mirrored(at, behind, level)
             extended, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
             body = with_cavities(surface_body(*extended), extended, behind)
-        point = np.stack(at, -1).reshape(-1, 3) + self.lift * normal
+        point = np.stack(seen, -1).reshape(-1, 3) + self.lift * normal
         return SurfaceHypothesis(self, Hits.on_mesh(point, normal), body, behind[0].shape, Intersector(body))
 
-    def sides(self, height: np.ndarray, normals: np.ndarray) -> list[SurfaceHypothesis]:
+    def mirrored(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
+        """Mirror a grid at the image's border; the occluded side of what is added stays on the sheet along the beam."""
+        n = int(MIRRORED * min(self.x.shape))
+        dx, dy = pitch(self.x[0]), pitch(self.y[:, 0])
+        x, y = np.meshgrid(
+            *(p[0] + step * np.arange(-n, p.size + n) for p, step in ((self.x[0], dx), (self.y[:, 0], dy)))
+        )
+        z = mirror_border(at[2], (dy, dx), level, n)
+        wide = *self.instrument.surface_position(x, y, z), z
+        moved = wide[0].copy(), wide[1].copy(), z.copy()
+        for field, inner in zip(moved, behind, strict=True):
+            field[n:-n, n:-n] = inner
+        return wide, moved
+
+    def sides(self, height: np.ndarray, normals: np.ndarray, way: str = "level") -> list[SurfaceHypothesis]:
         """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
         at = *self.instrument.surface_position(self.x, self.y, height), height
         is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
-        return [self.side(height, normals, share) for share in ((0.0,) if is_fully_seen else OCCLUDED_NODES)]
+        return [self.side(height, normals, share, way) for share in ((0.0,) if is_fully_seen else OCCLUDED_NODES)]
