@@ -160,6 +160,8 @@ measure/              numbers from height maps
 figures/              pictures
   canvas              the only door to matplotlib
   plot_data           arrays that panel and report share
+  maps                maps of the pages: image with colour bar, relief, validity
+  sheet               layout of a page in rows of cells
   panel               micrographs, heights, errors and profiles on one page
   report              HTML report
   interactive         interactive views; the only door to plotly
