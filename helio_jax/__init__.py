@@ -20,6 +20,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
   settings            base class of all settings tables
+  drawable            plot(), short repr and notebook view of the records
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated
@@ -167,6 +168,17 @@ figures/              pictures
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   before_after        a scan before and after calibration
+  notebook            thumbnail and table of a record
+  micrograph_page     page of micrographs and apertures
+  scene_page          page of a scene before any tracing
+  height_page         page of a height map
+  instrument_page     page of an instrument
+  instrument_views    plan view and side view of an instrument
+  scale_bar           scale bar of a map
+  text_box            rows of words on a page
+  summary             what a person wants to know, in about ten lines
+  image_numbers       mean, SNR and error of each image
+  wording             numbers with units as a person writes them
   overlay             overlay of aligned scans; facet map
   cracks              cracks and vertical edges
   steps               mask bands and steps on the micrographs
@@ -196,6 +208,8 @@ workflows/            what joins the stages
   calibrate_rotated   calibration of aligned rotated scans
   orient              finds the orientation of a file's arrays
   compare             simulation against experiment
+  show                pictures of records and files: hx.show
+  any_file            reads a file of any kind
   effects             effects that a simulation may lack
   measure             what helio measure prints
   steps               what helio measure --steps prints
@@ -210,9 +224,10 @@ commands/             the command line; no logic of its own
   app                 shared options and messages
   door                checks outputs against inputs before any work
   simulating          run, simulate, rays, resume, study, spot, plate
+  looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  about               info, validate, schema, doctor, fetch-data, cite
+  about               validate, schema, doctor, fetch-data, cite
 ```
 """
 
@@ -247,6 +262,7 @@ _HOME = {
     "simulate": "workflows.pipeline",
     "reconstruct": "workflows.pipeline",
     "true_height": "workflows.truth",
+    "show": "workflows.show",
     "evaluate": "workflows.pipeline",
     "run": "workflows.pipeline",
     "read": "formats.hdf5",

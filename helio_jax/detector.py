@@ -148,6 +148,18 @@ class Detector(Settings):
         """Whether it requires a plate of kind "mesh"."""
         return self.part is not None or self.height_um is not None
 
+    def aim(self, working_distance: float) -> tuple[float, float] | None:
+        """Return polar angle and azimuth, seen from the nominal spot [rad]; None: a mesh part.
+
+        Of a cone its axis as stated, of an ellipse its centre on a plate at `working_distance` [um].
+        """
+        if self.polar_deg is not None:
+            return math.radians(self.polar_deg), math.radians(self.azimuth_deg or 0.0)
+        if self.center_um is None:
+            return None
+        x, y = self.center_um
+        return math.atan2(math.hypot(x, y), working_distance), math.atan2(y, x)
+
     def opening(self, working_distance: float) -> Aperture | Cone | None:
         """Resolve to the ellipse on a plate at `working_distance` [um], or the cone at infinity; None: a mesh part."""
         if self.part is not None:

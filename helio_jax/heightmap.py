@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from helio_jax.arrays import check_axis, set_float_arrays
+from helio_jax.drawable import Drawable
 from helio_jax.errors import InputFileError
 
 
-@dataclass(frozen=True)
-class HeightMap:
+@dataclass(frozen=True, repr=False)
+class HeightMap(Drawable):
     """Heights on a regular x, y grid (checked when made).
 
     Attributes:
@@ -26,3 +27,6 @@ class HeightMap:
         check_axis("x", self.x, InputFileError)
         check_axis("y", self.y, InputFileError)
         set_float_arrays(self, {"height": (self.y.size, self.x.size)}, InputFileError)
+
+    def _in_short(self) -> str:
+        return f"{self.y.size} x {self.x.size} (y, x)"

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors"},
-    {"arrays", "settings", "kernel", "robust", "block_fit"},
+    {"arrays", "settings", "kernel", "robust", "block_fit", "drawable"},
     {"detector"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},

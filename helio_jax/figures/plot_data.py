@@ -12,6 +12,8 @@ from helio_jax.reconstruction import Reconstruction
 
 REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377", "#66ccee")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
+DETECTOR_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#999999")
+"""One colour per detector, repeated (Tol's bright scheme)."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""
 
@@ -35,6 +37,15 @@ def apex_pixel(height: np.ndarray) -> tuple[int, int]:
     """Find the pixel (row, column) farthest above or below the median height; NaN is ignored."""
     away = np.abs(height - np.nanmedian(height)) if np.isfinite(height).any() else np.zeros(height.shape)
     row, column = np.unravel_index(np.argmax(np.where(np.isfinite(away), away, -1.0)), height.shape)
+    return int(row), int(column)
+
+
+def highest_valid(rec: Reconstruction) -> tuple[int, int] | None:
+    """Find the pixel (row, column) of the highest valid height; None: no height is valid."""
+    use = rec.is_valid & np.isfinite(rec.height)
+    if not use.any():
+        return None
+    row, column = np.unravel_index(np.argmax(np.where(use, rec.height, -np.inf)), use.shape)
     return int(row), int(column)
 
 

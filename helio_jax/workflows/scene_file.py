@@ -59,7 +59,7 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
         SceneError: missing, too large, not UTF-8, not TOML, or invalid; the message lists all errors.
     """
     path = Path(path)
-    data = {"name": path.stem[:200], **with_scan_kind(_merge(_read_extended(path), _nest(overrides or {})))}
+    data = {"name": path.stem[:200], **with_scan_kind(_merge(read_tables(path), _nest(overrides or {})))}
     try:
         scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
@@ -78,7 +78,7 @@ def files_read(
     names: list[str] = []
     try:
         extended = _read_toml(path).get("extends")
-        tables = _merge(_read_extended(path), _nest(overrides or {}))
+        tables = _merge(read_tables(path), _nest(overrides or {}))
     except SceneError:
         return [(label, path)]
     with_files(tables, lambda name: names.append(name) or name)
@@ -104,7 +104,7 @@ def load_instrument(path: str | os.PathLike) -> Instrument:
     Raises:
         SceneError: as `load_scene`; only the tables beam, plate, uncertainty and detector are checked.
     """
-    data = _read_extended(Path(path))
+    data = read_tables(Path(path))
     known = set(SceneFile.model_fields) - set(Instrument.model_fields)
     tables = {key: value for key, value in data.items() if key not in known}
     try:
@@ -126,8 +126,12 @@ def json_schema() -> dict[str, Any]:
     return schema
 
 
-def _read_extended(path: Path) -> dict[str, Any]:
-    """Read a file and merge it over the file that it extends."""
+def read_tables(path: Path) -> dict[str, Any]:
+    """Read a scene or instrument file as tables, merged over the file that it extends; nothing else is checked.
+
+    Raises:
+        SceneError: missing, too large, not UTF-8 or not TOML.
+    """
     data = _read_toml(path)
     if "extends" not in data:
         return data

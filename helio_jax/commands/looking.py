@@ -1,0 +1,38 @@
+"""Commands to look at files: show, info. They parse, call and print only."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import FIGURE, app
+from helio_jax.commands.door import Reads
+
+
+@app.command()
+def show(
+    file: Annotated[
+        Path,
+        typer.Argument(help="Micrographs or height map (.h5, .mat, .npz), scene or instrument (.toml)."),
+        Reads(names_files=True),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Picture (default: FILE.show.png beside the file)."), FIGURE
+    ] = None,
+    window: Annotated[bool, typer.Option("--window", help="Open a window instead of writing a picture.")] = False,
+    instrument: Annotated[
+        Path | None, typer.Option(help="Instrument or scene file, for a .mat file."), Reads(names_files=True)
+    ] = None,
+    common_scale: Annotated[
+        bool, typer.Option("--common-scale", help="One grey scale for all micrographs (default: one for each).")
+    ] = False,
+    view: Annotated[int, typer.Option(min=0, help="Which view of a scene's scan, from 0.")] = 0,
+) -> None:
+    """Draw a file: micrographs and apertures, heights, the instrument, or a scene before any tracing."""
+    from helio_jax.workflows.show import default_picture
+    from helio_jax.workflows.show import show as draw_file
+
+    picture = output if output or window else default_picture(file)
+    draw_file(file, picture, window=window, instrument=instrument, common_scale=common_scale, view=view)
+    if picture:
+        print(picture)
