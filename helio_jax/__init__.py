@@ -209,6 +209,7 @@ workflows/            what joins the stages
   orient              finds the orientation of a file's arrays
   compare             simulation against experiment
   show                pictures of records and files: hx.show
+  file_info           what a file of any kind holds: helio info
   any_file            reads a file of any kind
   effects             effects that a simulation may lack
   measure             what helio measure prints

@@ -1,11 +1,12 @@
 """Commands to look at files: show, info. They parse, call and print only."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import FIGURE, app
+from helio_jax.commands.app import FIGURE, PICTURE, AsJson, app
 from helio_jax.commands.door import Reads
 
 
@@ -29,10 +30,35 @@ def show(
     view: Annotated[int, typer.Option(min=0, help="Which view of a scene's scan, from 0.")] = 0,
 ) -> None:
     """Draw a file: micrographs and apertures, heights, the instrument, or a scene before any tracing."""
-    from helio_jax.workflows.show import default_picture
     from helio_jax.workflows.show import show as draw_file
 
-    picture = output if output or window else default_picture(file)
+    picture = output if output or window else file.with_suffix(PICTURE)
     draw_file(file, picture, window=window, instrument=instrument, common_scale=common_scale, view=view)
     if picture:
         print(picture)
+
+
+@app.command()
+def info(
+    file: Annotated[
+        Path,
+        typer.Argument(help="Any file that helio reads: .h5, .toml, .mat, meshes, .npz, .npy, .csv, .mtl."),
+        Reads(),
+    ],
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also every array, setting and step of the history.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """State what a file holds, in about ten lines: sizes, counts, heights, geometry, where it came from."""
+    from helio_jax.figures.summary import text_lines
+    from helio_jax.workflows.file_info import file_info
+
+    found = file_info(file)
+    if as_json:
+        print(json.dumps(found.as_dict()))
+        return
+    print(f"{found.file}: {found.kind}, {found.n_bytes:,} bytes")
+    print("\n".join(text_lines(found.rows)))
+    if everything:
+        print("\n".join(found.detail_lines()))

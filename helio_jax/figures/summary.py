@@ -4,7 +4,6 @@ Rows of (label, text) for `helio info`, for the end of `helio simulate` and `hel
 plain text: um, deg.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,20 +29,20 @@ KINDS = {"expected": "expected counts", "poisson": "counts with noise", "measure
 
 def summarise(what: Any) -> Rows:
     """Summarise a stack, set, reconstruction, height map, instrument or scene as rows of (label, text)."""
-    kinds: tuple[tuple[type, Callable], ...] = (
-        (MicrographStack, _stack_rows),
-        (MicrographSet, _set_rows),
-        (Reconstruction, _reconstruction_rows),
-        (HeightMap, _height_map_rows),
-        (Scene, _scene_rows),
-        (Instrument, _instrument_rows),
-    )
-    for kind, rows in kinds:
-        if isinstance(what, kind):
-            return rows(what)
-    raise TypeError(
-        f"no summary of a {type(what).__name__}: needed is one of {', '.join(k.__name__ for k, _ in kinds)}"
-    )
+    match what:
+        case MicrographStack():
+            return _stack_rows(what)
+        case MicrographSet():
+            return _set_rows(what)
+        case Reconstruction():
+            return _reconstruction_rows(what)
+        case HeightMap():
+            return _height_map_rows(what)
+        case Scene():
+            return _scene_rows(what)
+        case Instrument():
+            return _instrument_rows(what)
+    raise TypeError(f"there is no summary of a {type(what).__name__}")
 
 
 def text_lines(rows: Rows) -> list[str]:
@@ -133,7 +132,8 @@ def _set_rows(scans: MicrographSet) -> Rows:
         rows.append((f"- {stack.name}", f"{where}; mean {means}"))
     if len(scans.stacks) > MAX_SCANS:
         rows.append(("- ...", f"{len(scans.stacks) - MAX_SCANS} more"))
-    return rows + _made_rows(scans.provenance or first.provenance)
+    made = [(f"{label} (first)", text) for label, text in _made_rows(first.provenance)]
+    return rows + (_made_rows(scans.provenance) or made)
 
 
 def _reconstruction_rows(rec: Reconstruction) -> Rows:
@@ -222,6 +222,10 @@ def _made_rows(provenance: Any) -> Rows:
     parts = []
     if isinstance(source := provenance.get("source"), dict):
         parts.append(f"imported from {source.get('file')} ({source.get('kind')})")
+    metadata = provenance.get("metadata")
+    scan = metadata.get("meas_list") if isinstance(metadata, dict) else None
+    if isinstance(scan, dict) and isinstance(took := scan.get("scan_time"), (int, float)):
+        parts.append(f"scanned in {duration(took)}")
     if "scene_file" in provenance:
         parts.append(f"simulated from {provenance['scene_file']}")
     scene = provenance.get("scene")

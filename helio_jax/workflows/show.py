@@ -27,8 +27,6 @@ from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits
 from helio_jax.workflows.any_file import read_any
 
-PICTURE = ".show.png"
-"""End of the name of the picture that is written beside a file."""
 _GRID = 101
 """Points per side of the drawn surface of a sample."""
 _AROUND = 0.15
@@ -106,11 +104,6 @@ def show(
     if window:
         canvas.open_window(figure)
     return figure
-
-
-def default_picture(path: str | os.PathLike) -> Path:
-    """Return the name of the picture beside a file: a.h5 -> a.show.png."""
-    return Path(path).with_suffix(PICTURE)
 
 
 def sample_surface(scene: Scene, view: View) -> SampleSurface:
