@@ -19,7 +19,7 @@ _PLATE, _BEAM, _QUIET = "#e9e9ea", "#111111", "#666666"
 _SIZES = (10, 8.5, 8)
 _FEW = 6
 """Up to so many detectors, polar angle and azimuth stand on each aperture."""
-_FARTHEST = math.radians(70.0)
+_FARTHEST = math.radians(55.0)
 """Cones at infinity are drawn at most this far from the plate normal."""
 
 
@@ -31,7 +31,7 @@ def color_of(k: int) -> str:
 def shown_ellipse(detector: Detector, distance: float) -> Aperture | None:
     """Return the ellipse on the plate that stands for a detector; None: a part of the plate's mesh.
 
-    Of a cone at infinity it is the section with the plate, drawn closer in where it lies beyond 70 deg.
+    Of a cone at infinity it is the section with the plate, drawn closer in where it lies beyond 55 deg.
     """
     opening = detector.opening(distance)
     if opening is None or isinstance(opening, Aperture):
@@ -44,37 +44,48 @@ def shown_ellipse(detector: Detector, distance: float) -> Aperture | None:
 def draw_plan(ax: canvas.Axes, instrument: Instrument) -> None:
     """Draw plate, apertures, pinhole, beam and nominal spot as seen from above, in the lab frame [mm]."""
     w, n = instrument.working_distance, len(instrument.detector)
-    rims, hidden = [], []
-    for k, detector in enumerate(instrument.detector):
-        ellipse, name = shown_ellipse(detector, w), detector.name
-        if ellipse is None:
-            hidden.append(name)
-            continue
-        rim = 1e-3 * ellipse.rim(96)[0]
-        ax.fill(rim[:, 0], rim[:, 1], facecolor="white", lw=0)
-        ax.fill(rim[:, 0], rim[:, 1], facecolor=color_of(k), alpha=0.45, lw=0)
-        closed = np.vstack([rim, rim[:1]])
-        dashes = "--" if detector.at_infinity else "-"
-        ax.plot(closed[:, 0], closed[:, 1], color=color_of(k), lw=1.6, ls=dashes, gid=name)
-        center = 1e-3 * np.array(ellipse.center)
-        ax.plot([0.0, center[0]], [0.0, center[1]], color=_QUIET, lw=0.8, ls=":", zorder=0)
-        polar, azimuth = detector.aim(w) or (0.0, 0.0)
-        words = f"polar {angle(polar)}\nazimuth {angle(azimuth)}" + "\nat infinity" * bool(detector.at_infinity)
-        label = f"{name}\n{typeset(words)}" if n <= _FEW else name
-        ax.text(center[0], center[1], label, ha="center", va="center", fontsize=_SIZES[2], linespacing=1.25)
-        rims.append(rim)
+    shown = {k: e for k, d in enumerate(instrument.detector) if (e := shown_ellipse(d, w)) is not None}
+    rims = {k: 1e-3 * ellipse.rim(96)[0] for k, ellipse in shown.items()}
     pinhole = 1e-3 * instrument.pinhole_center[:2]
-    marks = np.concatenate([*rims, pinhole[None], np.zeros((1, 2))])
+    marks = np.concatenate([*rims.values(), pinhole[None], np.zeros((1, 2))])
     half = _frame(ax, marks)
+    for k, rim in rims.items():
+        _draw_aperture(ax, instrument.detector[k], w, rim, color_of(k), half, has_angles=n <= _FEW)
     _draw_beam_from_above(ax, instrument, pinhole, half)
     if instrument.plate.kind == "scattering":
         ax.plot(*_outline(instrument).T, color=_QUIET, lw=1.0)
     _draw_axes(ax, half, marks)
     ax.set_facecolor(_PLATE)
-    if hidden:
+    if hidden := [d.name for k, d in enumerate(instrument.detector) if k not in shown]:
         text = f"parts of the plate's mesh, not drawn: {', '.join(hidden)}"
         ax.text(0.5, 0.99, text, transform=ax.transAxes, ha="center", va="top", fontsize=_SIZES[2])
     canvas.label_axes(ax, "Plate from above (lab frame)", "x (mm)", "y (mm)", _SIZES)
+
+
+def _draw_aperture(
+    ax: canvas.Axes,
+    detector: Detector,
+    distance: float,
+    rim: np.ndarray,
+    color: str,
+    half: float,
+    *,
+    has_angles: bool,
+) -> None:
+    """Draw an aperture from its rim [n, 2], mm, with its name and angles on it, or below it where it is small."""
+    ax.fill(rim[:, 0], rim[:, 1], facecolor="white", lw=0)
+    ax.fill(rim[:, 0], rim[:, 1], facecolor=color, alpha=0.45, lw=0)
+    closed = np.vstack([rim, rim[:1]])
+    dashes = "--" if detector.at_infinity else "-"
+    ax.plot(closed[:, 0], closed[:, 1], color=color, lw=1.6, ls=dashes, gid=detector.name)
+    x, y = 0.5 * (rim.min(0) + rim.max(0))
+    ax.plot([0.0, x], [0.0, y], color=_QUIET, lw=0.8, ls=":", zorder=0)
+    polar, azimuth = detector.aim(distance) or (0.0, 0.0)
+    words = f"polar {angle(polar)}\nazimuth {angle(azimuth)}" + "\nat infinity" * bool(detector.at_infinity)
+    label = f"{detector.name}\n{typeset(words)}" if has_angles else detector.name
+    is_small = has_angles and min(np.ptp(rim, axis=0)) < 0.3 * half
+    place = (x, rim[:, 1].min() - 0.02 * half, "top") if is_small else (x, y, "center")
+    ax.text(place[0], place[1], label, ha="center", va=place[2], fontsize=_SIZES[2], linespacing=1.25)
 
 
 def _frame(ax: canvas.Axes, points: np.ndarray) -> float:
@@ -107,7 +118,8 @@ def _draw_beam_from_above(ax: canvas.Axes, instrument: Instrument, pinhole: np.n
     turn = turn if -90.0 < turn <= 90.0 else turn - 180.0
     style = {**spot, "rotation": turn, "rotation_mode": "anchor"}
     ax.annotate("beam", tuple(middle), (0, 0), ha="center", va="bottom", xycoords="data", **style)
-    ax.annotate("spot", (0.0, 0.0), (0, -7), ha="center", va="top", **spot)
+    beside = {"ha": "center", "va": "top"} if across else {"ha": "left", "va": "center"}
+    ax.annotate("spot", (0.0, 0.0), (0, -7) if across else (9, 0), **beside, **spot)
 
 
 def _outline(instrument: Instrument) -> np.ndarray:

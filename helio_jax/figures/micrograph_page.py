@@ -78,9 +78,13 @@ def _title(stack: MicrographStack, k: int, found: ImageNumbers, *, is_one: bool)
     """Write scan, name and place of the aperture, mean counts and SNR, a line each."""
     unit = stack.unit if stack.unit in UNITS else ""
     scan = "" if is_one else f"{stack.name}, sample at {angle(stack.sample_rotation)}\n"
-    snr = "" if found.snr is None else f" · SNR {found.snr:.3g}" + (" if counted" if stack.noise == "expected" else "")
+    quality = ""
+    if found.snr is not None:
+        quality = f" · SNR {found.snr:.3g}" + (" if counted" if stack.noise == "expected" else "")
+    elif found.noise is not None:
+        quality = f" · noise {amount(found.noise, unit)}"
     aperture = f"{stack.instrument.detector_names[k]}: {aims(stack.instrument)[k]}"
-    return typeset(f"{scan}{aperture}\nmean {amount(found.mean, unit)}{snr}")
+    return typeset(f"{scan}{aperture}\nmean {amount(found.mean, unit)}{quality}")
 
 
 def _draw_line(ax: canvas.Axes, stack: MicrographStack, k: int, title: str) -> None:

@@ -152,6 +152,7 @@ def _frame(ax: Any, x: Any, y: Any, z: Any, spans: tuple[float, float, float], u
     ax.set_box_aspect(spans, zoom=0.86)
     ax.computed_zorder = False  # the order of drawing is given: the plate lies above the sample
     ax.view_init(elev=24, azim=-58)
+    ax.xaxis.labelpad = ax.yaxis.labelpad = 7
     ax.set_zlabel(f"height ({unit})", fontsize=_SIZES[1])
     ax.locator_params(nbins=5)
     ax.locator_params(axis="z", nbins=5 if spans[2] > 0.5 * max(spans) else 2)
