@@ -72,4 +72,4 @@ def draw_validity(ax: canvas.Axes, rec: Reconstruction) -> None:
     ax.locator_params(nbins=5)
     label_map(ax, "Validity")
     style = {"fontsize": 8, "frameon": False, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-    ax.legend(handles=keys, labelspacing=1.0, handlelength=1.2, **style)
+    ax.legend(handles=keys, labelspacing=1.0, handlelength=0.9, handletextpad=0.5, **style)

@@ -13,7 +13,7 @@ def length_unit(um: float) -> tuple[float, str]:
     """Choose the unit in which a length is read most easily: its size [um] and its name."""
     if um == 0.0:
         return 1.0, "um"
-    return next((unit for unit in reversed(_LENGTHS) if um >= 0.9995 * unit[0]), _LENGTHS[0])
+    return next((unit for unit in reversed(_LENGTHS) if um >= 0.99995 * unit[0]), _LENGTHS[0])
 
 
 def length(um: float) -> str:
