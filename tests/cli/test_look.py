@@ -174,6 +174,9 @@ def test_info_and_import_of_measured_files(shared, tmp_path):
     text = " ".join(said.split())
     assert code == 0 and "channel 1 121 x 121 (columns x rows), only zeros: not connected" in text
     assert "channel 4 121 x 121 (columns x rows), mean 9938" in text and "pixel 30 x 30 um" in text
+    assert "single 1 304 x 351 (columns" in " ".join(
+        helio("info", source.with_name("sphere_a_simulated.mat"))[1].split()
+    )
     code, said = helio("import", source, "-o", tmp_path / "m.h5", "--instrument", INSTRUMENT)
     assert code == 0 and "field of view 3.63 x 3.63 mm" in said and "scanned in 5 h 14 min" in said
     assert (tmp_path / "m.show.png").read_bytes().startswith(HEADS[".png"])
