@@ -152,10 +152,10 @@ def _of_mesh(path: Path) -> Found:
     closed = "yes" if found["is_watertight"] else f"no: {found['n_inner_open_edges']} open edges within"
     rows.append(("closed", f"{closed}; {found['n_open_edges'] - found['n_inner_open_edges']} on its outer border"))
     faults = {"n_edges_of_three_faces": "edges of three faces", "n_duplicate_faces": "faces given twice"}
-    told = [f"{found[key]} {words}" for key, words in faults.items() if found[key]]
+    shown = [f"{found[key]} {words}" for key, words in faults.items() if found[key]]
     if not found["is_winding_consistent"]:
-        told.append("neighbouring faces are wound in opposite senses")
-    return "mesh", [*rows, ("faults", ", ".join(told) or "none found")], {**found, "bounds": [low, high]}
+        shown.append("neighbouring faces are wound in opposite senses")
+    return "mesh", [*rows, ("faults", ", ".join(shown) or "none found")], {**found, "bounds": [low, high]}
 
 
 def _of_npz(path: Path) -> Found:
