@@ -12,13 +12,17 @@ import numpy as np
 from helio_jax.detector import Aperture, Detector, cone_ellipse
 from helio_jax.figures import canvas
 from helio_jax.figures.plot_data import DETECTOR_COLORS
-from helio_jax.figures.wording import angle, length, typeset
+from helio_jax.figures.wording import angle, length, short, typeset
 from helio_jax.instrument import Instrument
 
 _PLATE, _BEAM, _QUIET = "#e9e9ea", "#111111", "#666666"
 _SIZES = (10, 8.5, 8)
 _FEW = 6
 """Up to so many detectors, polar angle and azimuth stand on each aperture."""
+_MANY = 12
+"""With more detectors each aperture has its number in the order of the detectors instead of its name."""
+_NAME = 16
+"""Letters of a name that are drawn."""
 _FARTHEST = math.radians(55.0)
 """Cones at infinity are drawn at most this far from the plate normal."""
 
@@ -50,7 +54,8 @@ def draw_plan(ax: canvas.Axes, instrument: Instrument) -> None:
     marks = np.concatenate([*rims.values(), pinhole[None], np.zeros((1, 2))])
     half = _frame(ax, marks)
     for k, rim in rims.items():
-        _draw_aperture(ax, instrument.detector[k], w, rim, color_of(k), half, has_angles=n <= _FEW)
+        name = short(instrument.detector[k].name, _NAME) if n <= _MANY else f"{k + 1}"
+        _draw_aperture(ax, instrument.detector[k], name, w, rim, color_of(k), half, has_angles=n <= _FEW)
     _draw_beam_from_above(ax, instrument, pinhole, half)
     if instrument.plate.kind == "scattering":
         ax.plot(*_outline(instrument).T, color=_QUIET, lw=1.0)
@@ -65,6 +70,7 @@ def draw_plan(ax: canvas.Axes, instrument: Instrument) -> None:
 def _draw_aperture(
     ax: canvas.Axes,
     detector: Detector,
+    name: str,
     distance: float,
     rim: np.ndarray,
     color: str,
@@ -82,7 +88,7 @@ def _draw_aperture(
     ax.plot([0.0, x], [0.0, y], color=_QUIET, lw=0.8, ls=":", zorder=0)
     polar, azimuth = detector.aim(distance) or (0.0, 0.0)
     words = f"polar {angle(polar)}\nazimuth {angle(azimuth)}" + "\nat infinity" * bool(detector.at_infinity)
-    label = f"{detector.name}\n{typeset(words)}" if has_angles else detector.name
+    label = f"{name}\n{typeset(words)}" if has_angles else name
     is_small = has_angles and min(np.ptp(rim, axis=0)) < 0.3 * half
     place = (x, rim[:, 1].min() - 0.02 * half, "top") if is_small else (x, y, "center")
     ax.text(place[0], place[1], label, ha="center", va=place[2], fontsize=_SIZES[2], linespacing=1.25)
@@ -175,7 +181,9 @@ def draw_side(
         for j, k in enumerate(members):  # detectors at one place are drawn above one another
             height = 1e-3 * d * (1.0 + 0.018 * j)
             ax.plot([1e-3 * s0, 1e-3 * s1], [height] * 2, color=color_of(k), lw=5, solid_capstyle="butt", zorder=2)
-        names = ",\n".join(instrument.detector_names[k] for k in members[:3])
+        if len(instrument.detector) > _MANY:
+            continue  # the names would cover one another
+        names = ",\n".join(short(instrument.detector_names[k], _NAME) for k in members[:3])
         more = f"\n+{len(members) - 3}" if len(members) > 3 else ""
         ax.annotate(
             names + more, (0.5e-3 * (s0 + s1), 1e-3 * d), (0, 6 + 3 * len(members)), textcoords="offset points",

@@ -15,13 +15,15 @@ from helio_jax.figures.plot_data import observed_counts, robust_range
 from helio_jax.figures.scale_bar import draw_scale_bar
 from helio_jax.figures.sheet import Sheet
 from helio_jax.figures.summary import KINDS, aims
-from helio_jax.figures.wording import UNITS, amount, angle, count_unit, lengths, typeset
+from helio_jax.figures.wording import UNITS, amount, angle, count_unit, lengths, short, typeset
 from helio_jax.micrograph import Micrographs, MicrographStack
 
 MAX_IMAGES = 23
 """Images of one page; of a larger set the first ones are drawn."""
 _CELL = 4.3
 """Width of a cell [inch]."""
+_NARROW = 0.15
+"""A narrower map has no room for a scale bar and for more than two numbers on its short side."""
 _LINE = 2.2
 """Height of the curve of a line of positions [inch]."""
 
@@ -58,7 +60,11 @@ def draw_micrographs(micrographs: Micrographs, *, common_scale: bool = False) ->
             scaled = (low / size, high / size)
             per = " per pixel" if stack.unit in UNITS else ""
             draw_map(ax, stack.x, stack.y, image / size, title, unit + per, limits=scaled)
-            draw_scale_bar(ax)
+            ratio = np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim())
+            if min(ratio, 1.0 / ratio) < _NARROW:
+                ax.locator_params(axis="y" if ratio < 1.0 else "x", nbins=1)
+            else:
+                draw_scale_bar(ax)
         for spine in ax.spines.values():
             spine.set(color=color_of(k), linewidth=2.5)
     draw_plan(page.add(len(rows) - 1, len(drawn) % n_columns, n_columns), first.instrument)
@@ -67,7 +73,7 @@ def draw_micrographs(micrographs: Micrographs, *, common_scale: bool = False) ->
 
 def _heading(micrographs: Micrographs, n_drawn: int, n_images: int) -> str:
     first = micrographs.stacks[0]
-    name = first.name if len(micrographs.stacks) == 1 else f"{len(micrographs.stacks)} scans"
+    name = short(first.name, 30) if len(micrographs.stacks) == 1 else f"{len(micrographs.stacks)} scans"
     size = f"{first.shape[2]} x {first.shape[1]} pixels of {lengths(pitch(first.x), pitch(first.y))}"
     size = size if first.positions is None else f"{len(first.positions)} positions"
     more = f", the first {n_drawn} of {n_images} images" if n_images > n_drawn else ""
@@ -77,13 +83,13 @@ def _heading(micrographs: Micrographs, n_drawn: int, n_images: int) -> str:
 def _title(stack: MicrographStack, k: int, found: ImageNumbers, *, is_one: bool) -> str:
     """Write scan, name and place of the aperture, mean counts and SNR, a line each."""
     unit = stack.unit if stack.unit in UNITS else ""
-    scan = "" if is_one else f"{stack.name}, sample at {angle(stack.sample_rotation)}\n"
+    scan = "" if is_one else f"{short(stack.name, 24)}, sample at {angle(stack.sample_rotation)}\n"
     quality = ""
     if found.snr is not None:
         quality = f" · SNR {found.snr:.3g}" + (" if counted" if stack.noise == "expected" else "")
     elif found.noise is not None:
         quality = f" · noise {amount(found.noise, unit)}"
-    aperture = f"{stack.instrument.detector_names[k]}: {aims(stack.instrument)[k]}"
+    aperture = f"{short(stack.instrument.detector_names[k], 16)}: {aims(stack.instrument)[k]}"
     return typeset(f"{scan}{aperture}\nmean {amount(found.mean, unit)}{quality}")
 
 

@@ -16,7 +16,7 @@ from helio_jax.figures.plot_data import robust_range
 from helio_jax.figures.sheet import Sheet
 from helio_jax.figures.summary import summarise
 from helio_jax.figures.text_box import LINE, wrap_rows, write_rows
-from helio_jax.figures.wording import length_unit
+from helio_jax.figures.wording import length_unit, short
 from helio_jax.instrument import Instrument
 from helio_jax.scene.scene import Scene
 
@@ -64,7 +64,7 @@ def draw_scene(scene: Scene, instrument: Instrument, surface: SampleSurface) -> 
     rows = wrap_rows(summarise(scene), _WIDTH - 1.0)
     square = np.arange(2.0)
     half = Sheet.map_height(square, square, 0.5 * _WIDTH)
-    page = Sheet(_WIDTH, [half + 0.2, half, LINE * len(rows)], heading=f"Scene {scene.name}")
+    page = Sheet(_WIDTH, [half + 0.2, half, LINE * len(rows)], heading=f"Scene {short(scene.name, 60)}")
     _draw_whole(page.add_wide(0, 0, 2, projection="3d"), instrument, surface)
     _draw_close(page.add_wide(0, 1, 2, projection="3d"), surface)
     draw_plan(page.add(1, 0, 2), instrument)
@@ -89,7 +89,16 @@ def _draw_whole(ax: Any, instrument: Instrument, surface: SampleSurface) -> None
             continue
         x, y = 1e-3 * (ellipse.rim(64)[0] + [dx, dy]).T
         canvas.fill_level(ax, x, y, 1e-3 * d, color=color_of(k), alpha=0.75, zorder=5)
-        ax.text(x.mean(), y.mean(), 1.06e-3 * d, detector.name, ha="center", va="bottom", fontsize=_SIZES[2], zorder=8)
+        ax.text(
+            x.mean(),
+            y.mean(),
+            1.06e-3 * d,
+            short(detector.name, 16),
+            ha="center",
+            va="bottom",
+            fontsize=_SIZES[2],
+            zorder=8,
+        )
         rims.append(np.column_stack([x, y]))
     pinhole = 1e-3 * (instrument.pinhole_center[:2] + [dx, dy])
     spot = 1e-3 * np.array(surface.center)

@@ -4,12 +4,14 @@ import textwrap
 from collections.abc import Sequence
 
 from helio_jax.figures import canvas
-from helio_jax.figures.wording import typeset
+from helio_jax.figures.wording import short, typeset
 
 LINE = 0.2
 """Height of a line [inch]."""
 _LABEL = 1.15
 """Width of the labels [inch]."""
+_LETTERS = 16
+"""Longest label."""
 _LETTER = 0.072
 """Mean width of a letter [inch]."""
 
@@ -19,7 +21,7 @@ def wrap_rows(rows: Sequence[tuple[str, str]], width: float) -> list[tuple[str, 
     out = []
     for label, text in rows:
         lines = textwrap.wrap(typeset(text), max(10, int((width - _LABEL) / _LETTER))) or [""]
-        out += [(label if i == 0 else "", line) for i, line in enumerate(lines)]
+        out += [(short(label, _LETTERS) if i == 0 else "", line) for i, line in enumerate(lines)]
     return out
 
 

@@ -59,6 +59,11 @@ def plural(n: float, noun: str) -> str:
     return f"{n:,.0f} {noun}{'s' * (n != 1)}"
 
 
+def short(name: str, n: int) -> str:
+    """Cut a name to n letters, the last one an ellipsis."""
+    return name if len(name) <= n else name[: n - 1].rstrip() + "…"
+
+
 def duration(seconds: float) -> str:
     """Write a time, e.g. 5 h 14 min."""
     if seconds < 60:

@@ -236,8 +236,25 @@ def pages():
         "map": HeightMap(rec.height, rec.raster_x, rec.raster_y),
         "instrument": instrument(90.0),
         "normal": instrument(incidence_deg=0.0),
+        "long names": with_long_names(stack),
+        "narrow": stack.replace(
+            counts=stack.counts[:, :3],
+            variance=stack.variance[:, :3],
+            is_observed=None,
+            by_order=None,
+            masked=None,
+            shadowed=None,
+            y=stack.y[:3],
+        ),
         "scene": scene(),
     }
+
+
+def with_long_names(stack):
+    detectors = tuple(
+        d.model_copy(update={"name": d.name + " in the basement room" * 2}) for d in stack.instrument.detector
+    )
+    return stack.replace(name="scan " * 40, instrument=stack.instrument.model_copy(update={"detector": detectors}))
 
 
 @pytest.mark.parametrize("name", pages())
