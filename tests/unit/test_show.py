@@ -280,8 +280,8 @@ def test_large_sets_fit_on_a_page():
 
 
 def test_records_introduce_themselves(case):
-    """`repr` is one short line; the notebook's view is small and escapes names. Catches dumped arrays, and HTML from a
-    file."""
+    """`repr` is one short line; the notebook's view is small and escapes names. Catches dumped arrays, HTML from a
+    file, thumbnails that are not to scale."""
     stack, rec, _ = case
     records = [stack.replace(name="<b>x</b>"), MicrographSet((stack,)), rec, instrument(), scene()]
     records.append(HeightMap(rec.height, rec.raster_x, rec.raster_y))
@@ -291,6 +291,8 @@ def test_records_introduce_themselves(case):
         page = as_html(record)
         assert page == record._repr_html_() and len(page) < 200_000
         assert "<b>x</b>" not in page and page.count("<tr>") == len(summarise(record))
+    wide = HeightMap(np.zeros((20, 10)), np.arange(10) * 40.0, np.arange(20) * 10.0)  # 400 x 200 um
+    assert "width:160px;height:80px" in as_html(wide)
     assert as_html(stack).count("<img") == 3 and as_html(rec).count("<img") == 1
 
 
