@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -199,3 +200,13 @@ def test_simulate_ends_with_a_summary_and_a_picture(tmp_path):
     assert (tmp_path / "t.show.png").read_bytes().startswith(HEADS[".png"])
     assert helio("simulate", tmp_path / "t.toml", "-o", tmp_path / "u.h5", "--rays", 16, "--no-picture")[0] == 0
     assert (tmp_path / "u.h5").exists() and not (tmp_path / "u.show.png").exists()
+
+
+def test_documented_example_runs(tmp_path, monkeypatch):
+    """The Python block of docs/show.md, in a folder with the scenes. Catches docs ahead of the program."""
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "show.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(block, "docs/show.md", "exec"), {})
+    assert (tmp_path / "stack.pdf").read_bytes().startswith(HEADS[".pdf"])
