@@ -4,8 +4,8 @@ import numpy as np
 
 from helio_jax.arrays import pitch
 from helio_jax.figures import canvas
-from helio_jax.figures.maps import draw_map, draw_relief, draw_validity, label_map
-from helio_jax.figures.plot_data import highest_valid, robust_range, surface_cells
+from helio_jax.figures.maps import draw_cells, draw_map, draw_relief, draw_validity, label_map
+from helio_jax.figures.plot_data import cell_means, highest_valid, robust_range
 from helio_jax.figures.scale_bar import draw_scale_bar
 from helio_jax.figures.sheet import Sheet
 from helio_jax.figures.summary import summarise
@@ -58,16 +58,9 @@ def draw_height_map(found: HeightMap) -> canvas.Figure:
 def _draw_heights(ax: canvas.Axes, rec: Reconstruction) -> None:
     """Draw the heights in the sample frame, invalid ones pale, with a mark at the highest valid point."""
     limits = robust_range(rec.height[rec.is_valid]) if rec.is_valid.any() else robust_range(rec.height)
-    is_hole = ~np.isfinite(rec.height)
-    x = np.where(is_hole, np.broadcast_to(rec.raster_x, rec.height.shape), rec.x)
-    y = np.where(is_hole, np.broadcast_to(rec.raster_y[:, None], rec.height.shape), rec.y)
-    mean = 0.25 * (rec.height[1:, 1:] + rec.height[1:, :-1] + rec.height[:-1, 1:] + rec.height[:-1, :-1])
-    rgb = canvas.colored(np.nan_to_num(mean), limits)
-    valid = rec.is_valid[1:, 1:] & rec.is_valid[1:, :-1] & rec.is_valid[:-1, 1:] & rec.is_valid[:-1, :-1]
-    rgb = np.where(valid[..., None], rgb, 0.35 * rgb + 0.65)
-    cells = np.concatenate([rgb, surface_cells(rec)[..., None]], -1)
-    ax.pcolormesh(x, y, cells, rasterized=True, linewidth=0, antialiased=False)
-    ax.set_aspect("equal")
+    rgb = canvas.colored(np.nan_to_num(cell_means(rec.height)), limits)
+    is_valid = cell_means(rec.is_valid.astype(float)) == 1.0
+    draw_cells(ax, rec, np.where(is_valid[..., None], rgb, 0.35 * rgb + 0.65))
     half_x, half_y = 0.5 * pitch(rec.raster_x), 0.5 * pitch(rec.raster_y)
     ax.set_xlim(rec.raster_x[0] - half_x, rec.raster_x[-1] + half_x)
     ax.set_ylim(rec.raster_y[0] - half_y, rec.raster_y[-1] + half_y)

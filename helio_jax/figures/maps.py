@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.figures import canvas
-from helio_jax.figures.plot_data import REASON_COLORS, robust_range, surface_cells
+from helio_jax.figures.plot_data import REASON_COLORS, cell_corners, cell_means, robust_range, surface_cells
 from helio_jax.reconstruction import REASONS, Reconstruction
 
 _MISSING = "#e8b4b8"
@@ -41,19 +41,20 @@ def draw_map(
     label_map(ax, title)
 
 
+def draw_cells(ax: canvas.Axes, rec: Reconstruction, rgb: np.ndarray) -> None:
+    """Draw colours of the raster cells [y-1, x-1, 3] at the surface points' own positions; cut cells stay empty."""
+    cells = np.concatenate([rgb, surface_cells(rec)[..., None]], -1)
+    ax.pcolormesh(*cell_corners(rec), cells, rasterized=True, linewidth=0, antialiased=False)
+    ax.set_aspect("equal")
+
+
 def draw_relief(ax: canvas.Axes, rec: Reconstruction) -> None:
     """Draw the surface from above at its own x, y, shaded from the upper left; occlusion edges and jumps stay white."""
     light = np.array([-0.5, 0.5, 0.9])
     shade = np.clip(rec.normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
     rgb = canvas.colored(np.nan_to_num(rec.height), robust_range(rec.height))
     rgb = np.clip(rgb * (0.35 + 0.85 * np.nan_to_num(shade))[..., None], 0, 1)
-    mean = 0.25 * (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1])
-    cells = np.concatenate([mean, surface_cells(rec)[..., None]], -1)
-    is_hole = ~np.isfinite(rec.height)
-    corner_x = np.where(is_hole, np.broadcast_to(rec.raster_x, rec.height.shape), rec.x)
-    corner_y = np.where(is_hole, np.broadcast_to(rec.raster_y[:, None], rec.height.shape), rec.y)
-    ax.pcolormesh(corner_x, corner_y, cells, rasterized=True, linewidth=0, antialiased=False)
-    ax.set_aspect("equal")
+    draw_cells(ax, rec, cell_means(rgb))
     ax.set_facecolor("white")
     ax.locator_params(nbins=5)
     label_map(ax, "Shaded relief (gaps: not seen by the beam)", "x (µm)", "y (µm)")

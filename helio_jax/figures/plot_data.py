@@ -33,6 +33,18 @@ def surface_cells(rec: Reconstruction) -> np.ndarray:
     return along[:-1] & along[1:] & up[:, :-1] & up[:, 1:] & np.isfinite(rec.height[1:, 1:] + rec.height[:-1, :-1])
 
 
+def cell_corners(rec: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface points' own positions x, y [y, x], um; the raster's where a height is missing."""
+    is_hole = ~np.isfinite(rec.height)
+    x = np.where(is_hole, np.broadcast_to(rec.raster_x, rec.height.shape), rec.x)
+    return x, np.where(is_hole, np.broadcast_to(rec.raster_y[:, None], rec.height.shape), rec.y)
+
+
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """Average values [y, x, ...] over the four corners of each raster cell [y-1, x-1, ...]."""
+    return 0.25 * (values[1:, 1:] + values[1:, :-1] + values[:-1, 1:] + values[:-1, :-1])
+
+
 def apex_pixel(height: np.ndarray) -> tuple[int, int]:
     """Find the pixel (row, column) farthest above or below the median height; NaN is ignored."""
     away = np.abs(height - np.nanmedian(height)) if np.isfinite(height).any() else np.zeros(height.shape)

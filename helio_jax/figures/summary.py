@@ -4,6 +4,7 @@ Rows of (label, text) for `helio info`, for the end of `helio simulate` and `hel
 plain text: um, deg.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from helio_jax.arrays import pitch
 from helio_jax.figures.image_numbers import image_numbers
 from helio_jax.figures.plot_data import highest_valid
-from helio_jax.figures.wording import UNITS, amount, angle, duration, length, lengths, plural, share
+from helio_jax.figures.wording import UNITS, amount, angle, duration, length, lengths, plural, share, short
 from helio_jax.heightmap import HeightMap
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographSet, MicrographStack
@@ -218,22 +219,25 @@ def _scene_rows(scene: Scene) -> Rows:
 
 
 def _made_rows(provenance: Any) -> Rows:
-    """Write where the data come from, as far as their history states it."""
-    parts = []
-    if isinstance(source := provenance.get("source"), dict):
-        parts.append(f"imported from {source.get('file')} ({source.get('kind')})")
-    metadata = provenance.get("metadata")
-    scan = metadata.get("meas_list") if isinstance(metadata, dict) else None
-    if isinstance(scan, dict) and isinstance(took := scan.get("scan_time"), (int, float)):
+    """Write where the data come from, as far as their history states it; the history of a file may hold anything."""
+    source, scan = _table(provenance, "source"), _table(provenance, "metadata", "meas_list")
+    trace, versions = _table(provenance, "scene", "trace"), _table(provenance, "versions")
+    parts = [f"imported from {source.get('file')} ({source.get('kind')})"] if source else []
+    if isinstance(took := scan.get("scan_time"), (int, float)):
         parts.append(f"scanned in {duration(took)}")
     if "scene_file" in provenance:
         parts.append(f"simulated from {provenance['scene_file']}")
-    scene = provenance.get("scene")
-    if isinstance(scene, dict) and "seed" in (trace := scene.get("trace") or {}):
-        parts.append(f"{trace.get('estimator')} estimator, {trace.get('rays')} rays per pixel, seed {trace['seed']}")
-    version = (
-        (provenance.get("versions") or {}).get("helio-jax") if isinstance(provenance.get("versions"), dict) else None
-    )
-    parts += [f"helio_jax {version}"] if version else []
+    if trace:
+        parts.append(
+            f"{trace.get('estimator')} estimator, {trace.get('rays')} rays per pixel, seed {trace.get('seed')}"
+        )
+    parts += [f"helio_jax {versions['helio-jax']}"] if "helio-jax" in versions else []
     parts += [str(provenance["time"])] if "time" in provenance else []
-    return [("made", ", ".join(parts))] if parts else []
+    return [("made", short(", ".join(parts), 300))] if parts else []
+
+
+def _table(values: Any, *path: str) -> dict[str, Any]:
+    """Return a table within tables; an empty one if it is not there or no table."""
+    for name in path:
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return dict(values) if isinstance(values, Mapping) else {}

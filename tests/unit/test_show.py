@@ -341,3 +341,14 @@ def test_numbers_are_written_with_their_units():
     assert [share(v) for v in (0.048, 0.0012, 0.0, 1.0)] == ["4.8 %", "0.12 %", "0.0 %", "100.0 %"]
     assert [duration(v) for v in (2.34, 59.0, 18857.6, 3599.0)] == ["2.3 s", "59 s", "5 h 14 min", "1 h 0 min"]
     assert typeset("30 x 30 um, azimuth -120 deg +- 3 deg, number") == "30 × 30 µm, azimuth −120° ± 3°, number"
+
+
+@pytest.mark.parametrize(
+    "history",
+    [{"source": 1, "scene": [3], "versions": "x"}, {"metadata": {"meas_list": []}, "scene": {"trace": "seed"}}],
+)
+def test_summary_of_a_strange_history(case, history):
+    """What a foreign file states of its history is never trusted to be a table. Catches an AttributeError."""
+    stack, _, _ = case
+    assert "made" not in dict(summarise(stack.replace(provenance=history)))
+    assert "<table>" in as_html(stack.replace(provenance={**history, "time": "<i>" * 999}))
