@@ -19,6 +19,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
 .                     nouns and rules
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
+  spelling            near matches of a misspelt name
   settings            base class of all settings tables
   drawable            plot(), short repr and notebook view of the records
   kernel              how inner loops are compiled (numba)
@@ -94,6 +95,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_bilateral bilateral normal integration
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
+  explanations        competing explanations of the micrographs, each fitted; the best is kept
+  objects             objects on a flat substrate: their outlines and levels
   levels              level search of regions behind depth jumps
   merging             segmentation of a noisy map by region merging
   albedo_patches      parts of the surface of other albedo than the substrate's
@@ -147,6 +150,7 @@ scores/               errors against something known
   agreement           agreement of a simulation with measured micrographs
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
+  sample_grid         heights of an oblique beam on a regular grid of the sample frame
   roughness           ISO 25178 parameters, profiles, steps
   spectrum            power spectra of regions
   ripple              wavelength and amplitude of a ripple
@@ -195,7 +199,18 @@ formats/              the only door to files
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold
-  export              writes the reference simulator's layout
+  export              writes files of other programs; the suffix selects the format
+  export_formats      the table of these formats: what each holds
+  layers              named arrays on one raster, which every writer takes
+  write_arrays        MAT, NPZ, CSV
+  write_gwyddion      GWY, GSF
+  write_meshes        STL, PLY, OBJ
+  write_netcdf        NetCDF
+  write_png           PNG, 16-bit grey
+  write_reference     the reference simulator's layout (.mat)
+  write_sdf           SDF (ISO 25178-71)
+  write_tiff          TIFF
+  write_x3p           X3P (ISO 25178-72)
   columns             tables of columns (.csv, .npz)
   points              control points (.csv)
   toml                writes instrument files
@@ -203,6 +218,10 @@ formats/              the only door to files
 workflows/            what joins the stages
   pipeline            simulate, calibrate, align, reconstruct, evaluate, run
   scene_file          scene files: TOML -> Scene
+  shipped             scenes and instruments that come with the program, by name
+  copy_scene          copies of those
+  starting_file       starting files of a scene and an instrument
+  merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans
@@ -215,9 +234,11 @@ workflows/            what joins the stages
   measure             what helio measure prints
   steps               what helio measure --steps prints
   study               sweeps of scene values
+  export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
   spot                the beam's spot
+  validate            what helio validate checks
   provenance          how a result was made
   compilation_cache   keeps what JAX compiles
   doctor              checks the installation
@@ -228,7 +249,8 @@ commands/             the command line; no logic of its own
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  about               validate, schema, doctor, fetch-data, cite
+  scenes              scenes, init, validate, schema
+  about               doctor, fetch-data, cite
 ```
 """
 
@@ -269,6 +291,7 @@ _HOME = {
     "read": "formats.hdf5",
     "write": "formats.hdf5",
     "import_micrographs": "formats.matlab",
+    "export": "workflows.export",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

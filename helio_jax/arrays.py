@@ -98,6 +98,21 @@ def nearest_known(is_known: np.ndarray, sides: tuple[float, float] = (1.0, 1.0))
     return rows, columns
 
 
+def fill_gaps(values: np.ndarray, is_known: np.ndarray) -> np.ndarray:
+    """Interpolate unknown values [y, x] linearly; outside the hull of the known ones take the nearest."""
+    from scipy.interpolate import griddata
+
+    known, unknown = np.argwhere(is_known), np.argwhere(~is_known)
+    out = values.copy()
+    try:
+        inside = griddata(known, values[is_known], unknown, method="linear")
+    except ValueError:  # scipy's QhullError: all known pixels lie on one line
+        inside = np.full(len(unknown), np.nan)
+    nearest = griddata(known, values[is_known], unknown, method="nearest")
+    out[~is_known] = np.where(np.isfinite(inside), inside, nearest)
+    return out
+
+
 def as_json(value: Any) -> Any:
     """Convert nested mappings, sequences and arrays to JSON values; non-finite numbers become None."""
     if isinstance(value, Mapping):

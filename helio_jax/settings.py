@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from helio_jax.errors import SceneError
+from helio_jax.spelling import did_you_mean
 
 UNITS_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "inch": 25_400.0}
 """Length units of files [um]."""
@@ -32,5 +33,27 @@ class Settings(BaseModel):
         try:
             return type(self).model_validate(self.model_dump(exclude_unset=True) | changes)
         except ValidationError as e:
-            text = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}, got {p['input']!r}" for p in e.errors())
-            raise SceneError(f"setting not accepted: {text}") from None
+            raise SceneError(
+                f"setting not accepted: {'; '.join(_explain(type(self), p) for p in e.errors())}"
+            ) from None
+
+
+def _explain(model: type[Settings], problem: Any) -> str:
+    """Format one of pydantic's errors; an unknown setting gets its nearest name, or the table that it belongs to."""
+    where, value = ".".join(map(str, problem["loc"])), problem["input"]
+    if problem["type"] != "extra_forbidden":
+        return f"{where}: {problem['msg']}, got {value!r}"
+    *above, key = problem["loc"]
+    for part in above:
+        model = _tables(model).get(part, Settings)
+    for name, table in _tables(model).items():
+        if key in table.model_fields:
+            return f"{where}: belongs to {name!r}: give it as {name}={{{key!r}: {value!r}}}"
+    remedy = did_you_mean(key, model.model_fields) or f"known are {', '.join(model.model_fields)}"
+    return f"{where}: there is no such setting: {remedy}"
+
+
+def _tables(model: type[Settings]) -> dict[str, type[Settings]]:
+    """Return the settings of a model that are tables themselves."""
+    hints = {name: field.annotation for name, field in model.model_fields.items()}
+    return {name: hint for name, hint in hints.items() if isinstance(hint, type) and issubclass(hint, Settings)}

@@ -8,13 +8,23 @@ from pathlib import Path
 import pytest
 
 FAST = {
-    "formats": ("export", "hdf5", "matlab"),
+    "formats": ("export", "export_formats", "hdf5", "matlab"),
     "inverse": ("edges", "integrate"),
     "physics": ("formfactor", "render", "tracer"),
     "unit": (
         *("align", "arrays", "away_facets", "calibrate", "conventions", "edge_rule", "figures", "instrument"),
-        *("instrument_file", "language", "materials", "measure", "metrics", "placement", "project_files", "report"),
-        *("response", "sample", "scans", "scene", "settings", "units", "walls", "widening"),
+        *(
+            "instrument_file",
+            "language",
+            "materials",
+            "measure",
+            "merge",
+            "metrics",
+            "placement",
+            "project_files",
+            "report",
+        ),
+        *("response", "sample", "scans", "scene", "settings", "shipped", "units", "walls", "widening"),
     ),
 }
 """Modules tests/FOLDER/test_NAME.py whose tests, but for slow ones, are marked `fast`; so is test_architecture.py."""

@@ -1,4 +1,4 @@
-"""Informational commands: validate, schema, doctor, fetch-data, cite."""
+"""Informational commands: doctor, fetch-data, cite."""
 
 import json
 from pathlib import Path
@@ -6,43 +6,8 @@ from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import AsJson, SceneArg, app
+from helio_jax.commands.app import AsJson, app
 from helio_jax.commands.door import Writes
-
-
-@app.command()
-def validate(scene: SceneArg) -> None:
-    """Check a scene file and its sample; list all errors with key, value, limit and remedy."""
-    from helio_jax.scene.plates import check_solid
-    from helio_jax.scene.sample import check_body
-    from helio_jax.workflows.scene_file import load_scene
-
-    loaded = load_scene(scene)
-    loaded.read_laws()
-    loaded.read_rays()
-    body = check_body(
-        loaded.build_body(), loaded.sample.build_shape(loaded.base_dir) if loaded.sample.is_tilted else None
-    )
-    for key, value in body.items():
-        print(f"  {key}: {value}")
-    if body["n_open_edges"] and not body["n_inner_open_edges"]:
-        print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
-    if (plate := loaded.read_plate()) is not None:
-        for key, value in check_solid(plate).items():
-            print(f"  plate {key}: {value}")
-    for warning in loaded.warnings():
-        print(f"  warning: {warning}")
-    ny, nx = loaded.image_shape
-    views = f", {loaded.scan.n_views} views" if loaded.scan.n_views > 1 else ""
-    print(f"{scene}: ok ({nx} x {ny} pixels, {len(loaded.detector)} detectors{views})")
-
-
-@app.command()
-def schema() -> None:
-    """Print the JSON schema of scene files, for editors."""
-    from helio_jax.workflows.scene_file import json_schema
-
-    print(json.dumps(json_schema(), indent=2))
 
 
 @app.command()

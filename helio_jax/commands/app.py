@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from helio_jax import __version__
 from helio_jax.commands.door import Command, Reads, Writes
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
@@ -26,11 +27,30 @@ app = _Helio(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich alone takes 0.4 s to import
-    help="Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map.",
 )
 
 
-SceneArg = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE.toml"), Reads(names_files=True)]
+def _show_version(wanted: bool) -> None:
+    """Print the version and end, if that is wanted."""
+    if wanted:
+        print(f"helio_jax {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Simulate scanning helium micrographs and turn three or more of them into a true-to-scale height map."""
+
+
+SceneArg = Annotated[
+    Path,
+    typer.Argument(help="Scene file (TOML), or a name that helio scenes lists.", metavar="SCENE"),
+    Reads(names_files=True),
+]
 HDF5 = Writes("HDF5", HDF5_SUFFIXES)
 """Mark of what is written as HDF5."""
 HTML = Writes("HTML", (".html", ".htm"), beside=(".png",))
@@ -53,6 +73,7 @@ H5WithPicture = Annotated[
 Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FILE.show.png beside the file.")]
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]

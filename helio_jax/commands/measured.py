@@ -26,8 +26,10 @@ from helio_jax.commands.app import (
     say,
     set_options,
     tell_micrographs,
+    warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads, Writes
+from helio_jax.formats.export_formats import SUFFIXES, help_text
 
 COMPARISON = ("comparison.json", "comparison.png", "effects.png")
 """What `compare` writes in its folder (comparison.py)."""
@@ -40,7 +42,9 @@ def import_files(
     ],
     output: H5WithPicture,
     instrument: Annotated[
-        Path | None, typer.Option(help="Instrument or scene file, for files that lack it."), Reads(names_files=True)
+        Path | None,
+        typer.Option(help="Instrument or scene, file or name, for files that lack it."),
+        Reads(names_files=True),
     ] = None,
     picture: Picture = True,
 ) -> None:
@@ -56,22 +60,33 @@ def import_files(
     tell_micrographs(found, output, picture)
 
 
-@app.command()
+@app.command(epilog=f"\b\n{help_text()}\n\nWhat each file holds, frames and units: docs/exports.md.")
 def export(
-    file: Annotated[Path, typer.Argument(help="Micrographs (.h5)."), Reads()],
+    file: Annotated[Path, typer.Argument(help="Micrographs or heights (.h5)."), Reads()],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help="File to write: .mat (the reference's layout)."),
-        Writes("MATLAB", (".mat",)),
+        typer.Option("--output", "-o", help=f"File to write: {' '.join(SUFFIXES)}."),
+        Writes("a file of another program", SUFFIXES),
     ],
     view: Annotated[int | None, typer.Option(help="Which scan of a set, from 0.")] = None,
+    detector: Annotated[str | None, typer.Option(help="Only the micrograph of this detector.")] = None,
+    invalid: Annotated[
+        str, typer.Option(help="Heights that are not valid: nan (missing), keep (as they are), fill (interpolated).")
+    ] = "nan",
+    grid: Annotated[
+        float | None, typer.Option(help="Heights on a regular grid of this pitch in the sample frame [um].")
+    ] = None,
 ) -> None:
-    """Write micrographs in the layout of another program, by the suffix of the file."""
-    from helio_jax import read
-    from helio_jax.formats.export import export as write_foreign
+    """Write micrographs or heights for another program; the suffix of the file selects the format."""
+    from helio_jax import Reconstruction, read
+    from helio_jax import export as write_foreign
 
-    left_out = write_foreign(read(file), output, view)
+    found = read(file)
+    left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore
     print(output)
+    if isinstance(found, Reconstruction):
+        print(f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
+        warn_if_contradicted(found.is_contradicted, strict=False)
     for what in left_out:
         print(f"  not written: {what}")
 

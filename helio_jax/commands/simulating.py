@@ -207,7 +207,7 @@ def spot(
 def plate(
     instrument: Annotated[
         Path,
-        typer.Argument(help="Instrument or scene file with apertures.", metavar="SCENE.toml"),
+        typer.Argument(help="Instrument or scene with apertures, file or name.", metavar="SCENE"),
         Reads(names_files=True),
     ],
     output: Annotated[

@@ -1,5 +1,6 @@
 """Write tables of named columns as text (.csv) or NumPy arrays (.npz)."""
 
+import csv
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +25,7 @@ def check_table_target(path: str | os.PathLike) -> str:
 
 
 def write_columns(path: str | os.PathLike, columns: Mapping[str, np.ndarray]) -> None:
-    """Write columns of equal length; numbers in text are exact (17 digits).
+    """Write columns of equal length; numbers in text are exact: as many digits as that takes.
 
     Raises:
         SceneError: as `check_table_target`.
@@ -34,7 +35,7 @@ def write_columns(path: str | os.PathLike, columns: Mapping[str, np.ndarray]) ->
         if kind == ".npz":
             np.savez_compressed(part, **columns)  # type: ignore[arg-type]
             return
-        texts = [c.astype(str) if c.dtype.kind in "iuSU" else np.char.mod("%.17g", c) for c in columns.values()]
-        with part.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(",".join(columns) + "\n")
-            file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
+        with part.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*(c.astype(str) for c in columns.values()), strict=True))

@@ -28,9 +28,9 @@ _IMAGES = ("image", "single", "multiple")
 _SUMMARISED = ("labtemp", "beam_pressure", "return_state")
 _SMALL = 64
 _EXAMPLE_INSTRUMENT = {
-    "reference simulator": "scenes/instruments/bshem_wd4.toml",
-    "B-SHeM": "scenes/instruments/bshem_wd3.toml",
-    "A-SHeM": "scenes/instruments/ashem_normal.toml",
+    "reference simulator": "bshem_wd4",
+    "B-SHeM": "bshem_wd3",
+    "A-SHeM": "ashem_normal",
 }
 
 

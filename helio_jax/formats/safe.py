@@ -244,6 +244,16 @@ def check_target(target: Path) -> Path:
     return real
 
 
+def check_new(path: Path) -> None:
+    """Refuse a file that exists.
+
+    Raises:
+        SceneError: it does.
+    """
+    if os.path.lexists(path):
+        raise SceneError(f"{path} exists and is kept: choose another place, or replace it with --force")
+
+
 def check_outputs(inputs: Iterable[tuple[str, Path]], outputs: Iterable[tuple[str, Path]]) -> None:
     """Refuse, before any work, outputs that are an input, that are one file, or that could not be written.
 

@@ -1,4 +1,4 @@
-"""Write TOML: scenes of a study, instrument files with a fitted geometry."""
+"""Write TOML: scenes of a study, instrument files with a fitted geometry, single values."""
 
 import json
 import os
@@ -22,19 +22,20 @@ _COMMENT = """# Instrument file: the geometry that helio reconstruct fitted to {
 def to_toml(tables: Mapping[str, Any]) -> str:
     """Format a tree of JSON-compatible values as TOML, one line per value below each top table; None is omitted."""
     values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None}
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items()]
+    lines = [f"{_key(k)} = {value_text(v)}" for k, v in values.items()]
     for name, table in tables.items():
         if isinstance(table, Mapping):
             lines += ["", f"[{_key(name)}]"]
-            lines += [f"{_key(k)} = {_value(v)}" for k, v in table.items() if v is not None]
+            lines += [f"{_key(k)} = {value_text(v)}" for k, v in table.items() if v is not None]
     return "\n".join(lines) + "\n"
 
 
-def _value(value: Any) -> str:
+def value_text(value: Any) -> str:
+    """Format one JSON-compatible value as TOML, on one line."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
+        return "{ " + ", ".join(f"{_key(k)} = {value_text(v)}" for k, v in value.items() if v is not None) + " }"
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        return "[" + ", ".join(map(value_text, value)) + "]"
     # JSON's texts, numbers and truth values are TOML's
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, PrivateAttr
 
+from helio_jax.arrays import fill_gaps
 from helio_jax.errors import InputFileError
 from helio_jax.heightmap import HeightMap
 from helio_jax.reconstruction import Reconstruction
@@ -131,19 +132,4 @@ class ReconstructionSample(MapSample):
             raise InputFileError(
                 f"{self.file}: only {has_height.size - n_gaps} pixels have a height, at least 4 are needed to fill gaps"
             )
-        return _filled(rec.height, has_height) if n_gaps else rec.height
-
-
-def _filled(height: np.ndarray, is_known: np.ndarray) -> np.ndarray:
-    """Interpolate unknown heights [y, x] linearly; outside the hull of the known ones take the nearest."""
-    from scipy.interpolate import griddata
-
-    known, unknown = np.argwhere(is_known), np.argwhere(~is_known)
-    out = height.copy()
-    try:
-        values = griddata(known, height[is_known], unknown, method="linear")
-    except ValueError:  # scipy's QhullError: all known pixels lie on one line
-        values = np.full(len(unknown), np.nan)
-    nearest = griddata(known, height[is_known], unknown, method="nearest")
-    out[~is_known] = np.where(np.isfinite(values), values, nearest)
-    return out
+        return fill_gaps(rec.height, has_height) if n_gaps else rec.height

@@ -35,6 +35,7 @@ from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
+from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.truth import true_height
 
 DEFAULT_EXECUTOR = Executor()
@@ -108,7 +109,7 @@ def simulate_file(
     Where such parts are found, the run goes on from there.
 
     Args:
-        scene_path: of the scene file.
+        scene_path: of the scene file, or the name of a shipped one.
         output: of the HDF5 file.
         overrides: settings that win over the scene, dotted keys.
         options: noise, workers, shards.
@@ -122,14 +123,14 @@ def simulate_file(
         InterruptedRun, StoppedRun: Ctrl-C, SIGTERM or lost workers; the message says how to go on.
         GuardError: ray book-keeping failed.
     """
-    o, overrides = options, overrides or {}
+    o, overrides, scene_path = options, overrides or {}, locate(scene_path)
     check_outputs(files_read(scene_path, "the scene", overrides), [("output", Path(output))])
     scene = load_scene(scene_path, overrides)
     parts = Parts(Path(output))
     shard = Shard.parse(o.shard) if o.shard else None
     command = {
         "verb": verb,
-        "scene": str(Path(scene_path).resolve()),
+        "scene": str(scene_path.resolve()),
         "overrides": overrides,
         "noise": o.noise,
         "executor": asdict(o.executor),
@@ -363,7 +364,7 @@ def run(
     Each file is written as soon as it is known, so that an interrupted run keeps what was finished.
 
     Args:
-        scene_path: of the scene file.
+        scene_path: of the scene file, or the name of a shipped one.
         folder: where the files go; default helio-out/NAME.
         overrides: settings that win over the scene, dotted keys.
         stage: called with the name of each stage; a context manager that yields its progress callback.

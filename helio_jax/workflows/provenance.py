@@ -32,7 +32,10 @@ def with_provenance(stack: Micrographs, scene: SceneFile, scene_path: str | Path
 
 def git_commit() -> str:
     """Return the git commit of this package's checkout, or "" outside a checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    checkout = Path(__file__).resolve().parents[2]
+    if not (checkout / ".git").exists():  # installed: a repository further up is another project's
+        return ""
+    command = ["git", "-C", str(checkout), "rev-parse", "HEAD"]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=5, check=False).stdout.strip()
     except (OSError, subprocess.TimeoutExpired):

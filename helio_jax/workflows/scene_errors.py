@@ -1,12 +1,13 @@
 """Format pydantic's validation errors of scene and instrument files: key, value, limit, remedy."""
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
+
+from helio_jax.spelling import did_you_mean
 
 _UNIT = re.compile(r"_(um|nm|deg|mrad|mev|mb)$")
 _SIGNS = {"greater_than": (">", "gt"), "greater_than_equal": (">=", "ge"), "less_than": ("<", "lt")}
@@ -49,8 +50,7 @@ def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, A
             yield f"{where}: {line}" if where else line
     elif kind == "extra_forbidden":
         known = [] if parent is None else list(parent.model_fields)
-        near = difflib.get_close_matches(key, known, 1, 0.6)
-        remedy = f"did you mean {near[0]!r}?" if near else f"remove it; known here: {', '.join(known)}"
+        remedy = did_you_mean(key, known) or f"remove it; known here: {', '.join(known)}"
         yield f"{where}: unknown key {key!r} (value {_show(value)}): {remedy}"
     elif kind == "missing":
         if loc and isinstance(loc[-1], int):
@@ -62,9 +62,9 @@ def _explain(item: Any, loc: tuple, model: type[BaseModel], data: Mapping[str, A
     elif kind in ("literal_error", "union_tag_invalid"):
         value = value if kind == "literal_error" else context["tag"]
         expected = context["expected"] if kind == "literal_error" else context["expected_tags"]
-        near = difflib.get_close_matches(str(value), re.findall(r"'([^']*)'", expected), 1, 0.5)
+        question = did_you_mean(str(value), re.findall(r"'([^']*)'", expected), 0.5)
         where = where if kind == "literal_error" else f"{where}.kind"
-        yield f"{where} = {_show(value)}: must be one of {expected}" + (f": did you mean {near[0]!r}?" if near else "")
+        yield f"{where} = {_show(value)}: must be one of {expected}" + (f": {question}" if question else "")
     elif kind == "union_tag_not_found":
         yield f"{where}.kind: is missing: say which, one of {', '.join(_tags(field))}"
     elif kind in _SIGNS:

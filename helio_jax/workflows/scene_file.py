@@ -21,12 +21,14 @@ from helio_jax.scene.scan import with_scan_kind
 from helio_jax.scene.scene import Scene
 from helio_jax.scores.settings import TruthSettings
 from helio_jax.trace.settings import TraceSettings
+from helio_jax.workflows.merge import APPEND, Replaced, append, merge, nest
 from helio_jax.workflows.scene_errors import explain_errors
+from helio_jax.workflows.shipped import locate
 
 MAX_SCENE_MB = 1.0
 """Largest scene file."""
-SHARED_KEYS = ("plate",)
-"""Tables whose kinds share their keys."""
+SCENE_TABLES = frozenset(("sample", "scan"))
+"""Tables that a scene needs; an instrument file has neither."""
 
 
 class SceneFile(Scene):
@@ -51,19 +53,24 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
     """Read a scene file.
 
     Args:
-        path: of the TOML file. `extends = "FILE"` (relative to it) names one file whose tables it overrides.
+        path: of the TOML file, or the name of a scene that comes with the program ("sphere_a"; `helio scenes`).
+            `extends = "FILE"` (relative to it, or such a name) names one file whose tables it overrides.
         overrides: values that override the file: nested tables, or dotted keys as in {"trace.rays": 1000}
             and {"sample.spheres.0.radius_um": 500.0}.
 
     Raises:
         SceneError: missing, too large, not UTF-8, not TOML, or invalid; the message lists all errors.
     """
-    path = Path(path)
-    data = {"name": path.stem[:200], **with_scan_kind(_merge(read_tables(path), _nest(overrides or {})))}
+    path = locate(path)
+    tables = merge(read_tables(path), nest(overrides or {}))
+    data = {"name": path.stem[:200], **with_scan_kind(tables)}
     try:
         scene = SceneFile.model_validate(data, context={"read_reconstruction": read_reconstruction})
     except ValidationError as e:
-        raise SceneError(explain_errors(str(path), e, SceneFile, data)) from None
+        notes = replaced_lists(path)
+        if not is_scene(tables):
+            notes = ["this is an instrument file, without [sample] and [scan]: a scene may extend it", *notes]
+        raise SceneError("\n  ".join([explain_errors(str(path), e, SceneFile, data), *notes])) from None
     return scene.with_base_dir(path.parent).with_sample_distance()
 
 
@@ -74,15 +81,15 @@ def files_read(
 
     Beside an OBJ every .mtl counts. Nothing is checked: errors in the file are reported when it is loaded.
     """
-    path = Path(path)
     names: list[str] = []
     try:
-        extended = _read_toml(path).get("extends")
-        tables = _merge(read_tables(path), _nest(overrides or {}))
+        path = locate(path)
+        _, _, base_path = _read_layers(path)
+        tables = merge(read_tables(path), nest(overrides or {}))
     except SceneError:
-        return [(label, path)]
+        return [(label, Path(path))]
     with_files(tables, lambda name: names.append(name) or name)
-    found = [path.parent / name for name in ([extended] if isinstance(extended, str) else []) + names]
+    found = [*([base_path] if base_path else []), *(path.parent / name for name in names)]
     found += [mtl for obj in found if obj.suffix.lower() == ".obj" for mtl in obj.parent.glob("*.mtl")]
     return [(label, path), *((f"{label}: a file of {path.name}", file) for file in found)]
 
@@ -98,19 +105,30 @@ def read_reconstruction(path: Path) -> Reconstruction:
     return read_height(path)
 
 
-def load_instrument(path: str | os.PathLike) -> Instrument:
+def load_instrument(path: str | os.PathLike, overrides: Mapping[str, Any] | None = None) -> Instrument:
     """Read the instrument of an instrument file, or of any scene file.
+
+    Args:
+        path: of the TOML file, or a name ("bshem"), as in `load_scene`.
+        overrides: values that override the file, as in `load_scene`.
 
     Raises:
         SceneError: as `load_scene`; only the tables beam, plate, uncertainty and detector are checked.
     """
-    data = read_tables(Path(path))
+    path = locate(path)
+    data = merge(read_tables(path), nest(overrides or {}))
     known = set(SceneFile.model_fields) - set(Instrument.model_fields)
     tables = {key: value for key, value in data.items() if key not in known}
     try:
         return Instrument.model_validate(tables)
     except ValidationError as e:
-        raise SceneError(explain_errors(str(path), e, Instrument, tables)) from None
+        errors = explain_errors(str(path), e, Instrument, tables)
+        raise SceneError("\n  ".join([errors, *replaced_lists(path)])) from None
+
+
+def is_scene(tables: Mapping[str, Any]) -> bool:
+    """Whether the tables of a file are those of a scene; else they are those of an instrument."""
+    return not SCENE_TABLES.isdisjoint(tables)
 
 
 def resolved(scene: Scene) -> dict[str, Any]:
@@ -121,8 +139,15 @@ def resolved(scene: Scene) -> dict[str, Any]:
 def json_schema() -> dict[str, Any]:
     """Generate the JSON schema of a scene file, for editors and `helio schema`."""
     schema = SceneFile.model_json_schema()
-    text = "Scene or instrument file, relative to this one, whose tables this file overrides"
-    schema["properties"] = {"extends": {"type": "string", "description": text}, **schema["properties"]}
+    properties = {
+        "extends": {
+            "type": "string",
+            "description": "Scene or instrument whose tables this file overrides: a file, relative to this one, or a "
+            "name of helio scenes",
+        },
+        APPEND: {"type": "object", "description": "Lists, as [[append.detector]], that are added to those it extends"},
+    }
+    schema["properties"] = properties | schema["properties"]
     return schema
 
 
@@ -132,21 +157,44 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         SceneError: missing, too large, not UTF-8 or not TOML.
     """
+    base, own, _ = _read_layers(path)
+    more = own.pop(APPEND, {})
+    try:
+        return append(merge(base, own), more)
+    except SceneError as e:
+        raise SceneError(f"{path}: {e}") from None
+
+
+def replaced_lists(path: Path) -> list[str]:
+    """Describe each list of tables by which a file replaces that of the file that it extends."""
+    base, own, base_path = _read_layers(path)
+    replaced: Replaced = []
+    merge(base, own, replaced)
+    return [
+        f"[[{key}]] ({after} here) replaces all {before} of {base_path}; to add to them write [[{APPEND}.{key}]]"
+        for key, before, after in replaced
+    ]
+
+
+def _read_layers(path: Path) -> tuple[dict[str, Any], dict[str, Any], Path | None]:
+    """Read the tables of the file that a file extends, its own tables without `extends`, and the path of the former."""
     data = _read_toml(path)
     if "extends" not in data:
-        return data
+        if APPEND in data:
+            raise SceneError(f"{path}: {APPEND} adds to the lists of another file: name it with extends")
+        return {}, data, None
     name = data.pop("extends")
     if not isinstance(name, str):
         raise SceneError(f"{path}: extends must be the name of one TOML file in quotes, got {name!r}")
-    base_path = path.parent / name
     try:
+        base_path = locate(name, path.parent)
         base = _read_toml(base_path)
     except SceneError as e:
         raise SceneError(f"{path}: extends = {name!r}: {e}") from None
     if "extends" in base:
         raise SceneError(
             f"{path}: extends = {name!r}: that file extends {base['extends']!r} itself; only one level is allowed: "
-            "merge the two files"
+            "merge the two files, or change a copy"
         )
 
     def relative_to_scene(name: str) -> str:
@@ -154,7 +202,7 @@ def read_tables(path: Path) -> dict[str, Any]:
             return name
         return Path(os.path.relpath(base_path.parent / name, path.parent)).as_posix()
 
-    return _merge(with_files(base, relative_to_scene), data)
+    return with_files(base, relative_to_scene), data, base_path
 
 
 def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
@@ -187,36 +235,3 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise SceneError(f"{path}: is not valid TOML: {e}") from None
     except RecursionError:
         raise SceneError(f"{path}: is nested too deeply: a scene has tables of plain values") from None
-
-
-def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge tables recursively; other values, and tables of another `kind` (except `SHARED_KEYS`), are replaced.
-
-    An index from 0 selects an element of an array ({"spheres": {"0": ...}}).
-    """
-    out = dict(base)
-    for key, value in over.items():
-        old = out.get(key)
-        both = isinstance(old, Mapping) and isinstance(value, Mapping)
-        if both and (key in SHARED_KEYS or value.get("kind", old.get("kind")) == old.get("kind")):  # type: ignore[union-attr]
-            out[key] = _merge(old, value)  # type: ignore[arg-type]
-        elif isinstance(old, list) and isinstance(value, Mapping) and all(_is_index(k, old) for k in value):
-            out[key] = list(_merge(dict(zip(map(str, range(len(old))), old, strict=True)), value).values())
-        else:
-            out[key] = value
-    return out
-
-
-def _is_index(key: str, array: list) -> bool:
-    """Whether a key is the index of an element."""
-    return key in map(str, range(len(array)))
-
-
-def _nest(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert dotted keys to nested tables."""
-    out: dict[str, Any] = {}
-    for key, value in overrides.items():
-        first, _, rest = key.partition(".")
-        nested = {rest: value} if rest else value
-        out = _merge(out, {first: _nest(nested) if isinstance(nested, Mapping) else nested})
-    return out

@@ -34,6 +34,7 @@ from helio_jax.workflows import pipeline
 from helio_jax.workflows.checkpoint import Shard
 from helio_jax.workflows.scene_errors import explain_errors
 from helio_jax.workflows.scene_file import files_read, load_scene, resolved, with_files
+from helio_jax.workflows.shipped import locate
 
 MAX_POINTS = 100_000
 INDEX_SECONDS = 5.0
@@ -206,7 +207,7 @@ def run_study(
     path, folder = Path(path), Path(folder)
     study = load_study(path)
     points = [_Point(i, v, folder / f"point_{i:05d}") for i, v in enumerate(study.points(), start=1)]
-    scene_path = path.parent / study.scene
+    scene_path = locate(study.scene, path.parent)
     inputs = [("the study", path), *files_read(scene_path, "its scene", study.set)]
     check_outputs(inputs, files_within("-o", folder, WRITTEN))
     scenes = [_scene_text(scene_path, study.set | p.values, f"{path}: point {p.number}") for p in points]

@@ -35,16 +35,18 @@ SCENE = '[sample]\nkind = "mesh"\nfile = {file!r}\n'
 MESH_READERS = [(c, r, out) for c, r, out in PAIRS if MARKS[c][r].names_files]
 
 
-def line(command: str, folder: Path, **given: Path) -> list[str]:
+def line(command: str, folder: Path, /, **given: Path) -> list[str]:
     """Return a command with the paths given, and values made up for everything else that it needs."""
-    words = [command]
-    for param in COMMANDS[command].params:
+    words, params = [command], COMMANDS[command].params
+    last = max((i for i, p in enumerate(params) if p.param_type_name == "argument" and p.name in given), default=-1)
+    for i, param in enumerate(params):
         mark = MARKS[command].get(param.name)
-        if not (param.required or param.name in given):
+        stands_before = param.param_type_name == "argument" and i < last
+        if not (param.required or param.name in given or stands_before):
             continue
         value = given.get(param.name, folder / f"{param.name}{suffix(mark) if isinstance(mark, Writes) else '.h5'}")
         if mark is None:
-            value = 1
+            value = {"action": "list", "kind": "scene"}.get(param.name, 1)
         words += [str(value)] if param.param_type_name == "argument" else [max(param.opts, key=len), str(value)]
     return words
 
@@ -202,7 +204,8 @@ def test_bad_output_is_told_before_any_work(command, out, wrong, tmp_path, no_wo
         pytest.skip("any suffix will do")
     before = sorted(tmp_path.rglob("*"))
     code, text = said(CliRunner().invoke(app, line(command, tmp_path, **{out: bad})))
-    assert code == 2 and bad.name[:20] in text and ("-o: " in text or f"--{out.replace('_', '-')}: " in text), text
+    labels = "-o: ", f"--{out.replace('_', '-')}: ", f"{out.upper()}: "
+    assert code == 2 and bad.name[:20] in text and any(label in text for label in labels), text
     assert sorted(tmp_path.rglob("*")) == before
 
 

@@ -1,4 +1,4 @@
-"""Micrographs in the reference simulator's layout: what `helio import` reads back, and what MATLAB sees."""
+"""Micrographs in the reference simulator's layout (.mat): what `helio import` reads back, and what MATLAB sees."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from scale import SCENE
 from typer.testing import CliRunner
 
 from helio_jax.__main__ import app
+from helio_jax.detector import Detector
 from helio_jax.errors import SceneError
 from helio_jax.formats.export import export
 from helio_jax.formats.hdf5 import write
@@ -83,17 +84,26 @@ def test_file_of_the_reference_is_written_as_it_was(tmp_path, shared, bshem):
 
 
 def test_command_and_refusals(tmp_path, stacks):
-    """`helio export` by suffix; errors name reason and known formats. Catches noise exported as single scattering."""
+    """What the layout cannot hold is written under other names, with the reason. Catches noise in single scattering."""
     write(stacks["analog"], tmp_path / "a.h5")
     result = CliRunner().invoke(app, ["export", str(tmp_path / "a.h5"), "-o", str(tmp_path / "a.mat")])
     assert result.exit_code == 0 and (tmp_path / "a.mat").stat().st_size > 500, result.output
     stack, scene = stacks["expected"], load_scene(SCENE, SMALL)
-    with pytest.raises(SceneError, match=r"cannot be written as '.x3p': known is .mat for micrographs"):
-        export(stack, tmp_path / "a.x3p")
-    with pytest.raises(SceneError, match="are expectations, its counts have noise"):
-        export(record(scene, stack), tmp_path / "a.mat")
-    with pytest.raises(SceneError, match="single and multiple scattering separately"):
-        export(stack.replace(by_order=None), tmp_path / "a.mat")
+    noisy = record(scene, stack)
+    cones = [
+        Detector(name=name, polar_deg=40.0, azimuth_deg=120.0 * k, half_angle_deg=5.0, at_infinity=True)
+        for k, name in enumerate(stack.instrument.detector_names)
+    ]
+    with_cones = stack.instrument.model_copy(update={"detector": cones})
+    for other, reason in (
+        (noisy, "both are expectations while the counts have noise"),
+        (stack.replace(instrument=with_cones), "is at infinity"),
+        (stack.replace(by_order=None), "which these micrographs do not"),
+    ):
+        assert reason in export(other, tmp_path / "other.mat")[0]
+        assert "im" not in scipy.io.loadmat(tmp_path / "other.mat")
+    counts = scipy.io.loadmat(tmp_path / "other.mat", simplify_cells=True)["counts"]
+    assert np.array_equal(np.stack(list(counts)), stack.counts)
     both = MicrographSet((stack, stacks["analog"]))
     with pytest.raises(SceneError, match=r"give --view 0 to 1$"):
         export(both, tmp_path / "a.mat")

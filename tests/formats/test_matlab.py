@@ -6,7 +6,6 @@ flip in the reader cannot be matched by the same flip in the test.
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from helio_jax.errors import InputFileError
 from helio_jax.formats import matlab, safe
 from helio_jax.formats.matlab import import_micrographs
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.workflows.shipped import find_shipped
 
 WD4_CENTERS = ((2309.4, 0.0), (-1154.7, -2000.0), (-1154.7, 2000.0))
 ROTATIONS = (0.0, 60.0, -60.0)
@@ -237,7 +237,7 @@ def test_reference_detectors_follow_the_given_order(import_tree):
         (make_bshem(0.75, working_distance_um=4000.0), r"centre in the file is .*2309.4.* in the instrument .*1732"),
         (make_bshem(channels=(1, 2)), "has 3 detectors, the instrument 2"),
         (make_bshem(beam=Beam(incidence_deg=30.0, source="gaussian")), "source is uniform in the file but gaussian"),
-        (None, r"--instrument scenes/instruments/bshem_wd4.toml"),
+        (None, r"--instrument bshem_wd4"),
     ],
 )
 def test_reference_contradictions_are_named(instrument, match, import_tree):
@@ -391,12 +391,11 @@ def test_ashem_needs_one_detector(import_tree):
         import_tree({"meas_list": scan}, make_bshem())
     with pytest.raises(InputFileError, match="sample_orientation must be an array"):
         import_tree({"meas_list": scan}, make_ashem())
-    with pytest.raises(InputFileError, match=r"--instrument scenes/instruments/ashem_normal.toml"):
+    with pytest.raises(InputFileError, match=r"--instrument ashem_normal"):
         import_tree({"meas_list": scan}, None)
 
 
-def test_named_instrument_files_exist():
-    """Catches an error message that recommends a file which is not shipped."""
-    root = Path(__file__).resolve().parents[2]
+def test_named_instruments_exist():
+    """Catches an error message that recommends an instrument which is not shipped."""
     for name in matlab._EXAMPLE_INSTRUMENT.values():
-        assert (root / name).is_file(), name
+        assert find_shipped(name).kind == "instrument"

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse import methods as solve
+from helio_jax.inverse import explanations as solve
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
 from helio_jax.workflows import pipeline
@@ -49,6 +49,22 @@ def test_anchors_hold_the_level_of_a_region():
         assert kept.value == pytest.approx([36.0])
         assert np.einsum("ayx,yx->a", kept.weight, heights) == pytest.approx([40.0], rel=1e-2)
     assert anchors.padded(4).weight.shape == (4, *SHAPE) and not anchors.padded(4).weight[1:].any()
+
+
+def test_a_measured_step_is_tried_above_the_substrate_of_the_start():
+    """Where the border is free the substrate is at any height. Rejects steps taken for heights above 0."""
+    ground = Surface(np.full(SHAPE, 70.0), *np.zeros((2, *SHAPE)))
+    region = Region(INSIDE, height=20.0, std=0.3, substrate=70.0)
+    assert region.heights(70.0, (10.0, 10.0), 500.0) == [90.0]
+    found = search_levels(
+        [region],
+        ground,
+        (10.0, 10.0),
+        500.0,
+        misfit := lambda s: 1e4 + 0.3 * (s.height[INSIDE].mean() - 90.0) ** 2,
+        lambda s: (misfit(s), s),
+    )
+    assert found.moved == [0] and found.surface.height[INSIDE].mean() == pytest.approx(90.0, abs=2.0)
 
 
 @pytest.mark.parametrize("best", [-130.0, 45.0])

@@ -5,8 +5,15 @@ import numpy as np
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections
-from helio_jax.inverse.methods import SEARCH_THRIFT, START_THRIFT, reconstruct_stack
-from helio_jax.inverse.settings import LEAST_PATHS, PATHS_PER_PIXEL, ReconstructSettings, RefineSettings
+from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.settings import (
+    LEAST_PATHS,
+    PATHS_PER_PIXEL,
+    SEARCH_THRIFT,
+    START_THRIFT,
+    ReconstructSettings,
+    RefineSettings,
+)
 from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.corrections import make_predictor
 

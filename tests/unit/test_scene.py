@@ -283,10 +283,12 @@ def test_loading_a_scene_is_light():
 
 
 def test_schema_describes_every_key():
-    """The JSON schema knows all tables and `extends`. Catches: a table that editors cannot complete."""
+    """The JSON schema knows all tables, `extends` and `append`. Catches: a table that editors cannot complete."""
     schema = json_schema()
     json.dumps(schema)
-    assert {"extends", "beam", "plate", "detector", "sample", "scan", "trace", "noise"} <= set(schema["properties"])
+    assert {"extends", "append", "beam", "plate", "detector", "sample", "scan", "trace", "noise"} <= set(
+        schema["properties"]
+    )
     assert "incidence" in json.dumps(schema["$defs"]["Beam"]["properties"])
     assert schema["$defs"]["Beam"]["properties"]["incidence_deg"]["description"].startswith("Angle t")
 

@@ -1,5 +1,7 @@
 """Settings that are given, left open, or go together."""
 
+import re
+
 import pytest
 
 from helio_jax.commands.app import set_options
@@ -7,6 +9,7 @@ from helio_jax.errors import SceneError
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.measure.spectrum import RippleSettings
 from helio_jax.micrograph import Calibration
+from helio_jax.spelling import did_you_mean
 from helio_jax.workflows.calibrate_rotated import _JUMPS
 from helio_jax.workflows.measure import Wanted, _settings
 from helio_jax.workflows.pipeline import _with_priors
@@ -51,3 +54,24 @@ def test_settings_of_a_measurement():
     with pytest.raises(SceneError, match="along_axes: the requested measurements have no such setting"):
         _settings(wanted._replace(settings={"along_axes": "true"}))
     assert _settings(Wanted(ripple=True, settings={"along_axes": "true"}))["ripple"].along_axes
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"metod": "linear"}, "metod: there is no such setting: did you mean 'method'?"),
+        ({"refine": {"max_round": 2}}, "refine.max_round: there is no such setting: did you mean 'max_rounds'?"),
+        ({"max_rounds": 2}, "belongs to 'refine': give it as refine={'max_rounds': 2}"),
+        ({"zzz": 1}, "known are method"),
+    ],
+)
+def test_misspelt_settings(changes, told):
+    """Catches pydantic's wording, a nearest name taken from the wrong table, and no word on what is known."""
+    with pytest.raises(SceneError, match=re.escape(told)):
+        ReconstructSettings().changed(**changes)
+
+
+def test_units_are_no_likeness():
+    """Catches a key that is proposed because it ends in a unit, too."""
+    assert did_you_mean("diameter_mm", ["center_um", "axes_um"]) is None
+    assert did_you_mean("radius_mm", ["center_um", "radius_um"]) == "did you mean 'radius_um'?"

@@ -1,0 +1,127 @@
+"""Commands about scene and instrument files: scenes, init, validate, schema."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from helio_jax.commands.app import TOML, AsJson, Force, app
+from helio_jax.commands.door import Reads, Writes
+from helio_jax.workflows.shipped import Kind, list_shipped
+
+
+@app.command()
+def scenes(
+    action: Annotated[Literal["list", "copy"], typer.Argument(help="List them, or copy one.")] = "list",
+    name: Annotated[str | None, typer.Argument(help="Which one to copy.")] = None,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where to copy it (default: here)."), Writes("scenes", within=())
+    ] = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the scenes and instruments that come with helio; copy one with the files that it reads, to change it."""
+    if action == "copy":
+        _copy(name, folder or Path(), force, as_json)
+        return
+    files = list_shipped()
+    if as_json:
+        keys = ("name", "aliases", "kind", "about")
+        print(json.dumps([{key: getattr(f, key) for key in keys} | {"path": str(f.path)} for f in files]))
+        return
+    names = [", ".join((file.name, *file.aliases)) for file in files]
+    width = max(map(len, names), default=0)
+    for called, file in zip(names, files, strict=True):
+        print(f"{called:<{width}}  {file.kind:<10}  {file.about}")
+    print("\nhelio run NAME; helio import --instrument NAME; helio scenes copy NAME: a copy to change")
+
+
+def _copy(name: str | None, folder: Path, force: bool, as_json: bool) -> None:
+    """Copy one and print the copies."""
+    from helio_jax.workflows.copy_scene import copy_shipped
+
+    if name is None:
+        raise typer.BadParameter("say which one to copy: helio scenes lists their names", param_hint="NAME")
+    files = list(map(str, copy_shipped(name, folder, force=force)))
+    print(json.dumps(files) if as_json else "\n".join(files))
+
+
+@app.command()
+def init(
+    kind: Annotated[Kind, typer.Argument(help="What to begin.", show_default=False)],
+    file: Annotated[
+        Path | None, typer.Argument(help="File to write (default: scene.toml or instrument.toml)."), TOML
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a starting file of a scene or an instrument that works as it is, with every key and its meaning."""
+    from helio_jax.workflows.starting_file import write_starting_file
+
+    path = file or Path(f"{kind}.toml")
+    write_starting_file(kind, path, force=force)
+    print(f"{path}: check it with helio validate {path}")
+
+
+@app.command()
+def validate(
+    file: Annotated[
+        Path,
+        typer.Argument(help="Scene or instrument: file (TOML), or name that helio scenes lists.", metavar="SCENE"),
+        Reads(names_files=True),
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
+    from helio_jax.workflows.validate import check_file
+
+    found = check_file(file)
+    if as_json:
+        print(json.dumps(asdict(found)))
+        return
+    for line in _instrument_lines(found.instrument):
+        print(f"  {line}")
+    for key, value in (found.body or {}).items():
+        print(f"  {key}: {value}")
+    if found.body and found.body["n_open_edges"] and not found.body["n_inner_open_edges"]:
+        print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
+    for key, value in (found.plate or {}).items():
+        print(f"  plate {key}: {value}")
+    for text in found.replaced:
+        print(f"  {text}")
+    for warning in found.warnings:
+        print(f"  warning: {warning}")
+    n = len(found.instrument["detectors"])
+    about = f"{n} detector{'s' * (n != 1)}"
+    if found.image:
+        views = f", {found.image['views']} views" if found.image["views"] > 1 else ""
+        about = f"{found.image['nx']} x {found.image['ny']} pixels, {about}{views}"
+    else:
+        about += "; it has no [sample] and no [scan]"
+    print(f"{file}: ok, {'a scene' if found.image else 'an instrument'} ({about})")
+
+
+def _instrument_lines(found: dict[str, Any]) -> list[str]:
+    """Format the summary of an instrument."""
+    lines = [
+        f"beam: {found['incidence_deg']:g} deg from the plate normal, travels towards azimuth {found['azimuth_deg']:g} "
+        f"deg; source {found['source']}",
+        f"plate: {found['plate']}, working distance {found['working_distance_um']:g} um, sample distance "
+        f"{found['sample_distance_um']:g} um",
+    ]
+    for detector in found["detectors"]:
+        angles = (
+            "" if detector["polar_deg"] is None else " at polar angle {polar_deg:g} deg, azimuth {azimuth_deg:g} deg"
+        )
+        channel = "" if detector["channel"] is None else ", channel {channel}"
+        lines.append(("detector {name!r}: {kind}" + angles + channel).format(**detector))
+    return lines
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of scene files, for editors."""
+    from helio_jax.workflows.scene_file import json_schema
+
+    print(json.dumps(json_schema(), indent=2))

@@ -1,0 +1,309 @@
+"""Competing explanations of one stack's micrographs, each fitted; the one that explains them best is kept.
+
+The first is the photometric solution, with regions at the levels of the steps that mask bands show. Where the data
+contradict its fit, objects on a flat substrate are tried, and then patches of another albedo. A level that explains the
+images about as well as the one that is kept is undecided.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from helio_jax.errors import PredictionError, SceneError
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.readout import ScanOrder
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.albedo_search import search_albedo_patches
+from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.fit import Fit, Report, fit_heights, misfit_of, short_fit
+from helio_jax.inverse.integrate import integrate_slopes
+from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
+from helio_jax.inverse.linear import signal_of, solve_known_albedo
+from helio_jax.inverse.mask_steps import find_steps
+from helio_jax.inverse.nearfield import level, limited, solve_nearfield
+from helio_jax.inverse.objects import find_objects
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.quality import squares
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
+from helio_jax.inverse.verdict import LIMIT, local_chi_square, residuals_of_state
+from helio_jax.micrograph import MicrographStack
+
+MAX_WIDTH = 0.125
+"""Levels are searched up to twice this share of the sample distance above and below the substrate."""
+MIN_CONTRADICTED = 0.02
+"""Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
+MAX_LEVEL_SLOPE = 0.3
+"""Steeper pixels of a region do not count for its level: they are its wall."""
+MAX_BACKTRACKS = 3
+"""How often a starting surface is smoothed when masks and multiple scattering cannot be predicted for it."""
+
+
+class Explanation(NamedTuple):
+    """A fit, and what it takes for granted.
+
+    Attributes:
+        fit: without error bars.
+        is_undecided: where another level explains the images as well [y, x].
+        objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
+        has_steps: whether regions are at the levels of measured steps.
+    """
+
+    fit: Fit
+    is_undecided: np.ndarray
+    objects: np.ndarray | None = None
+    has_steps: bool = False
+
+
+def explain(
+    stack: MicrographStack, settings: ReconstructSettings, make_predict: Callable[[int], Predict], report: Report | None
+) -> Explanation:
+    """Fit the heights, and other explanations where the data contradict the fit; arguments as `reconstruct_stack`.
+
+    Another explanation is kept where the data that are expected of it explain the micrographs better by `GAIN`.
+    """
+    fits = _Fits(stack, settings, make_predict, report)
+    best = fits.from_steps(AlbedoPatches.none(stack.shape[1:]))
+    for other in (fits.from_objects, fits.from_albedo_patches):
+        if best.fit.is_interrupted:
+            return best
+        try:
+            residuals = fits.residuals(best)
+            if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
+                return best
+            found = other(best, residuals)
+            if found and 0.5 * np.sum(squares(residuals) - squares(fits.residuals(found))) > GAIN:
+                best = found
+        except PredictionError:
+            continue
+    return best
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Fits of one stack from different starts; fields as the arguments of `explain`."""
+
+    stack: MicrographStack
+    settings: ReconstructSettings
+    make_predict: Callable[[int], Predict]
+    report: Report | None
+
+    @property
+    def n_pixels(self) -> int:
+        return self.stack.counts[0].size
+
+    @cached_property
+    def predict(self) -> Predict:
+        """As precise as a fit needs it."""
+        return self.make_predict(self.settings.refine.paths(self.n_pixels))
+
+    @cached_property
+    def predict_start(self) -> Predict:
+        """As precise as a photometric solution needs it."""
+        return self.make_predict(self.settings.refine.start_paths(self.n_pixels))
+
+    @cached_property
+    def predict_trial(self) -> Predict:
+        """As precise as a search and the test of a fit need it."""
+        return self.make_predict(self.settings.refine.search_paths(self.n_pixels))
+
+    def pose(
+        self,
+        surface: Surface,
+        patches: AlbedoPatches,
+        region: np.ndarray | None = None,
+        anchors: Anchors | None = None,
+    ) -> FitProblem:
+        """Pose the fit from a surface on."""
+        return FitProblem.of(
+            *signal_of(self.stack),
+            self.stack.instrument,
+            Raster.of(self.stack),
+            surface,
+            self.settings,
+            region,
+            scan_order(self.stack),
+            patches=patches,
+            anchors=anchors,
+        )
+
+    def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
+        """Half the chi-square of the data expected on a surface, nothing fitted."""
+        problem = self.pose(surface, patches)
+        return misfit_of(problem, FitState.at(problem, surface), self.predict_trial)
+
+    def short_fit(self, surface: Surface, patches: AlbedoPatches) -> tuple[float, Surface]:
+        """The same after a short fit, and its surface."""
+        return short_fit(self.pose(surface, patches), surface, self.predict_trial)
+
+    def residuals(self, explanation: Explanation) -> np.ndarray:
+        """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
+        return residuals_of_state(explanation.fit.problem, explanation.fit.state, self.predict_trial)
+
+    def say(self, said: str) -> None:
+        """Report what is tried."""
+        if self.report:
+            self.report(0, self.settings.refine.max_rounds, said)
+
+    def fitted(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
+        """Fit the heights from a surface, or one nearer to a smoothed one; `known` as in `pose`."""
+        fit, _ = _with_backtracking(
+            lambda start: fit_heights(self.pose(start, *known), start, self.predict, self.report), surface, smoothed
+        )
+        return fit
+
+    def from_steps(self, patches: AlbedoPatches) -> Explanation:
+        """Fit from the photometric solution, with regions at the levels of the steps that are measured."""
+        start, smoothed = _start(self.stack, self.settings, patches, self.predict_start)
+        shape = self.stack.shape[1:]
+        labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
+        if steps := measured_regions(self.stack, start):
+            raster = Raster.of(self.stack)
+            try:
+                found = search_levels(
+                    steps,
+                    start,
+                    (raster.dy, raster.dx),
+                    MAX_WIDTH * self.stack.instrument.sample_distance,
+                    lambda trial: self.misfit(trial, patches),
+                    lambda trial: self.short_fit(trial, patches),
+                    self.stack.instrument.beam_shift,
+                    self.say,
+                )
+                start, is_undecided = found.surface, covered(steps, found.undecided)
+                if moved := [steps[i] for i in found.moved]:
+                    labels = labelled(moved)
+                    anchors = level_anchors(labels, moved, start)
+            except PredictionError:
+                pass  # the start is too rough for it: the fit begins at a smoother one
+        fit = self.fitted(start, smoothed, patches, labels, anchors)
+        return Explanation(fit, is_undecided, has_steps=anchors is not None and anchors.value.size > 0)
+
+    def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
+        """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
+        if self.settings.border != "flat" or not self.settings.refine.objects or best.has_steps:
+            return None
+        none = AlbedoPatches.none(self.stack.shape[1:])
+        relief, smoothed = _start(self.stack, self.settings, none, self.predict_start)
+        objects = find_objects(
+            self.stack,
+            self.settings,
+            relief,
+            self.predict_trial,
+            lambda surface: self.misfit(surface, none),
+            self.say,
+        )
+        if objects is None:
+            return None
+        start = self.short_fit(objects.surface(relief), none)[1]
+        fit = self.fitted(start, smoothed, none, objects.number)
+        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number)
+
+    def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
+        """Fit with the albedos of patches that a fit does not explain; None where there are none."""
+        if not self.settings.refine.albedo_patches:
+            return None
+        found = search_albedo_patches(self.stack, self.settings, self.predict_start)
+        patches = found.keeping(found.unexplained(squares(residuals).mean(0)))
+        if not patches.objects:
+            return None
+        if best.objects is None:
+            return self.from_steps(patches)
+        surface = best.fit.state.surface
+        return best._replace(fit=self.fitted(surface, surface, patches, best.objects))
+
+
+def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
+    """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
+    signal, variance = (f / patches.albedo**n for n, f in enumerate(signal_of(stack), 1))
+    optics, raster = Optics.of(stack.instrument), Raster.of(stack)
+    corrections = predict(surface.height, normals, **patches.known)
+    sigma = prediction_std(corrections, normals, settings.refine)
+    masked, multiple = linearised_in_normal(corrections, normals)
+    visible = form_factor(optics, surface.height) - masked
+    spread = variance + sigma**2
+    (a, b), _ = solve_known_albedo(signal - multiple, spread, visible, normals, stack.instrument.beam_shift)
+    weight = np.ones(stack.shape[1:])
+    height = integrate_slopes(a, b, raster.dx, raster.dy, "weighted", weight)
+    return Surface(limited(level(height, settings, weight), optics), a, b)
+
+
+def _with_backtracking(work: Callable[[Surface], Any], surface: Surface, smoothed: Surface) -> tuple[Any, Surface]:
+    """Run `work` on a surface; on PredictionError, halve the step towards a smoothed surface (`MAX_BACKTRACKS`)."""
+    for _ in range(MAX_BACKTRACKS):
+        try:
+            return work(surface), surface
+        except PredictionError:
+            surface = jax.tree.map(lambda rough, smooth: 0.5 * (rough + smooth), surface, smoothed)
+    return work(surface), surface
+
+
+def scan_order(stack: MicrographStack) -> ScanOrder:
+    """Order in which a stack's pixels were recorded."""
+    return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
+
+
+def measured_regions(stack: MicrographStack, start: Surface) -> list[Region]:
+    """Find the patches whose steps the mask bands show, the largest first; none where steps cannot be measured.
+
+    Steps are measured from the substrate, which the start puts at any height where the border is free.
+    """
+    try:
+        found = find_steps(stack)
+    except SceneError:
+        return []
+    substrate = float(np.median(start.height[found.patch == 0]))
+    return [
+        Region(found.patch == p.number, p.level_um, p.level_std_um, substrate)
+        if p.is_determined
+        else Region(found.patch == p.number)
+        for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels)
+    ]
+
+
+def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:
+    """Anchor the regions whose heights are measured, where the surface is level in them.
+
+    Args:
+        labels: 1, 2, ... in the regions [y, x].
+        regions: that were moved, in this order.
+        surface: with the regions at their levels.
+    """
+    is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
+    known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
+    return Anchors.of_levels(labels, known, is_level, SKIRT)
+
+
+def labelled(regions: list[Region]) -> np.ndarray:
+    """Number the pixels of regions 1, 2, ... [y, x]; 0 outside of all."""
+    out = np.zeros(regions[0].inside.shape, int)
+    for number, region in enumerate(regions, 1):
+        out[region.inside] = number
+    return out
+
+
+def _start(
+    stack: MicrographStack, settings: ReconstructSettings, patches: AlbedoPatches, predict: "Predict"
+) -> tuple[Surface, Surface]:
+    """Find the photometric solution that the fit starts from, and a smoother one."""
+    optics, raster, shift = Optics.of(stack.instrument), Raster.of(stack), stack.instrument.beam_shift
+    height, solution = solve_nearfield(*signal_of(stack), optics, raster, settings, settings.rounds)
+
+    def correct(surface: Surface) -> Surface:
+        return _corrected(stack, settings, patches, surface, surface.normals(shift), predict)
+
+    smoothed = Surface(*np.zeros((3, *height.shape)))
+    try:
+        near = Surface(limited(height, optics), *np.zeros((2, *height.shape)))
+        start = _corrected(stack, settings, patches, near, solution.normals, predict)
+    except PredictionError:
+        start = correct(smoothed)
+    for _ in range(settings.refine.photometric_rounds - 1):
+        start, smoothed = _with_backtracking(correct, start, smoothed)
+    return start, smoothed

@@ -1,0 +1,109 @@
+"""Check a scene or instrument file for `helio validate`, and summarise what it describes."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from helio_jax.detector import Detector
+from helio_jax.instrument import Instrument
+from helio_jax.scene.plates import check_solid
+from helio_jax.scene.sample import check_body
+from helio_jax.workflows.scene_file import (
+    SceneFile,
+    is_scene,
+    load_instrument,
+    load_scene,
+    read_tables,
+    replaced_lists,
+)
+from helio_jax.workflows.shipped import Kind, locate
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A file without errors.
+
+    Attributes:
+        file: its path.
+        kind: "scene", or "instrument" for a file without the tables of a sample and a scan.
+        instrument: beam, plate and detectors, JSON-compatible.
+        image: pixels in x and y and number of views; none of an instrument.
+        body: triangles and spheres of the sample; none of an instrument.
+        plate: triangles of a plate of kind "mesh".
+        replaced: lists that replace those of the extended file.
+        warnings: probable mistakes.
+    """
+
+    file: str
+    kind: Kind
+    instrument: dict[str, Any]
+    image: dict[str, int] | None = None
+    body: dict[str, Any] | None = None
+    plate: dict[str, Any] | None = None
+    replaced: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def check_file(name: str | Path) -> Checked:
+    """Check a scene, its sample and the files that it names, or an instrument.
+
+    Args:
+        name: of the file, or of a scene or instrument that comes with the program.
+
+    Raises:
+        SceneError: errors of the file; the message lists all of them.
+        InputFileError: a file that it names is missing or wrong.
+    """
+    path = locate(name)
+    replaced = tuple(replaced_lists(path))
+    if not is_scene(read_tables(path)):
+        return Checked(str(path), "instrument", summarise(load_instrument(path)), replaced=replaced)
+    scene = load_scene(path)
+    scene.read_laws()
+    scene.read_rays()
+    plate = scene.read_plate()
+    ny, nx = scene.image_shape
+    return Checked(
+        str(path),
+        "scene",
+        summarise(scene),
+        image={"nx": nx, "ny": ny, "views": scene.scan.n_views},
+        body=_check_sample(scene),
+        plate=None if plate is None else check_solid(plate),
+        replaced=replaced,
+        warnings=tuple(scene.warnings()),
+    )
+
+
+def summarise(instrument: Instrument) -> dict[str, Any]:
+    """Summarise an instrument: beam, distances [um], and the direction of every detector [deg]."""
+    return {
+        "incidence_deg": instrument.beam.incidence_deg,
+        "azimuth_deg": instrument.beam.azimuth_deg,
+        "source": instrument.beam.source,
+        "plate": instrument.plate.kind,
+        "working_distance_um": instrument.working_distance,
+        "sample_distance_um": instrument.sample_distance,
+        "detectors": [_summarise_detector(d, instrument.working_distance) for d in instrument.detector],
+    }
+
+
+def _summarise_detector(detector: Detector, working_distance: float) -> dict[str, Any]:
+    """Summarise a detector: kind, polar angle and azimuth of its middle [deg], channel."""
+    aim = detector.aim(working_distance)
+    kind = "cone at infinity" if detector.at_infinity else "aperture" if aim else f"part {detector.part!r} of the plate"
+    polar, azimuth = (None, None) if aim is None else (round(math.degrees(angle), 2) + 0.0 for angle in aim)
+    return {
+        "name": detector.name,
+        "kind": kind,
+        "polar_deg": polar,
+        "azimuth_deg": azimuth,
+        "channel": detector.channel,
+    }
+
+
+def _check_sample(scene: SceneFile) -> dict[str, Any]:
+    """Check the triangles of a scene's sample."""
+    untilted = scene.sample.build_shape(scene.base_dir) if scene.sample.is_tilted else None
+    return check_body(scene.build_body(), untilted)
