@@ -14,15 +14,19 @@ from helio_jax.commands.door import Reads
 def show(
     file: Annotated[
         Path,
-        typer.Argument(help="Micrographs or height map (.h5, .mat, .npz), scene or instrument (.toml)."),
+        typer.Argument(help="Micrographs or height map (.h5, .mat, .npz); scene or instrument, file (.toml) or name."),
         Reads(names_files=True),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Picture (default: FILE.show.png beside the file)."), FIGURE
+        Path | None,
+        typer.Option("--output", "-o", help="Picture (default: FILE.show.png beside the file; of a name: here)."),
+        FIGURE,
     ] = None,
     window: Annotated[bool, typer.Option("--window", help="Open a window instead of writing a picture.")] = False,
     instrument: Annotated[
-        Path | None, typer.Option(help="Instrument or scene file, for a .mat file."), Reads(names_files=True)
+        Path | None,
+        typer.Option(help="Instrument or scene, file or name, for a .mat file."),
+        Reads(names_files=True),
     ] = None,
     common_scale: Annotated[
         bool, typer.Option("--common-scale", help="One grey scale for all micrographs (default: one for each).")
@@ -30,9 +34,10 @@ def show(
     view: Annotated[int, typer.Option(min=0, help="Which view of a scene's scan, from 0.")] = 0,
 ) -> None:
     """Draw a file: micrographs and apertures, heights, the instrument, or a scene before any tracing."""
+    from helio_jax.workflows.shipped import path_beside
     from helio_jax.workflows.show import show as draw_file
 
-    picture = output if output or window else file.with_suffix(PICTURE)
+    picture = output if output or window else path_beside(file, PICTURE)
     draw_file(file, picture, window=window, instrument=instrument, common_scale=common_scale, view=view)
     if picture:
         print(picture)
@@ -42,7 +47,7 @@ def show(
 def info(
     file: Annotated[
         Path,
-        typer.Argument(help="Any file that helio reads: .h5, .toml, .mat, meshes, .npz, .npy, .csv, .mtl."),
+        typer.Argument(help="Any file that helio reads (.h5, .toml, .mat, meshes, .npz, .npy, .csv, .mtl), or a name."),
         Reads(),
     ],
     everything: Annotated[

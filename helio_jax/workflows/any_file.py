@@ -1,7 +1,6 @@
 """Read a file of any kind that holds a record: micrographs, heights, a scene, an instrument."""
 
 import os
-from pathlib import Path
 
 from helio_jax.errors import InputFileError
 from helio_jax.formats.hdf5 import MAX_BYTES, read
@@ -13,7 +12,8 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Micrographs
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.files import read_height_map
-from helio_jax.workflows.scene_file import load_instrument, load_scene, read_tables
+from helio_jax.workflows.scene_file import is_scene, load_instrument, load_scene, read_tables
+from helio_jax.workflows.shipped import locate
 
 Record = Micrographs | Reconstruction | HeightMap | Instrument
 """What a file can hold; a scene is an instrument, too."""
@@ -23,17 +23,18 @@ def read_any(path: str | os.PathLike, instrument: str | os.PathLike | None = Non
     """Read a record from a file by its suffix and, of TOML, by its tables.
 
     Args:
-        path: .h5 of helio; .toml of a scene or an instrument; .mat of micrographs; .npz of a height map (in um).
-        instrument: file of the instrument, for a .mat file.
+        path: .h5 of helio; .toml of a scene or an instrument, or the name of one that comes with the program; .mat of
+            micrographs; .npz of a height map (in um).
+        instrument: file or name of the instrument, for a .mat file.
 
     Raises:
         InputFileError: missing, damaged, or of an unknown kind.
-        SceneError: a wrong scene or instrument file.
+        SceneError: a wrong scene or instrument file, or an unknown name.
     """
-    path = Path(path)
+    path = locate(path)
     kind = path.suffix.lower()
     if kind == ".toml":
-        return load_scene(path) if {"sample", "scan"} & read_tables(path).keys() else load_instrument(path)
+        return load_scene(path) if is_scene(read_tables(path)) else load_instrument(path)
     check_size(path, MAX_BYTES)
     if kind in HDF5_SUFFIXES:
         return read(path)

@@ -22,7 +22,8 @@ from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, read_bytes, read_height_map, read_table
 from helio_jax.scene.sample import MeshSample, check_body, load_mesh
-from helio_jax.workflows.scene_file import SceneFile, load_instrument, load_scene, read_tables, resolved
+from helio_jax.workflows.scene_file import SceneFile, is_scene, load_instrument, load_scene, read_tables, resolved
+from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study import load_study
 
 MESHES = (".stl", ".obj", ".ply", ".glb")
@@ -71,13 +72,13 @@ class FileInfo:
 
 
 def file_info(path: str | os.PathLike) -> FileInfo:
-    """Find out what a file holds.
+    """Find out what a file holds, or a scene or an instrument that comes with the program, by its name.
 
     Raises:
         InputFileError: missing, damaged, or of a kind that the program does not read.
-        SceneError: a wrong scene, instrument or study file.
+        SceneError: a wrong scene, instrument or study file, or an unknown name.
     """
-    path = Path(path)
+    path = locate(path)
     suffix = path.suffix.lower()
     n_bytes = check_size(path, hdf5.MAX_BYTES)
     readers = {".toml": _of_toml, ".mat": _of_matlab, ".npz": _of_npz, ".npy": _of_npy, ".mtl": _of_mtl}
@@ -115,7 +116,7 @@ def _of_toml(path: Path) -> Found:
         rows = [("study", study.name), ("scene", study.scene), ("varies", varied)]
         rows.append(("points", f"{len(study.points())} ({study.design})"))
         return "study", rows, {"settings": study.model_dump(mode="json")}
-    if not {"sample", "scan"} & tables.keys():
+    if not is_scene(tables):
         instrument = load_instrument(path)
         return "instrument", summarise(instrument), {"settings": instrument.model_dump(mode="json", exclude_none=True)}
     scene = load_scene(path)

@@ -26,6 +26,7 @@ from helio_jax.scene.views import View
 from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits
 from helio_jax.workflows.any_file import read_any
+from helio_jax.workflows.shipped import locate
 
 _GRID = 101
 """Points per side of the drawn surface of a sample."""
@@ -77,27 +78,28 @@ def show(
 ) -> canvas.Figure:
     """Draw a record or a file; write the picture, open a window, or return the figure for a notebook.
 
-    Example: `hx.show("scenes/sphere_a.toml")`, `hx.show(stack, "stack.png")`.
+    Example: `hx.show("sphere_a")`, `hx.show(stack, "stack.png")`.
 
     Args:
-        what: a record (see `draw`), or the path of a file of one.
+        what: a record (see `draw`), the path of a file of one, or the name of a scene or instrument of `helio scenes`.
         output: picture to write (.png, .pdf, .svg).
         window: open a window, and return when it is closed.
-        instrument: instrument file for a .mat file, which lacks its own.
+        instrument: file or name of an instrument for a .mat file, which lacks its own.
         common_scale: micrographs: one grey scale for all images.
         view: scene: which view of the scan, from 0.
 
     Raises:
-        SceneError: nothing can be drawn of it, or the picture cannot be written.
+        SceneError: nothing can be drawn of it, an unknown name, or the picture cannot be written.
         InputFileError: the file is missing, damaged or of an unknown kind.
         MissingDependencyError: `window` without a display.
     """
     if window:
         canvas.check_display("helio show --window", "write a picture: -o FILE.png")
     if isinstance(what, (str, os.PathLike)):
+        path = locate(what)
         if output is not None:
-            check_outputs([("file", Path(what))], [("-o", Path(output))])
-        what = read_any(what, instrument)
+            check_outputs([("file", path)], [("-o", Path(output))])
+        what = read_any(path, instrument)
     figure = draw(what, common_scale=common_scale, view=view)
     if output is not None:
         canvas.save_figure(figure, Path(output))

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ import helio_jax.__main__  # registers the commands
 from helio_jax.commands.app import app
 from helio_jax.errors import HelioError
 from helio_jax.formats.points import write_points
+from helio_jax.workflows import shipped
 
 ROOT = Path(__file__).resolve().parents[2]
 TRENCH = ROOT / "scenes" / "trench.toml"
@@ -86,6 +88,52 @@ def test_scene_and_instrument_without_a_display(file, tmp_path):
     assert window.returncode == 5 and "-o FILE.png" in window.stderr and "Traceback" not in window.stderr
 
 
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Scenes within the package, as a wheel has them, and an empty folder to work in; return the former."""
+    package = tmp_path / "site-packages" / "helio_jax"
+    shutil.copytree(ROOT / "scenes", package / "scenes", ignore=shutil.ignore_patterns("*.png"))
+    monkeypatch.setattr(shipped, "__file__", str(package / "workflows" / "shipped.py"))
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return package / "scenes"
+
+
+@pytest.mark.parametrize(
+    ("named", "name"),
+    [("trench", "trench"), ("bshem", "bshem"), ("ashem_45", "ashem_45"), ("instruments/bshem_wd4.toml", "bshem_wd4")],
+)
+def test_picture_of_what_is_shipped_goes_here(installed, named, name):
+    """By its name, an alias or its path: the current folder has the picture, the package none. --view, -o as ever.
+
+    Catches a picture within an installed package.
+    """
+    before = sorted(installed.rglob("*"))
+    code, said = helio("show", installed / named if "/" in named else named)
+    assert code == 0 and said.split() == [f"{name}.show.png"], said
+    assert Path(f"{name}.show.png").read_bytes().startswith(HEADS[".png"])
+    assert helio("show", name, "-o", "p.svg")[0] == 0
+    assert sorted(p.name for p in Path().iterdir()) == sorted([f"{name}.show.png", "p.svg"])
+    assert sorted(installed.rglob("*")) == before
+
+
+def test_picture_of_a_copy_goes_beside_it(installed):
+    """A copy is the user's own file. Catches every file of a shipped name taken for the shipped one."""
+    assert helio("scenes", "copy", "trench", "mine")[0] == 0
+    code, said = helio("show", "mine/trench.toml")
+    assert code == 0 and said.strip() == str(Path("mine/trench.show.png")) and Path(said.strip()).is_file()
+    assert not Path("trench.show.png").exists()
+
+
+def test_info_by_name(installed):
+    """A name says what its file says; a file of that very name wins. Catches a name that only some commands know."""
+    for name, path in (("trench", "trench.toml"), ("bshem", "instruments/bshem_wd3.toml")):
+        assert helio("info", name, "--all") == helio("info", installed / path, "--all")
+    assert hx.show("bshem").axes
+    shutil.copy(installed / "instruments" / "bshem_wd4.toml", "trench")
+    assert helio("info", "trench")[0] == 3  # a file without a suffix
+
+
 def test_window_shows_the_figure(folder, monkeypatch):
     """The figure that was drawn is what the window holds. Catches an empty window."""
     from matplotlib import pyplot
@@ -109,7 +157,11 @@ def test_window_shows_the_figure(folder, monkeypatch):
         ("show box.obj", 3, "belong in a scene"),
         ("show stack.h5 -o p.jpg", 2, ".png or .pdf or .svg"),
         ("show stack.h5 -o missing/p.png", 2, "No such file or directory"),
+        ("show spher_a", 2, "did you mean 'sphere_a'"),
+        ("show sphere_a --view 1", 2, "view must be 0 to 0"),
         ("info nothing.toml", 3, "does not exist"),
+        ("info bshen", 2, "did you mean 'bshem'"),
+        ("info sphere_a.toml", 2, "without folder and suffix, names"),
         ("info points.xyz", 3, "unknown kind of file .xyz"),
         ("info broken.npz", 3, "broken.npz"),
         ("info broken.h5", 3, "not an HDF5 file"),
@@ -203,8 +255,7 @@ def test_simulate_ends_with_a_summary_and_a_picture(tmp_path):
 
 
 def test_documented_example_runs(tmp_path, monkeypatch):
-    """The Python block of docs/show.md, in a folder with the scenes. Catches docs ahead of the program."""
-    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    """The Python block of docs/show.md, in an empty folder. Catches docs ahead of the program."""
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "show.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
