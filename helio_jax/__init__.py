@@ -21,6 +21,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
   settings            base class of all settings tables
+  drawable            plot(), short repr and notebook view of the records
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated
@@ -164,11 +165,24 @@ measure/              numbers from height maps
 figures/              pictures
   canvas              the only door to matplotlib
   plot_data           arrays that panel and report share
+  maps                maps of the pages: image with colour bar, relief, validity
+  sheet               layout of a page in rows of cells
   panel               micrographs, heights, errors and profiles on one page
   report              HTML report
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   before_after        a scan before and after calibration
+  notebook            thumbnail and table of a record
+  micrograph_page     page of micrographs and apertures
+  scene_page          page of a scene before any tracing
+  height_page         page of a height map
+  instrument_page     page of an instrument
+  instrument_views    plan view and side view of an instrument
+  scale_bar           scale bar of a map
+  text_box            rows of words on a page
+  summary             what a person wants to know, in about ten lines
+  image_numbers       mean, SNR and error of each image
+  wording             numbers with units as a person writes them
   overlay             overlay of aligned scans; facet map
   cracks              cracks and vertical edges
   steps               mask bands and steps on the micrographs
@@ -213,6 +227,9 @@ workflows/            what joins the stages
   calibrate_rotated   calibration of aligned rotated scans
   orient              finds the orientation of a file's arrays
   compare             simulation against experiment
+  show                pictures of records and files: hx.show
+  file_info           what a file of any kind holds: helio info
+  any_file            reads a file of any kind
   effects             effects that a simulation may lack
   measure             what helio measure prints
   steps               what helio measure --steps prints
@@ -229,10 +246,11 @@ commands/             the command line; no logic of its own
   app                 shared options and messages
   door                checks outputs against inputs before any work
   simulating          run, simulate, rays, resume, study, spot, plate
+  looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
   scenes              scenes, init, validate, schema
-  about               info, doctor, fetch-data, cite
+  about               doctor, fetch-data, cite
 ```
 """
 
@@ -267,6 +285,7 @@ _HOME = {
     "simulate": "workflows.pipeline",
     "reconstruct": "workflows.pipeline",
     "true_height": "workflows.truth",
+    "show": "workflows.show",
     "evaluate": "workflows.pipeline",
     "run": "workflows.pipeline",
     "read": "formats.hdf5",

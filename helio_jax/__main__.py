@@ -3,7 +3,14 @@
 import sys
 import traceback
 
-from helio_jax.commands import about, heights, measured, scenes, simulating  # noqa: F401 (each registers its commands)
+from helio_jax.commands import (  # noqa: F401 (each registers its commands)
+    about,
+    heights,
+    looking,
+    measured,
+    scenes,
+    simulating,
+)
 from helio_jax.commands.app import app, say
 from helio_jax.errors import HelioError
 from helio_jax.workflows.compilation_cache import keep_compiled

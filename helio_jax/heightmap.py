@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from helio_jax.arrays import check_axis, set_float_arrays
+from helio_jax.drawable import Drawable
 from helio_jax.errors import InputFileError
 
 
-@dataclass(frozen=True)
-class HeightMap:
+@dataclass(frozen=True, repr=False)
+class HeightMap(Drawable):
     """Heights on a regular x, y grid (checked when made).
 
     Attributes:
@@ -35,3 +36,6 @@ class HeightMap:
         check_axis("y", self.y, InputFileError)
         shape = (self.y.size, self.x.size)
         set_float_arrays(self, {"height": shape, "height_std": shape}, InputFileError)
+
+    def _in_short(self) -> str:
+        return f"{self.y.size} x {self.x.size} (y, x)"

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from helio_jax.detector import Aperture, Cone, Detector
+from helio_jax.drawable import Drawable
 from helio_jax.errors import SceneError
 from helio_jax.settings import Settings, Unit
 
@@ -150,7 +151,7 @@ class Uncertainty(Settings):
         return any(self.model_dump().values())
 
 
-class Instrument(Settings):
+class Instrument(Drawable, Settings):
     """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians)."""
 
     beam: Beam = Beam()
@@ -182,6 +183,10 @@ class Instrument(Settings):
                 "plate.kind = 'mesh' with its file, or remove the key"
             )
         return self
+
+    def _in_short(self) -> str:
+        names = ", ".join(self.detector_names[:4]) + (", ..." if len(self.detector) > 4 else "")
+        return f"{len(self.detector)} detectors ({names}), incidence {self.beam.incidence_deg:g} deg"
 
     def idealised(self) -> "Instrument":
         """Return the instrument with a parallel beam and a cosine-law plate, which need no file or material."""

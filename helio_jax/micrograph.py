@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from helio_jax.arrays import as_float_array, as_json, check_axis, set_float_arrays
+from helio_jax.drawable import Drawable
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 
@@ -57,8 +58,8 @@ class ScanAlignment:
             object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
-@dataclass(frozen=True)
-class MicrographStack:
+@dataclass(frozen=True, repr=False)
+class MicrographStack(Drawable):
     """Images of one scan, all detectors on one raster (frozen, checked when made).
 
     Attributes:
@@ -138,6 +139,10 @@ class MicrographStack:
         if planes is not None and len(planes) != shape[0]:
             raise error(f"alignment.time_planes must hold one plane for each of {shape[0]} images, got {len(planes)}")
 
+    def _in_short(self) -> str:
+        n, ny, nx = self.shape
+        return f"{self.name!r}: {n} x {ny} x {nx} (detector, y, x), {self.noise}, {self.unit}"
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """(detectors, rows, columns)."""
@@ -198,8 +203,8 @@ class MicrographStack:
         return replace(self, **changes)
 
 
-@dataclass(frozen=True)
-class MicrographSet:
+@dataclass(frozen=True, repr=False)
+class MicrographSet(Drawable):
     """Several scans of one sample, each with its own raster, azimuth, rotation and instrument."""
 
     stacks: tuple[MicrographStack, ...]
@@ -208,6 +213,10 @@ class MicrographSet:
     def __post_init__(self) -> None:
         if not self.stacks:
             raise InputFileError("a micrograph set must hold at least one stack, got none")
+
+    def _in_short(self) -> str:
+        names = ", ".join(s.name for s in self.stacks[:3]) + (", ..." if len(self.stacks) > 3 else "")
+        return f"of {len(self.stacks)} scans: {names}"
 
     def only(self, error: type[HelioError] = InputFileError) -> MicrographStack:
         """Return the only stack; several scans must be aligned first."""

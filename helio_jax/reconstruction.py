@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from helio_jax.arrays import check_axis, pitch, set_float_arrays
+from helio_jax.drawable import Drawable
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 
@@ -36,8 +37,8 @@ def contradicted_share(reason: np.ndarray) -> float:
     return float(np.sum(is_contradicted) / max(1, np.sum(is_contradicted | (reason == 0))))
 
 
-@dataclass(frozen=True)
-class Reconstruction:
+@dataclass(frozen=True, repr=False)
+class Reconstruction(Drawable):
     """Heights of the surface seen by the beam (frozen, checked when made).
 
     Attributes:
@@ -105,6 +106,10 @@ class Reconstruction:
             object.__setattr__(self, name, value.astype(kind))
         if self.reason.max(initial=0) >= len(REASONS):
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
+
+    def _in_short(self) -> str:
+        ny, nx = self.height.shape
+        return f"by {self.method}: {ny} x {nx} (y, x), {self.is_valid.mean():.1%} valid"
 
     def spread(self, number: Callable[[np.ndarray], float]) -> tuple[float, float]:
         """Compute a number derived from the heights, and its posterior standard deviation (NaN without samples).

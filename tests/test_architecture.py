@@ -6,6 +6,7 @@ nouns > settings, arrays, kernel, block_fit > errors, spelling.
 """
 
 import ast
+import re
 import subprocess
 import sys
 import warnings
@@ -16,7 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors", "spelling"},
-    {"arrays", "settings", "kernel", "robust", "block_fit"},
+    {"arrays", "settings", "kernel", "robust", "block_fit", "drawable"},
     {"detector"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},
@@ -121,6 +122,12 @@ def module_graph(sources: dict[str, str]) -> dict[str, set[str]]:
     return graph
 
 
+def late_bindings(source: str) -> list[str]:
+    """Return texts that name a module of the package and may be imported by name, past the rules above."""
+    texts = [n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    return [t for t in texts if re.fullmatch(r"helio_jax(\.\w+)+", t)]
+
+
 def find_cycle(graph: dict[str, set[str]]) -> list[str]:
     """Return one cycle of imports, or nothing."""
     done: set[str] = set()
@@ -214,6 +221,14 @@ def test_no_import_cycle():
     assert [n for n in imports(modules[front_door]) if n.startswith("helio_jax")] == []
     bad = {"p.a": "from p.b import f", "p.b": "import p.c", "p.c": "def g():\n    from p import a"}
     assert find_cycle(module_graph(bad)) == ["p.a", "p.b", "p.c", "p.a"]
+
+
+def test_late_binding_has_one_place():
+    """Only `drawable` names modules above it as texts: the figures behind `plot()`. Catches a hidden upward import."""
+    found = {p.relative_to(ROOT).as_posix(): late_bindings(p.read_text(encoding="utf-8")) for p in FILES}
+    assert {place: names for place, names in found.items() if names} == {
+        "drawable.py": ["helio_jax.workflows.show", "helio_jax.figures.notebook"]
+    }
 
 
 def test_truth_stays_out_of_inverse():

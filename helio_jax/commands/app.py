@@ -63,6 +63,14 @@ TOML = Writes("TOML", (".toml",))
 """Mark of options that name a scene or instrument file to write."""
 COLUMNS = Writes("a table", (".csv", ".npz"))
 """Mark of options that name a table of columns to write."""
+PICTURE = ".show.png"
+"""End of the name of the picture that is written beside micrographs."""
+H5WithPicture = Annotated[
+    Path,
+    typer.Option("--output", "-o", help="File to write (.h5); a picture goes beside it."),
+    Writes("HDF5", HDF5_SUFFIXES, beside=(PICTURE,)),
+]
+Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FILE.show.png beside the file.")]
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
@@ -93,6 +101,18 @@ def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
         raise GuardError("the data contradict the height map (--strict): it is written, see its status above")
     if is_contradicted:
         say("warning: the data contradict this height map: do not trust it; the status above says where they differ")
+
+
+def tell_micrographs(stack: Any, output: Path, has_picture: bool) -> None:
+    """Print what was written in about ten lines, and draw it beside the file."""
+    from helio_jax.figures.summary import summarise, text_lines
+
+    print("\n".join(text_lines(summarise(stack))))
+    if has_picture:
+        from helio_jax.workflows.show import show
+
+        show(stack, output.with_suffix(PICTURE))
+        print(f"picture: {output.with_suffix(PICTURE)}")
 
 
 class Bar:

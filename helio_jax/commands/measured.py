@@ -16,6 +16,8 @@ from helio_jax.commands.app import (
     AsJson,
     Bar,
     H5File,
+    H5WithPicture,
+    Picture,
     Rays,
     SceneArg,
     app,
@@ -23,6 +25,7 @@ from helio_jax.commands.app import (
     print_table,
     say,
     set_options,
+    tell_micrographs,
     warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads, Writes
@@ -37,12 +40,13 @@ def import_files(
     files: Annotated[
         list[Path], typer.Argument(help="Micrographs (.mat of B-SHeM, A-SHeM, the reference simulator)."), Reads()
     ],
-    output: H5File,
+    output: H5WithPicture,
     instrument: Annotated[
         Path | None,
         typer.Option(help="Instrument or scene, file or name, for files that lack it."),
         Reads(names_files=True),
     ] = None,
+    picture: Picture = True,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
     from helio_jax import MicrographSet, import_micrographs, write
@@ -50,10 +54,10 @@ def import_files(
 
     given = load_instrument(instrument) if instrument else None
     stacks = tuple(import_micrographs(path, given) for path in files)
-    write(stacks[0] if len(stacks) == 1 else MicrographSet(stacks), output)
-    for stack in stacks:
-        print(f"{stack.name}: {stack.shape[0]} micrographs of {stack.shape[2]} x {stack.shape[1]} pixels, {stack.unit}")
+    found = stacks[0] if len(stacks) == 1 else MicrographSet(stacks)
+    write(found, output)
     print(f"written to {output}")
+    tell_micrographs(found, output, picture)
 
 
 @app.command(epilog=f"\b\n{help_text()}\n\nWhat each file holds, frames and units: docs/exports.md.")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +13,9 @@ from helio_jax.commands.app import (
     FIGURE,
     AsJson,
     Bar,
-    H5File,
+    H5WithPicture,
     Method,
+    Picture,
     Processes,
     Rays,
     Restart,
@@ -26,6 +28,7 @@ from helio_jax.commands.app import (
     given_options,
     print_table,
     say,
+    tell_micrographs,
     warn_if_contradicted,
 )
 from helio_jax.commands.door import Reads, Writes
@@ -76,7 +79,7 @@ def run(
 @app.command()
 def simulate(
     scene: SceneArg,
-    output: H5File,
+    output: H5WithPicture,
     rays: Rays = None,
     seed: Seed = None,
     workers: Workers = None,
@@ -86,25 +89,25 @@ def simulate(
     shard: Annotated[str | None, typer.Option(help="i/N: trace the i-th of N shares; the last one writes.")] = None,
     scheduler: Scheduler = None,
     restart: Restart = False,
+    picture: Picture = True,
 ) -> None:
     """Trace the micrographs of a scene and write them to an HDF5 file; repeat the command to resume it."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
+    start = time.perf_counter()
     with Bar("tracing") as bar:
         options = SimulateOptions(noise, Executor(workers, processes, scheduler), shard, restart, bar, say)
         stack = simulate_file(scene, output, overrides=overrides, options=options)
-    if stack is not None:
+    if stack is None:
+        return
+    print(f"{output}: {time.perf_counter() - start:.1f} s")
+    if "rays_per_pixel" in stack.provenance:
+        print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel on average")
         for one in stack.stacks:
-            n, ny, nx = one.shape
-            view = f"{one.name}: " if one is not stack else ""
-            print(f"{output}: {view}{n} micrographs of {nx} x {ny} pixels ({one.noise})")
-            if "rays_per_pixel" in stack.provenance:
-                print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel on average", end="")
-                missed = one.provenance.get("n_above_target")
-                print("" if missed is None else f"; {missed} of {nx * ny} pixels are above the target error")
-            for name, share in one.count_fractions().items():
-                print(f"  {name}: {share:.2%} of the counts")
+            if (missed := one.provenance.get("n_above_target")) is not None:
+                print(f"  {one.name}: {missed} of {one.counts[0].size} pixels are above the target error")
+    tell_micrographs(stack, output, picture)
 
 
 @app.command()

@@ -1,9 +1,10 @@
 """Canvas of every figure: the only module that imports matplotlib, and only when the first figure is drawn.
 
-Uses `matplotlib.figure.Figure`: no pyplot, no display, no global state. Only the window of `pick` needs pyplot. Images
+Uses `matplotlib.figure.Figure`: no pyplot, no display, no global state. Only windows need pyplot. Images
 are drawn in the beam frame: one pixel per beam position, origin lower, axes in um.
 """
 
+import functools
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,34 +30,46 @@ _NO_DISPLAY = ("agg", "pdf", "svg", "ps", "cairo", "template")
 
 def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
     """Create an empty white figure [inch]; `layout=None` leaves the placing of axes to the caller."""
+    return _figure_class()(figsize=(width, height), facecolor="white", layout=layout)
+
+
+@functools.cache
+def _figure_class() -> Any:
+    """Return a figure that a notebook shows as it is, without pyplot."""
     from matplotlib import figure
 
-    return figure.Figure(figsize=(width, height), facecolor="white", layout=layout)
+    class Picture(figure.Figure):
+        def _repr_png_(self) -> bytes:
+            return figure_png(self, dpi=80)
+
+    return Picture
 
 
-def open_window(n_columns: int, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
-    """Create a figure with one row of axes for a window; `show_window` opens it.
+def check_display(what: str, otherwise: str) -> None:
+    """Refuse to open a window where there is no display.
+
+    Args:
+        what: needs the window, for the message.
+        otherwise: what else the user can do.
 
     Raises:
         MissingDependencyError: no window can be opened on this machine.
     """
     import matplotlib
-    from matplotlib import pyplot
 
-    if matplotlib.get_backend().lower() in _NO_DISPLAY:
+    backend = matplotlib.get_backend()
+    if backend.lower() in _NO_DISPLAY:
         raise MissingDependencyError(
-            f"picking points needs a window, but matplotlib has only the backend {matplotlib.get_backend()!r} here: "
-            "run it on a machine with a display and a GUI toolkit (pip install PyQt6), or write the CSV by hand: "
-            "view,point,x_um,y_um"
+            f"{what} needs a window, but matplotlib has only the backend {backend!r} here: run it on a machine with a "
+            f"display and a GUI toolkit (pip install PyQt6), or {otherwise}"
         )
-    figure, axes = pyplot.subplots(1, n_columns, squeeze=False, figsize=(width, height))
-    return figure, axes[0]
 
 
-def show_window() -> None:
-    """Open the window and return when it is closed."""
+def open_window(figure: Figure) -> None:
+    """Show a figure in a window; return when it is closed (see `check_display`)."""
     from matplotlib import pyplot
 
+    pyplot.figure(FigureClass=lambda **_: figure)  # type: ignore[arg-type]  # pyplot makes the window of the figure that is there
     pyplot.show()
 
 
@@ -102,6 +115,13 @@ def draw_circle(ax: Axes, center: tuple[float, float], radius: float) -> None:
     ax.add_patch(Circle(center, radius, fill=False, color="white", lw=1.0))
 
 
+def fill_level(ax: Any, x: np.ndarray, y: np.ndarray, z: float, **style: Any) -> None:
+    """Fill a level polygon at the height z in 3-D axes."""
+    from matplotlib.collections import PolyCollection
+
+    ax.add_collection3d(PolyCollection([np.column_stack([x, y])], **style), zs=z, zdir="z")
+
+
 def label_axes(
     ax: Axes, title: str, xlabel: str = "", ylabel: str = "", sizes: tuple[float, float, float] = (9, 8, 7)
 ) -> None:
@@ -126,6 +146,36 @@ def draw_image(
     extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
     style = {"origin": "lower", "interpolation": "nearest", "extent": extent, **style}
     return ax.imshow(image, cmap=cmap, vmin=limits[0], vmax=limits[1], **style)
+
+
+def outline_text(text: Any, color: str = "black") -> None:
+    """Draw a thin rim around a text, so that it can be read on any image."""
+    from matplotlib import patheffects
+
+    text.set_path_effects([patheffects.withStroke(linewidth=1.6, foreground=color)])
+
+
+def image_png(image: np.ndarray, limits: tuple[float, float], name: str) -> bytes:
+    """Return an image [y, x] as PNG, one dot per pixel, y upwards; missing pixels are transparent."""
+    from matplotlib import image as images
+
+    buffer = io.BytesIO()
+    images.imsave(
+        buffer, np.ma.masked_invalid(image), cmap=color_map(name), vmin=limits[0], vmax=limits[1], origin="lower",
+        format="png",
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
+def color_bar(ax: Axes, limits: tuple[float, float], name: str, label: str) -> None:
+    """Draw a colour bar at the right of axes for colours from `colored`."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    place = ax.inset_axes((1.03, 0.0, 0.04, 1.0))
+    bar = ax.figure.colorbar(ScalarMappable(Normalize(*limits), color_map(name)), cax=place)
+    bar.set_label(label, fontsize=8.5)
+    bar.ax.tick_params(labelsize=8, length=3)
 
 
 def figure_png(figure: Figure, *, dpi: float = 150.0) -> bytes:

@@ -4,15 +4,13 @@ Maps are drawn in the beam frame; relief and profiles at the surface points' own
 the same data is `report`.
 """
 
-import textwrap
 from typing import Any
 
 import numpy as np
 
-from helio_jax.arrays import pitch
 from helio_jax.figures import canvas
+from helio_jax.figures.maps import draw_map, draw_relief, draw_validity, label_map
 from helio_jax.figures.plot_data import (
-    REASON_COLORS,
     apex_pixel,
     multiple_fraction,
     observed_counts,
@@ -21,11 +19,11 @@ from helio_jax.figures.plot_data import (
     profile_place,
     residual_rms,
     robust_range,
-    surface_cells,
     symmetric_range,
 )
+from helio_jax.figures.sheet import Sheet
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, height_error
 
 PANEL_SCORES = (
@@ -34,50 +32,6 @@ PANEL_SCORES = (
 )  # fmt: skip
 WIDTH = 12.6
 """Width of the panel [inch]."""
-_MISSING = "#e8b4b8"
-_SIZES = (10, 8.5, 8)
-_BEAM_X, _BEAM_Y = "beam position X (µm)", "beam position Y (µm)"
-
-
-def _label(ax: canvas.Axes, title: str, xlabel: str = _BEAM_X, ylabel: str = _BEAM_Y) -> None:
-    canvas.label_axes(ax, title, xlabel, ylabel, _SIZES)
-    ax.tick_params(direction="out", length=3)
-
-
-def _draw_map(
-    ax: canvas.Axes, x: np.ndarray, y: np.ndarray, image: np.ndarray, title: str, unit: str, **style: Any
-) -> None:
-    """Draw one image [y, x] over its beam positions, to scale, with a colour bar; missing pixels in pink."""
-    low, high = limits = style.get("limits") or robust_range(image)
-    cmap = canvas.color_map(style.get("cmap", canvas.COUNT_MAP), missing=_MISSING)
-    shown = canvas.draw_image(ax, x, y, np.ma.masked_invalid(image), cmap, limits, aspect="equal")
-    finite = image[np.isfinite(image)]
-    below, above = (finite.min() < low, finite.max() > high) if finite.size else (False, False)
-    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
-    place = ax.inset_axes((1.03, 0.0, 0.04, 1.0))
-    bar = ax.figure.colorbar(shown, cax=place, extendfrac=0.025, extend=extend[bool(below), bool(above)])
-    bar.set_label(unit, fontsize=_SIZES[1])
-    bar.ax.tick_params(labelsize=_SIZES[2], length=3)
-    ax.locator_params(nbins=5)
-    _label(ax, title)
-
-
-def _draw_relief(ax: canvas.Axes, rec: Reconstruction) -> None:
-    """Draw the surface from above at its own x, y, shaded from the upper left; occlusion edges and jumps stay white."""
-    light = np.array([-0.5, 0.5, 0.9])
-    shade = np.clip(rec.normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
-    rgb = canvas.colored(np.nan_to_num(rec.height), robust_range(rec.height))
-    rgb = np.clip(rgb * (0.35 + 0.85 * np.nan_to_num(shade))[..., None], 0, 1)
-    mean = 0.25 * (rgb[1:, 1:] + rgb[1:, :-1] + rgb[:-1, 1:] + rgb[:-1, :-1])
-    cells = np.concatenate([mean, surface_cells(rec)[..., None]], -1)
-    is_hole = ~np.isfinite(rec.height)
-    corner_x = np.where(is_hole, np.broadcast_to(rec.raster_x, rec.height.shape), rec.x)
-    corner_y = np.where(is_hole, np.broadcast_to(rec.raster_y[:, None], rec.height.shape), rec.y)
-    ax.pcolormesh(corner_x, corner_y, cells, rasterized=True, linewidth=0, antialiased=False)
-    ax.set_aspect("equal")
-    ax.set_facecolor("white")
-    ax.locator_params(nbins=5)
-    _label(ax, "Shaded relief (gaps: not seen by the beam)", "x (µm)", "y (µm)")
 
 
 def _draw_profile(ax: canvas.Axes, rec: Reconstruction, truth: Truth | None, level: float, along: str) -> None:
@@ -101,28 +55,12 @@ def _draw_profile(ax: canvas.Axes, rec: Reconstruction, truth: Truth | None, lev
         ax.fill(outline_x, outline_z, color="#4477aa", alpha=0.3, lw=0, label="± 1 std")
     draw(height, "reconstruction", color="#4477aa", lw=1.2)
     place = profile_place(rec, along, pixel)
-    _label(ax, f"Profile along {along} through the apex, {place}", f"{along} (µm)", "height (µm)")
+    label_map(ax, f"Profile along {along} through the apex, {place}", f"{along} (µm)", "height (µm)")
     ax.grid(color="#dddddd", lw=0.5)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     ax.margins(x=0.01, y=0.08)
     ax.legend(fontsize=8, frameon=False, loc="best")
-
-
-def _draw_validity(ax: canvas.Axes, rec: Reconstruction) -> None:
-    """Draw why pixels are not valid, with the share of each reason."""
-    limits = -0.5, len(REASONS) - 0.5
-    canvas.draw_image(ax, rec.raster_x, rec.raster_y, rec.reason, canvas.listed_colors(REASON_COLORS), limits)
-    share = [float(np.mean(rec.reason == k)) for k in range(len(REASONS))]
-    keys = [
-        canvas.patch(color, f"{textwrap.fill(name, 11)}\n{100 * s:.1f} %", edgecolor="#888888", lw=0.5)
-        for color, name, s in zip(REASON_COLORS, REASONS, share, strict=True)
-        if s > 0
-    ]
-    ax.locator_params(nbins=5)
-    _label(ax, "Validity")
-    style = {"fontsize": 8, "frameon": False, "loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-    ax.legend(handles=keys, labelspacing=1.0, handlelength=1.2, **style)
 
 
 def _draw_numbers(ax: canvas.Axes, rec: Reconstruction, scores: Scores | None) -> None:
@@ -143,29 +81,6 @@ def _draw_numbers(ax: canvas.Axes, rec: Reconstruction, scores: Scores | None) -
         ax.text(0.0, 1.0 - k * step, label, color="#444444", **text)
         ax.text(1.03, 1.0 - k * step, value, ha="right", color="#000000", **text)
         ax.text(1.06, 1.0 - k * step, unit.replace("um", "µm").replace("deg", "°"), color="#444444", **text)
-
-
-class _Sheet:
-    """A figure filled row by row; every box is placed in inches, so that maps line up and nothing overlaps."""
-
-    left, right, head, foot = 0.75, 0.9, 0.4, 0.55
-
-    def __init__(self, width: float, heights: list[float]) -> None:
-        self.width, self.heights = width, [h + self.head + self.foot for h in heights]
-        self.figure = canvas.new_figure(width, sum(self.heights), layout=None)
-
-    def add(self, row: int, column: int, n_columns: int) -> canvas.Axes:
-        """Add axes in one of `n_columns` cells of a row, with room for labels and a colour bar."""
-        cell, total = self.width / n_columns, sum(self.heights)
-        bottom = total - sum(self.heights[: row + 1]) + self.foot
-        size = ((cell - self.left - self.right) / self.width, (self.heights[row] - self.head - self.foot) / total)
-        return self.figure.add_axes(((column * cell + self.left) / self.width, bottom / total, *size), anchor="NW")
-
-    @classmethod
-    def map_height(cls, x: np.ndarray, y: np.ndarray, cell: float) -> float:
-        """Return the height [inch] that lets a map fill a cell's width, within sensible limits."""
-        ratio = (np.ptp(y) + pitch(y)) / (np.ptp(x) + pitch(x))
-        return float(np.clip((cell - cls.left - cls.right) * ratio, 0.6, 6.0))
 
 
 def _extra_maps(rec: Reconstruction, error: np.ndarray | None) -> list[tuple[np.ndarray, str, str, dict[str, Any]]]:
@@ -203,18 +118,18 @@ def panel(
     n = 0 if stack is None else stack.shape[0]
     per_row = 4 if n == 4 else 3
     top = -(-n // per_row)
-    tall = _Sheet.map_height(x, y, WIDTH / 3)
-    sheet = _Sheet(WIDTH, [_Sheet.map_height(x, y, WIDTH / per_row)] * top + [tall, max(tall, 2.8), 2.3])
+    tall = Sheet.map_height(x, y, WIDTH / 3)
+    sheet = Sheet(WIDTH, [Sheet.map_height(x, y, WIDTH / per_row)] * top + [tall, max(tall, 2.8), 2.3])
     if stack is not None:
         for k, (name, image) in enumerate(zip(stack.instrument.detector_names, observed_counts(stack), strict=True)):
             ax = sheet.add(k // per_row, k % per_row, per_row)
-            _draw_map(ax, stack.x, stack.y, image, f"Micrograph {name}", f"{stack.unit} per pixel")
+            draw_map(ax, stack.x, stack.y, image, f"Micrograph {name}", f"{stack.unit} per pixel")
     levelled = rec.replace(height=rec.height - level)
-    _draw_map(sheet.add(top, 0, 3), x, y, levelled.height, "Height", "height (µm)", cmap=canvas.HEIGHT_MAP)
-    _draw_relief(sheet.add(top, 1, 3), levelled)
+    draw_map(sheet.add(top, 0, 3), x, y, levelled.height, "Height", "height (µm)", cmap=canvas.HEIGHT_MAP)
+    draw_relief(sheet.add(top, 1, 3), levelled)
     for (row, column), extra in zip(((top, 2), (top + 1, 1)), _extra_maps(rec, error), strict=False):
-        _draw_map(sheet.add(row, column, 3), x, y, extra[0], extra[1], extra[2], **extra[3])
-    _draw_validity(sheet.add(top + 1, 0, 3), rec)
+        draw_map(sheet.add(row, column, 3), x, y, extra[0], extra[1], extra[2], **extra[3])
+    draw_validity(sheet.add(top + 1, 0, 3), rec)
     _draw_numbers(sheet.add(top + 1, 2, 3), rec, scores)
     _draw_profile(sheet.add(top + 2, 0, 2), rec, truth, level, "x")
     _draw_profile(sheet.add(top + 2, 1, 2), rec, truth, level, "y")
@@ -240,9 +155,9 @@ def micrograph_panel(stack: MicrographStack) -> canvas.Figure:
     if stack.shadowed is not None:
         kinds.append(("Shadowed", stack.shadowed[None], "fraction", fraction))
     cell = max(4.0, WIDTH / n) if n > 3 else WIDTH / 3
-    sheet = _Sheet(cell * n, [_Sheet.map_height(stack.x, stack.y, cell)] * len(kinds))
+    sheet = Sheet(cell * n, [Sheet.map_height(stack.x, stack.y, cell)] * len(kinds))
     for i, (title, images, unit, style) in enumerate(kinds):
         for k, image in enumerate(images):
             name = "" if len(images) != n or title == "Shadowed" else f" {stack.instrument.detector_names[k]}"
-            _draw_map(sheet.add(i, k, n), stack.x, stack.y, image, title + name, unit, **style)
+            draw_map(sheet.add(i, k, n), stack.x, stack.y, image, title + name, unit, **style)
     return sheet.figure

@@ -7,7 +7,7 @@ the scan under the mouse. Wheel: zoom about the mouse. Closing the window ends t
 from collections.abc import Callable
 from typing import Any
 
-from helio_jax.figures.canvas import COUNT_MAP, draw_image, open_window, show_window
+from helio_jax.figures.canvas import COUNT_MAP, check_display, draw_image, new_figure, open_window
 from helio_jax.micrograph import MicrographSet
 
 Picks = dict[str, dict[str, tuple[float, float]]]
@@ -50,7 +50,9 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
     Raises:
         MissingDependencyError: no window can be opened here.
     """
-    figure, axes = open_window(len(scans.stacks), 4.5 * len(scans.stacks), 5)
+    check_display("picking points", "write the CSV by hand: view,point,x_um,y_um")
+    figure = new_figure(4.5 * len(scans.stacks), 5)
+    axes = figure.subplots(1, len(scans.stacks), squeeze=False)[0]
     picker = Picker([s.name for s in scans.stacks], picks)
     view_of = {}
     for ax, stack in zip(axes, scans.stacks, strict=True):
@@ -99,5 +101,5 @@ def pick_points(scans: MicrographSet, picks: Picks, save: Callable[[Picks], None
     for name, handler in (("button_press", on_click), ("key_press", on_key), ("scroll", on_wheel)):
         figure.canvas.mpl_connect(f"{name}_event", handler)  # type: ignore[call-overload,arg-type]
     draw()
-    show_window()
+    open_window(figure)
     return picker.picks

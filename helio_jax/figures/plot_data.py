@@ -12,6 +12,8 @@ from helio_jax.reconstruction import Reconstruction
 
 REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377", "#66ccee")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
+DETECTOR_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#999999")
+"""One colour per detector, repeated (Tol's bright scheme)."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""
 
@@ -31,10 +33,31 @@ def surface_cells(rec: Reconstruction) -> np.ndarray:
     return along[:-1] & along[1:] & up[:, :-1] & up[:, 1:] & np.isfinite(rec.height[1:, 1:] + rec.height[:-1, :-1])
 
 
+def cell_corners(rec: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface points' own positions x, y [y, x], um; the raster's where a height is missing."""
+    is_hole = ~np.isfinite(rec.height)
+    x = np.where(is_hole, np.broadcast_to(rec.raster_x, rec.height.shape), rec.x)
+    return x, np.where(is_hole, np.broadcast_to(rec.raster_y[:, None], rec.height.shape), rec.y)
+
+
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """Average values [y, x, ...] over the four corners of each raster cell [y-1, x-1, ...]."""
+    return 0.25 * (values[1:, 1:] + values[1:, :-1] + values[:-1, 1:] + values[:-1, :-1])
+
+
 def apex_pixel(height: np.ndarray) -> tuple[int, int]:
     """Find the pixel (row, column) farthest above or below the median height; NaN is ignored."""
     away = np.abs(height - np.nanmedian(height)) if np.isfinite(height).any() else np.zeros(height.shape)
     row, column = np.unravel_index(np.argmax(np.where(np.isfinite(away), away, -1.0)), height.shape)
+    return int(row), int(column)
+
+
+def highest_valid(rec: Reconstruction) -> tuple[int, int] | None:
+    """Find the pixel (row, column) of the highest valid height; None: no height is valid."""
+    use = rec.is_valid & np.isfinite(rec.height)
+    if not use.any():
+        return None
+    row, column = np.unravel_index(np.argmax(np.where(use, rec.height, -np.inf)), use.shape)
     return int(row), int(column)
 
 

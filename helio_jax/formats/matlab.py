@@ -49,10 +49,8 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
     Raises:
         InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument contradicts the file.
     """
-    safe.check_size(path, MAX_FILE_BYTES)
-    _check_header(Path(path))
+    tree = _read_tree(path)
     digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    tree = safe.call_in_child("helio_jax.formats.matlab:load_tree", path, memory_bytes=3 * safe.GIB, seconds=120)
     kind = _find_kind(str(path), tree)
     if instrument is None:
         raise InputFileError(
@@ -67,6 +65,46 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
         return MicrographStack(**{"instrument": instrument, "name": Path(path).stem, **fields}, provenance=provenance)
     except InputFileError as e:
         raise InputFileError(f"{path}: {e}") from None
+
+
+def describe_matlab(path: str | os.PathLike) -> dict[str, Any]:
+    """Summarise the micrographs of a MATLAB file without an instrument; the result is JSON-compatible.
+
+    Returns:
+        kind; images: shape, min, mean and max by name, in the raw orientation; numbers: pixel and dwell time in words;
+        metadata.
+
+    Raises:
+        InputFileError: missing, corrupt, or of another kind.
+    """
+    tree = _read_tree(path)
+    kind = _find_kind(str(path), tree)
+    scan, found = tree["im" if kind == "reference simulator" else "meas_list"], {}
+    for key in _IMAGES:
+        value = scan.get(key)
+        several = isinstance(value, list)
+        for i, image in enumerate(value if several else [value]):
+            if isinstance(image, np.ndarray) and image.ndim == 2 and image.size:
+                name = f"channel {i + 1}" if key == "image" and several else f"{key} {i + 1}" if several else key
+                found[name] = {"shape": list(image.shape)} | {
+                    word: float(getattr(image, word)()) for word in ("min", "mean", "max")
+                }
+    unit = {"B-SHeM": 1e-6, "A-SHeM": 1e-3, "reference simulator": 1e3}[kind]
+    steps = ("raster_movement_x", "raster_movement_y") if kind == "reference simulator" else ("hori_res", "vert_res")
+    pixel = [scan.get(name) for name in steps]
+    numbers = {}
+    if all(isinstance(p, (int, float)) for p in pixel):
+        numbers["pixel"] = f"{float(pixel[0]) * unit:g} x {float(pixel[1]) * unit:g} um (columns x rows)"
+    if isinstance(took := scan.get("scan_time"), (int, float)):
+        numbers["scan time"] = f"{took:.0f} s"
+    return {"kind": kind, "images": found, "numbers": numbers, "metadata": {k: _to_json(v) for k, v in tree.items()}}
+
+
+def _read_tree(path: str | os.PathLike) -> dict[str, Any]:
+    """Check a file's size and header and parse it in a child process."""
+    safe.check_size(path, MAX_FILE_BYTES)
+    _check_header(Path(path))
+    return safe.call_in_child("helio_jax.formats.matlab:load_tree", path, memory_bytes=3 * safe.GIB, seconds=120)
 
 
 def _check_header(path: Path) -> None:

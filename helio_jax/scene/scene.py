@@ -84,6 +84,10 @@ class Scene(Instrument):
             )
         return problems
 
+    def _in_short(self) -> str:
+        ny, nx = self.image_shape
+        return f"{self.name!r}: {self.sample.kind}, {nx} x {ny} pixels, {len(self.detector)} detectors"
+
     @property
     def instrument(self) -> Instrument:
         """Beam, plate, detectors and their uncertainty, as a micrograph stack carries them."""

@@ -94,3 +94,16 @@ def locate(name: str | os.PathLike, folder: Path = Path()) -> Path:
             "names the file that comes with helio"
         )
     return path
+
+
+def path_beside(name: str | os.PathLike, suffix: str) -> Path:
+    """Return the path of what is written beside a file, under its name with another suffix.
+
+    What comes with the program stays as it is: beside its files nothing is written, but in the current folder.
+
+    Raises:
+        SceneError: see `locate`.
+    """
+    path = Path(name)
+    is_shipped = locate(path).resolve() in {file.path.resolve() for file in list_shipped()}
+    return (Path() if is_shipped else path.parent) / f"{path.stem}{suffix}"

@@ -127,7 +127,7 @@ def test_interrupt_ends_with_130(small_scene, tmp_path):
     A first run compiles what is not compiled yet, for a signal that falls into the compiler's callbacks is lost;
     should something be left to compile, the signal is repeated every 10 s.
     """
-    assert helio("simulate", small_scene, "-o", tmp_path / "first.h5", "--rays", "8").returncode == 0
+    assert helio("simulate", small_scene, "-o", tmp_path / "first.h5", "--rays", "8", "--no-picture").returncode == 0
     (tmp_path / "first.h5").unlink()
     command = [sys.executable, "-m", "helio_jax", "simulate", str(small_scene), "-o", str(tmp_path / "s.h5")]
     # a shell's background job ignores Ctrl-C, and so does what it starts: the gate may be one

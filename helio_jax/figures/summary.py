@@ -1,0 +1,243 @@
+"""What a person wants to know about micrographs, heights, an instrument or a scene, in about ten lines.
+
+Rows of (label, text) for `helio info`, for the end of `helio simulate` and `helio import`, and for notebooks. Units in
+plain text: um, deg.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from helio_jax.arrays import pitch
+from helio_jax.figures.image_numbers import image_numbers
+from helio_jax.figures.plot_data import highest_valid
+from helio_jax.figures.wording import UNITS, amount, angle, duration, length, lengths, plural, share, short
+from helio_jax.heightmap import HeightMap
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.scene.scene import Scene
+
+Rows = list[tuple[str, str]]
+VALID_RULE = "a height is valid if enough data determine it and the data do not contradict it"
+"""What `is_valid` states, in words."""
+MAX_SCANS = 8
+"""A summary lists at most this many scans of a set."""
+KINDS = {"expected": "expected counts", "poisson": "counts with noise", "measured": "measured counts"}
+"""What the counts of a stack are, by `MicrographStack.noise`."""
+
+
+def summarise(what: Any) -> Rows:
+    """Summarise a stack, set, reconstruction, height map, instrument or scene as rows of (label, text)."""
+    match what:
+        case MicrographStack():
+            return _stack_rows(what)
+        case MicrographSet():
+            return _set_rows(what)
+        case Reconstruction():
+            return _reconstruction_rows(what)
+        case HeightMap():
+            return _height_map_rows(what)
+        case Scene():
+            return _scene_rows(what)
+        case Instrument():
+            return _instrument_rows(what)
+    raise TypeError(f"there is no summary of a {type(what).__name__}")
+
+
+def text_lines(rows: Rows) -> list[str]:
+    """Format rows as aligned lines."""
+    width = max((len(label) for label, _ in rows), default=0)
+    return [f"  {label:<{width}}  {text}" for label, text in rows]
+
+
+def aims(instrument: Instrument) -> list[str]:
+    """Write where each detector's opening lies, e.g. polar 30 deg, azimuth 120 deg."""
+    found = [detector.aim(instrument.working_distance) for detector in instrument.detector]
+    return [
+        "a part of the plate's mesh" if aim is None else f"polar {angle(aim[0])}, azimuth {angle(aim[1])}"
+        for aim in found
+    ]
+
+
+def raster_text(x: np.ndarray, y: np.ndarray) -> str:
+    """Write size, pixel and field of a raster."""
+    dx, dy = pitch(x), pitch(y)
+    field = lengths(dx * x.size, dy * y.size)
+    return f"{x.size} x {y.size} pixels of {lengths(dx, dy)}; field of view {field}"
+
+
+def _stack_rows(stack: MicrographStack) -> Rows:
+    rows = [
+        ("micrographs", f"{stack.name}: {plural(stack.shape[0], 'image')}, {KINDS[stack.noise]}"),
+        _raster_row(stack),
+    ]
+    rows.append(("counts of", _exposure(stack)))
+    rows += _detector_rows(stack)
+    shares = [f"{name} {share(part)}" for name, part in stack.count_fractions().items()]
+    rows += [("of the counts", ", ".join(shares))] if shares else []
+    rows.append(("beam", _beam_text(stack.instrument)))
+    if stack.sample_rotation:
+        rows.append(("sample", f"rotated by {angle(stack.sample_rotation)}"))
+    if stack.noise == "measured":
+        done = (
+            "no (helio calibrate)"
+            if stack.calibration is None
+            else f"yes, by {stack.calibration.method.replace('_', ' ')}"
+        )
+        rows.append(("calibrated", done + (", aligned scans" if stack.alignment is not None else "")))
+    if not stack.is_observed.all():
+        rows.append(("observed", f"{share(float(stack.is_observed.mean()))} of the pixels"))
+    return rows + _made_rows(stack.provenance)
+
+
+def _raster_row(stack: MicrographStack) -> tuple[str, str]:
+    if stack.positions is not None:
+        return "positions", f"a list of {len(stack.positions)}"
+    return "raster", raster_text(stack.x, stack.y)
+
+
+def _exposure(stack: MicrographStack) -> str:
+    if stack.n_rays is not None:
+        unit = "" if stack.unit in UNITS else f" (unit: {stack.unit})"
+        return f"{plural(stack.n_rays, 'beam atom')} per pixel{unit}"
+    if not stack.dwell:
+        return "an unknown exposure"
+    total = duration(stack.dwell * stack.shape[1] * stack.shape[2])
+    return f"{stack.dwell:.3g} s per pixel ({total} for one image, without the time to move)"
+
+
+def _detector_rows(stack: MicrographStack) -> Rows:
+    rows = []
+    names, unit = stack.instrument.detector_names, stack.unit if stack.unit in UNITS else ""
+    for name, aim, found in zip(names, aims(stack.instrument), image_numbers(stack), strict=True):
+        text = f"{aim}; mean {amount(found.mean, unit)}, max {amount(found.highest, unit)}"
+        if found.relative_error is not None and stack.noise == "expected":
+            text += f", error of the simulation {share(found.relative_error)}"
+        elif found.noise is not None:
+            text += f", noise {amount(found.noise, unit)}"
+        if found.snr is not None:
+            text += f", SNR {found.snr:.3g}" + (" if counted" if stack.noise == "expected" else "")
+        rows.append((f"- {name}", text))
+    return rows
+
+
+def _set_rows(scans: MicrographSet) -> Rows:
+    first = scans.stacks[0]
+    rows = [("scans", f"{len(scans.stacks)}, {KINDS[first.noise]}"), _raster_row(first)]
+    rows += [("counts of", _exposure(first)), ("beam", _beam_text(first.instrument))]
+    for stack in scans.stacks[:MAX_SCANS]:
+        means = ", ".join(amount(found.mean, stack.unit) for found in image_numbers(stack))
+        where = f"sample at {angle(stack.sample_rotation)}, {length(stack.instrument.sample_distance)} below the plate"
+        rows.append((f"- {stack.name}", f"{where}; mean {means}"))
+    if len(scans.stacks) > MAX_SCANS:
+        rows.append(("- ...", f"{len(scans.stacks) - MAX_SCANS} more"))
+    made = [(f"{label} (first)", text) for label, text in _made_rows(first.provenance)]
+    return rows + (_made_rows(scans.provenance) or made)
+
+
+def _reconstruction_rows(rec: Reconstruction) -> Rows:
+    rows = [("height map", f"by {rec.method} from {plural(len(rec.instrument.detector), 'image')}")]
+    rows.append(("raster", f"{raster_text(rec.raster_x, rec.raster_y)} (beam frame)"))
+    top = highest_valid(rec)
+    if top is None:
+        rows.append(("highest point", "none: no height is valid"))
+    else:
+        z, std = rec.height[top], None if rec.height_std is None else rec.height_std[top]
+        error = "" if std is None or not np.isfinite(std) else f" +- {std:.{0 if std >= 10 else 1}f}"
+        place = f"x = {rec.x[top]:.0f} um, y = {rec.y[top]:.0f} um"
+        rows.append(("highest point", f"{z:.4g}{error} um at {place} (of the valid ones)"))
+        heights = rec.height[rec.is_valid & np.isfinite(rec.height)]
+        rows.append(("heights", f"{heights.min():.4g} to {heights.max():.4g} um above {_level(rec)}"))
+    if rec.height_std is not None and rec.is_valid.any():
+        rows.append(("standard dev.", f"{np.nanmedian(rec.height_std[rec.is_valid]):.3g} um (median of valid heights)"))
+    rows.append(("valid", f"{share(float(rec.is_valid.mean()))} of the pixels: {VALID_RULE}"))
+    numbers = ((reason, float(np.mean(rec.reason == k))) for k, reason in enumerate(REASONS) if k)
+    causes = [f"{reason} {share(part)}" for reason, part in numbers if part]
+    rows += [("not valid", ", ".join(causes))] if causes else []
+    if rec.is_contradicted:
+        rows.append(("WARNING", "the data contradict this height map: do not trust it"))
+    rows += [("status", rec.status)] if rec.status else []
+    return [*rows, ("beam", _beam_text(rec.instrument)), *_made_rows(rec.provenance)]
+
+
+def _level(rec: Reconstruction) -> str:
+    return "the substrate" if rec.border == "flat" else "an unknown level (free border)"
+
+
+def _height_map_rows(found: HeightMap) -> Rows:
+    known = found.height[np.isfinite(found.height)]
+    rows = [("height map", "on a regular grid, sample frame"), ("grid", raster_text(found.x, found.y))]
+    if not known.size:
+        return [*rows, ("heights", "none: all are missing")]
+    rows.append(("heights", f"{known.min():.4g} to {known.max():.4g} um, median {np.median(known):.4g} um"))
+    if n_missing := found.height.size - known.size:
+        rows.append(("missing", f"{n_missing} of {found.height.size} heights"))
+    return rows
+
+
+def _beam_text(instrument: Instrument) -> str:
+    t, phi = instrument.beam.incidence_deg, instrument.beam.azimuth_deg
+    way = f"{t:g} deg from the plate normal, travels towards azimuth {phi:g} deg" if t else "along the plate normal"
+    design, distance = instrument.working_distance, instrument.sample_distance
+    aimed = f" (aimed at {length(design)})" if design != distance else ""
+    return f"{way}; substrate {length(distance)} below the plate{aimed}"
+
+
+def _instrument_rows(instrument: Instrument) -> Rows:
+    beam, plate = instrument.beam, instrument.plate
+    size = "" if beam.source in ("pencil", "rays") else f" of {beam.source_size_mrad:g} mrad"
+    rows = [("beam", _beam_text(instrument))]
+    rows.append(("source", f"{beam.source}{size}, pinhole radius {length(beam.pinhole_radius_um)}"))
+    rows.append(("plate", plate.kind))
+    for detector, aim in zip(instrument.detector, aims(instrument), strict=True):
+        channel = "" if detector.channel is None else f", channel {detector.channel}"
+        rows.append((f"- {detector.name}", aim + (", at infinity" if detector.at_infinity else "") + channel))
+    stated = {k: v for k, v in instrument.uncertainty.model_dump().items() if v}
+    said = ", ".join(
+        f"{k.rpartition('_')[0].replace('_', ' ')} {v:g} {k.rpartition('_')[2]}" for k, v in stated.items()
+    )
+    return [*rows, ("uncertainty", said or "none stated: the geometry counts as exact")]
+
+
+def _scene_rows(scene: Scene) -> Rows:
+    (x0, y0, z0), (x1, y1, z1) = scene.build_body().bounds
+    rows = [("scene", scene.name + (f": {scene.description.strip()}" if scene.description.strip() else ""))]
+    file = getattr(scene.sample, "file", None)
+    kind = scene.sample.kind + (f" from {file}" if file else "")
+    heights = f"from {length(z0)} to {length(z1)} above the substrate"
+    rows.append(("sample", f"{kind}, {lengths(x1 - x0, y1 - y0)} wide, {heights}"))
+    laws = ", ".join(f"{name} ({law.kind})" for name, law in scene.used_materials.items())
+    rows.append(("materials", laws or "all scatter by the cosine law"))
+    ny, nx = scene.image_shape
+    raster = (
+        raster_text(*scene.positions()) if scene.scan.kind == "raster" else f"{scene.scan.kind} of {nx * ny} positions"
+    )
+    views = f"; {scene.scan.n_views} views" if scene.scan.n_views > 1 else ""
+    return [*rows, ("scan", raster + views), *_instrument_rows(scene.instrument)]
+
+
+def _made_rows(provenance: Any) -> Rows:
+    """Write where the data come from, as far as their history states it; the history of a file may hold anything."""
+    source, scan = _table(provenance, "source"), _table(provenance, "metadata", "meas_list")
+    trace, versions = _table(provenance, "scene", "trace"), _table(provenance, "versions")
+    parts = [f"imported from {source.get('file')} ({source.get('kind')})"] if source else []
+    if isinstance(took := scan.get("scan_time"), (int, float)):
+        parts.append(f"scanned in {duration(took)}")
+    if "scene_file" in provenance:
+        parts.append(f"simulated from {provenance['scene_file']}")
+    if trace:
+        parts.append(
+            f"{trace.get('estimator')} estimator, {trace.get('rays')} rays per pixel, seed {trace.get('seed')}"
+        )
+    parts += [f"helio_jax {versions['helio-jax']}"] if "helio-jax" in versions else []
+    parts += [str(provenance["time"])] if "time" in provenance else []
+    return [("made", short(", ".join(parts), 300))] if parts else []
+
+
+def _table(values: Any, *path: str) -> dict[str, Any]:
+    """Return a table within tables; an empty one if it is not there or no table."""
+    for name in path:
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return dict(values) if isinstance(values, Mapping) else {}
