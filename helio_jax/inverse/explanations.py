@@ -6,7 +6,7 @@ images about as well as the one that is kept is undecided.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import squares
+from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
 from helio_jax.inverse.verdict import LIMIT, local_chi_square, residuals_of_state
@@ -41,6 +42,8 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
+HELD = 1e-4
+"""Gains and offsets that are held have this share of their prior standard deviation."""
 MAX_BACKTRACKS = 3
 """How often a starting surface is smoothed when masks and multiple scattering cannot be predicted for it."""
 
@@ -74,11 +77,11 @@ def explain(
         if best.fit.is_interrupted:
             return best
         try:
-            residuals = fits.residuals(best)
+            residuals = fits.residuals(best.fit)
             if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
                 return best
             found = other(best, residuals)
-            if found and 0.5 * np.sum(squares(residuals) - squares(fits.residuals(found))) > GAIN:
+            if found and fits.gain(best.fit, found.fit) > GAIN:
                 best = found
         except PredictionError:
             continue
@@ -119,14 +122,15 @@ class _Fits:
         patches: AlbedoPatches,
         region: np.ndarray | None = None,
         anchors: Anchors | None = None,
+        settings: ReconstructSettings | None = None,
     ) -> FitProblem:
-        """Pose the fit from a surface on."""
+        """Pose the fit from a surface on; `settings`: other ones than stated."""
         return FitProblem.of(
             *signal_of(self.stack),
             self.stack.instrument,
             Raster.of(self.stack),
             surface,
-            self.settings,
+            settings or self.settings,
             region,
             scan_order(self.stack),
             patches=patches,
@@ -142,9 +146,13 @@ class _Fits:
         """The same after a short fit, and its surface."""
         return short_fit(self.pose(surface, patches), surface, self.predict_trial)
 
-    def residuals(self, explanation: Explanation) -> np.ndarray:
+    def residuals(self, fit: Fit) -> np.ndarray:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
-        return residuals_of_state(explanation.fit.problem, explanation.fit.state, self.predict_trial)
+        return residuals_of_state(fit.problem, fit.state, self.predict_trial)
+
+    def gain(self, fit: Fit, other: Fit) -> float:
+        """Compute by how much another fit explains the micrographs better [half chi-square]."""
+        return 0.5 * float(np.sum(squares(self.residuals(fit)) - squares(self.residuals(other))))
 
     def say(self, said: str) -> None:
         """Report what is tried."""
@@ -152,7 +160,26 @@ class _Fits:
             self.report(0, self.settings.refine.max_rounds, said)
 
     def fitted(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
-        """Fit the heights from a surface, or one nearer to a smoothed one; `known` as in `pose`."""
+        """Fit the heights from a surface, or one nearer to a smoothed one; `known` as in `pose`.
+
+        With a free border, gains and offsets have much the same effect as tilt and relief: what the model lacks moved
+        gains of a right instrument by several per cent, and tilted the heights with them. They are then held as stated,
+        and the fit with free ones is kept only if the data demand it. The error bars include them in either case.
+        """
+        problem = self.pose(surface, *known)
+        if self.settings.border == "flat" or problem.is_instrument_unknown:
+            return self._fit(surface, smoothed, *known)
+        held = with_held_readout(self.settings)
+        patches, region, anchors = (*known, None, None)[:3]
+        fit = self._fit(surface, smoothed, patches, region, anchors, held)
+        fit = replace(fit, problem=problem, state=replace(fit.state, parameters=readout_as_stated(fit.parameters)))
+        if fit.is_interrupted:
+            return fit
+        free = self._fit(fit.state.surface, smoothed, *known)
+        return free if self.gain(fit, free) > GAIN else fit
+
+    def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
+        """Fit once; arguments as those of `fitted`."""
         fit, _ = _with_backtracking(
             lambda start: fit_heights(self.pose(start, *known), start, self.predict, self.report), surface, smoothed
         )
@@ -217,6 +244,17 @@ class _Fits:
             return self.from_steps(patches)
         surface = best.fit.state.surface
         return best._replace(fit=self.fitted(surface, surface, patches, best.objects))
+
+
+def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:
+    """Hold gains and offsets at what is stated."""
+    held = {"gain_std": HELD * settings.refine.gain_std, "offset_std": HELD * settings.refine.offset_std}
+    return settings.model_copy(update={"refine": settings.refine.model_copy(update=held)})
+
+
+def readout_as_stated(parameters: Parameters) -> Parameters:
+    """Set gains and offsets to what is stated."""
+    return parameters.replaced(log_gain=0.0 * parameters.log_gain, offset=0.0 * parameters.offset)
 
 
 def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
