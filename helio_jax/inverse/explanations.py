@@ -54,12 +54,14 @@ class Explanation(NamedTuple):
     Attributes:
         fit: without error bars.
         is_undecided: where another level explains the images as well [y, x].
+        assumed: what the fit takes for granted beyond the settings, in words; "": nothing.
         objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
         has_steps: whether regions are at the levels of measured steps.
     """
 
     fit: Fit
     is_undecided: np.ndarray
+    assumed: str = ""
     objects: np.ndarray | None = None
     has_steps: bool = False
 
@@ -83,8 +85,8 @@ def explain(
             found = other(best, residuals)
             if found and fits.gain(best.fit, found.fit) > GAIN:
                 best = found
-        except PredictionError:
-            continue
+        except PredictionError as e:
+            fits.say(f"another explanation is given up: {e}")
     return best
 
 
@@ -172,11 +174,16 @@ class _Fits:
         held = with_held_readout(self.settings)
         patches, region, anchors = (*known, None, None)[:3]
         fit = self._fit(surface, smoothed, patches, region, anchors, held)
-        fit = replace(fit, problem=problem, state=replace(fit.state, parameters=readout_as_stated(fit.parameters)))
+        parameters = readout_as_stated(fit.parameters)
+        fit = replace(fit, problem=problem, parameters=parameters, state=replace(fit.state, parameters=parameters))
         if fit.is_interrupted:
             return fit
-        free = self._fit(fit.state.surface, smoothed, *known)
-        return free if self.gain(fit, free) > GAIN else fit
+        try:
+            free = self._fit(fit.state.surface, smoothed, *known)
+            return free if self.gain(fit, free) > GAIN else fit
+        except PredictionError as e:
+            self.say(f"free gains and offsets are given up: {e}")
+            return fit
 
     def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
         """Fit once; arguments as those of `fitted`."""
@@ -207,10 +214,12 @@ class _Fits:
                 if moved := [steps[i] for i in found.moved]:
                     labels = labelled(moved)
                     anchors = level_anchors(labels, moved, start)
-            except PredictionError:
-                pass  # the start is too rough for it: the fit begins at a smoother one
+            except PredictionError as e:  # the fit begins at a smoother start
+                self.say(f"levels of measured steps are given up: {e}")
         fit = self.fitted(start, smoothed, patches, labels, anchors)
-        return Explanation(fit, is_undecided, has_steps=anchors is not None and anchors.value.size > 0)
+        n_steps = 0 if anchors is None else len(anchors.value)
+        assumed = f"{n_steps} levels from mask bands" if n_steps else ""
+        return Explanation(fit, is_undecided, assumed, has_steps=n_steps > 0)
 
     def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
@@ -230,7 +239,8 @@ class _Fits:
             return None
         start = self.short_fit(objects.surface(relief), none)[1]
         fit = self.fitted(start, smoothed, none, objects.number)
-        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number)
+        assumed = f"{len(np.unique(objects.number)) - 1} objects on a flat substrate"
+        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), assumed, objects.number)
 
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""

@@ -149,6 +149,7 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
+    assumed = f"assumed: {found.assumed}" if found.assumed else ""
     rec = Reconstruction(
         height=fit.surface.height,
         raster_x=stack.x,
@@ -165,7 +166,7 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
         gain=fit.gain,
         offset=fit.offset,
         border=settings.border,
-        status=f"{fit.status}; {GEOMETRY_WARNING}" if is_moved else fit.status,
+        status="; ".join(filter(None, (fit.status, assumed, GEOMETRY_WARNING if is_moved else ""))),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),
@@ -174,6 +175,7 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
             "sensitivity": sensitivity(fit, settings),
             "instrument": describe_instrument(fit, settings.refine),
             "chi_square": fit.chi_square,
+            "assumed": found.assumed,
         },
     )
     return rec, partial(residuals_of_state, fit.problem, fit.state)
