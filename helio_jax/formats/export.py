@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from helio_jax.errors import SceneError
-from helio_jax.formats.export_formats import FORMATS, Format, find_format, suffixes_for
+from helio_jax.formats.export_formats import FORMATS, SUFFIXES, Format, find_format, suffixes_for
 from helio_jax.formats.layers import Layers, layers_of
 from helio_jax.formats.safe import atomic_path
 from helio_jax.formats.write_reference import why_not, write_reference
@@ -27,8 +27,7 @@ def export(
     stack = _one_of(obj, view, path)
     form = find_format(Path(path).suffix)
     if form is None:
-        known = " ".join(suffix for known in FORMATS for suffix in known.suffixes)
-        raise SceneError(f"{path}: no format has the suffix {Path(path).suffix!r}: known are {known}")
+        raise SceneError(f"{path}: no format has the suffix {Path(path).suffix!r}: known are {' '.join(SUFFIXES)}")
     if not isinstance(stack, (MicrographStack, Reconstruction, HeightMap)):
         raise SceneError(f"{path}: a {type(obj).__name__} cannot be exported: give micrographs or heights")
     note = []

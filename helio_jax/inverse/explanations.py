@@ -54,16 +54,21 @@ class Explanation(NamedTuple):
     Attributes:
         fit: without error bars.
         is_undecided: where another level explains the images as well [y, x].
-        assumed: what the fit takes for granted beyond the settings, in words; "": nothing.
         objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
-        has_steps: whether regions are at the levels of measured steps.
+        n_steps: number of regions that are held at the levels of measured steps.
     """
 
     fit: Fit
     is_undecided: np.ndarray
-    assumed: str = ""
     objects: np.ndarray | None = None
-    has_steps: bool = False
+    n_steps: int = 0
+
+    @property
+    def assumed(self) -> str:
+        """What the fit takes for granted beyond the settings, in words; "": nothing."""
+        if self.objects is not None:
+            return f"{len(np.unique(self.objects)) - 1} objects on a flat substrate"
+        return f"{self.n_steps} levels from mask bands" if self.n_steps else ""
 
 
 def explain(
@@ -83,7 +88,7 @@ def explain(
             if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
                 return best
             found = other(best, residuals)
-            if found and fits.gain(best.fit, found.fit) > GAIN:
+            if found and improvement(residuals, fits.residuals(found.fit)) > GAIN:
                 best = found
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
@@ -152,10 +157,6 @@ class _Fits:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
 
-    def gain(self, fit: Fit, other: Fit) -> float:
-        """Compute by how much another fit explains the micrographs better [half chi-square]."""
-        return 0.5 * float(np.sum(squares(self.residuals(fit)) - squares(self.residuals(other))))
-
     def say(self, said: str) -> None:
         """Report what is tried."""
         if self.report:
@@ -180,7 +181,7 @@ class _Fits:
             return fit
         try:
             free = self._fit(fit.state.surface, smoothed, *known)
-            return free if self.gain(fit, free) > GAIN else fit
+            return free if improvement(self.residuals(fit), self.residuals(free)) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")
             return fit
@@ -192,9 +193,18 @@ class _Fits:
         )
         return fit
 
+    def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
+        """Find the photometric solution that a fit starts from, and a smoother one."""
+        return _start(self.stack, self.settings, patches, self.predict_start)
+
+    @cached_property
+    def plain_start(self) -> tuple[Surface, Surface]:
+        """The same without patches of another albedo; several explanations begin with it."""
+        return self.start(AlbedoPatches.none(self.stack.shape[1:]))
+
     def from_steps(self, patches: AlbedoPatches) -> Explanation:
         """Fit from the photometric solution, with regions at the levels of the steps that are measured."""
-        start, smoothed = _start(self.stack, self.settings, patches, self.predict_start)
+        start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
         if steps := measured_regions(self.stack, start):
@@ -217,16 +227,13 @@ class _Fits:
             except PredictionError as e:  # the fit begins at a smoother start
                 self.say(f"levels of measured steps are given up: {e}")
         fit = self.fitted(start, smoothed, patches, labels, anchors)
-        n_steps = 0 if anchors is None else len(anchors.value)
-        assumed = f"{n_steps} levels from mask bands" if n_steps else ""
-        return Explanation(fit, is_undecided, assumed, has_steps=n_steps > 0)
+        return Explanation(fit, is_undecided, n_steps=0 if anchors is None else len(anchors.value))
 
     def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
-        if self.settings.border != "flat" or not self.settings.refine.objects or best.has_steps:
+        if self.settings.border != "flat" or not self.settings.refine.objects or best.n_steps:
             return None
-        none = AlbedoPatches.none(self.stack.shape[1:])
-        relief, smoothed = _start(self.stack, self.settings, none, self.predict_start)
+        none, (relief, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
         objects = find_objects(
             self.stack,
             self.settings,
@@ -239,8 +246,7 @@ class _Fits:
             return None
         start = self.short_fit(objects.surface(relief), none)[1]
         fit = self.fitted(start, smoothed, none, objects.number)
-        assumed = f"{len(np.unique(objects.number)) - 1} objects on a flat substrate"
-        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), assumed, objects.number)
+        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number)
 
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""
@@ -254,6 +260,11 @@ class _Fits:
             return self.from_steps(patches)
         surface = best.fit.state.surface
         return best._replace(fit=self.fitted(surface, surface, patches, best.objects))
+
+
+def improvement(residuals: np.ndarray, others: np.ndarray) -> float:
+    """Compute by how much other residuals [detector, y, x] are smaller, in half chi-square."""
+    return 0.5 * float(np.sum(squares(residuals) - squares(others)))
 
 
 def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:

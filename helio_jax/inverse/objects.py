@@ -27,7 +27,7 @@ from scipy.ndimage import (
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.form_factor import form_factor
-from helio_jax.forward.optics import Optics
+from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.levels import GAIN
@@ -191,8 +191,8 @@ def find_objects(
     enclosed = enclosed_by(sharp)
     if not enclosed.any():
         return None
-    pitch = float(np.diff(stack.y).mean()), float(np.diff(stack.x).mean())
-    search = ObjectSearch(relief, sharp, pitch, misfit, substrate.unexplained, report)
+    raster = Raster.of(stack)
+    search = ObjectSearch(relief, sharp, (raster.dy, raster.dx), misfit, substrate.unexplained, report)
     return search.find(Objects(enclosed, (0.0,) * int(enclosed.max()))).objects
 
 
