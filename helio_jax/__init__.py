@@ -97,6 +97,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edges               edges of the raster: smooth, kink or jump
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   objects             objects on a flat substrate: their outlines and levels
+  pits                pits in a flat substrate: their outlines and levels
   levels              level search of regions behind depth jumps
   merging             segmentation of a noisy map by region merging
   albedo_patches      parts of the surface of other albedo than the substrate's
@@ -119,6 +120,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   fit                 outer iterations of the fit
   convergence         convergence error and status of a fit
   posterior           Laplace posterior of heights and slopes
+  correlated_errors   errors that agree between neighbours: predicted data, edges at kinks
   samples             posterior samples of the heights
   noise_bias          bias that the noise of the data causes
   quality             why a height is not valid

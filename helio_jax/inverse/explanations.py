@@ -28,6 +28,7 @@ from helio_jax.inverse.linear import signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
+from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters
@@ -55,19 +56,22 @@ class Explanation(NamedTuple):
         fit: without error bars.
         is_undecided: where another level explains the images as well [y, x].
         objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
+        pits: likewise, of pits.
         n_steps: number of regions that are held at the levels of measured steps.
     """
 
     fit: Fit
     is_undecided: np.ndarray
     objects: np.ndarray | None = None
+    pits: np.ndarray | None = None
     n_steps: int = 0
 
     @property
     def assumed(self) -> str:
         """What the fit takes for granted beyond the settings, in words; "": nothing."""
-        if self.objects is not None:
-            return f"{len(np.unique(self.objects)) - 1} objects on a flat substrate"
+        for kind, number in (("objects on", self.objects), ("pits in", self.pits)):
+            if number is not None:
+                return f"{len(np.unique(number)) - 1} {kind} a flat substrate"
         return f"{self.n_steps} levels from mask bands" if self.n_steps else ""
 
 
@@ -80,7 +84,7 @@ def explain(
     """
     fits = _Fits(stack, settings, make_predict, report)
     best = fits.from_steps(AlbedoPatches.none(stack.shape[1:]))
-    for other in (fits.from_objects, fits.from_albedo_patches):
+    for other in (fits.from_pits, fits.from_objects, fits.from_albedo_patches):
         if best.fit.is_interrupted:
             return best
         try:
@@ -148,6 +152,11 @@ class _Fits:
         """Half the chi-square of the data expected on a surface, nothing fitted."""
         problem = self.pose(surface, patches)
         return misfit_of(problem, FitState.at(problem, surface), self.predict_trial)
+
+    def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
+        """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
+        problem = self.pose(surface, patches)
+        return residuals_of_state(problem, FitState.at(problem, surface), self.predict_trial)
 
     def short_fit(self, surface: Surface, patches: AlbedoPatches) -> tuple[float, Surface]:
         """The same after a short fit, and its surface."""
@@ -248,6 +257,24 @@ class _Fits:
         fit = self.fitted(start, smoothed, none, objects.number)
         return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number)
 
+    def from_pits(self, best: Explanation, _: np.ndarray) -> Explanation | None:
+        """Fit from pits with flat floors in a flat substrate; None where there are none."""
+        if self.settings.border != "flat" or not self.settings.refine.objects:
+            return None
+        none, raster, shape = AlbedoPatches.none(self.stack.shape[1:]), Raster.of(self.stack), self.stack.shape[1:]
+        search = PitSearch(
+            lambda surface: self.residuals_on(surface, none),
+            (raster.dy, raster.dx),
+            self.stack.instrument.beam_shift,
+            self.say,
+        )
+        pits = search.find((shape[0], shape[1]))
+        if pits is None:
+            return None
+        start = self.short_fit(pits.surface, none)[1]
+        fit = self.fitted(start, self.plain_start[1], none, pits.number)
+        return Explanation(fit, np.zeros(shape, bool), pits=pits.number)
+
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""
         if not self.settings.refine.albedo_patches:
@@ -256,10 +283,11 @@ class _Fits:
         patches = found.keeping(found.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
-        if best.objects is None:
+        known = best.pits if best.objects is None else best.objects
+        if known is None:
             return self.from_steps(patches)
         surface = best.fit.state.surface
-        return best._replace(fit=self.fitted(surface, surface, patches, best.objects))
+        return best._replace(fit=self.fitted(surface, surface, patches, known))
 
 
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:

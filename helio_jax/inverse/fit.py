@@ -15,9 +15,10 @@ import numpy as np
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
+from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
-from helio_jax.inverse.posterior import MAX_PIXELS, ModelError, Posterior, linearise, sample_posterior
+from helio_jax.inverse.posterior import MAX_PIXELS, Posterior, linearise, sample_posterior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
@@ -100,7 +101,8 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     limits = s.robust_limits[-1], s.jump_limits[-1]
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
-    found = sample_posterior(linearise(unknowns, fixed), n_samples, error=error)
+    edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
+    found = sample_posterior(linearise(unknowns, fixed), n_samples, error=error, edge_error=edge_error)
     planes = part.priors.tilt * part.position
     found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)

@@ -16,6 +16,7 @@ from helio_jax.forward.optics import Raster
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.linear import MIN_IMAGES
+from helio_jax.inverse.misfit_errors import with_path_error
 from helio_jax.inverse.nearfield import photometric_heights
 from helio_jax.inverse.quality import (
     FACET_IMAGES,
@@ -34,7 +35,7 @@ from helio_jax.inverse.verdict import (
     Trace,
     judged,
     misfit_of_map,
-    residuals_of_state,
+    misfit_of_state,
 )
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
@@ -77,26 +78,29 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result, residuals = _refined(stack, settings, make_predict, report)
+        result, misfit_of = _refined(stack, settings, make_predict, report)
         _check_finite(result)
-        return judged(result, stack, partial(residuals, trace)) if trace else result
+        if not trace:
+            return result
+        tested, misfit = _tested(stack, partial(misfit_of, trace), result)
+        return with_path_error(tested, misfit, stack, settings) if misfit else tested
 
     predict = make_predict and make_predict(settings.refine.start_paths(stack.counts[0].size))
     test = None
     if trace:
         patches = search_albedo_patches(stack, settings, predict) if predict else AlbedoPatches.none(stack.shape[1:])
-        test = partial(_tested, stack, patches, trace)
+        test = lambda rec: _tested(stack, partial(misfit_of_map, stack, rec, patches, trace), rec)  # noqa: E731
     result = photometric_heights(stack, settings, predict, test)
     _check_finite(result)
     return result
 
 
 def _tested(
-    stack: MicrographStack, patches: AlbedoPatches, trace: Trace, rec: Reconstruction
+    stack: MicrographStack, misfit_of: Callable[[], Misfit], rec: Reconstruction
 ) -> tuple[Reconstruction, Misfit | None]:
-    """Return a photometric height map with the verdict of its data, and its misfit unless it cannot be traced."""
+    """Return a height map with the verdict of its data, and its misfit unless it cannot be traced."""
     _check_finite(rec)
-    misfit = cache(partial(misfit_of_map, stack, rec, patches, trace))
+    misfit = cache(misfit_of)
     tested = judged(rec, stack, lambda: misfit().residuals)
     return tested, None if tested.chi_square is None else misfit()
 
@@ -124,8 +128,8 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], np.ndarray]]:
-    """Reconstruct by the fit; return what computes its residuals from a trace, too."""
+def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
+    """Reconstruct by the fit; return what computes its misfit from a trace, too."""
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.fit import with_posterior
     from helio_jax.inverse.instrument_report import describe_instrument
@@ -178,4 +182,4 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
             "assumed": found.assumed,
         },
     )
-    return rec, partial(residuals_of_state, fit.problem, fit.state)
+    return rec, partial(misfit_of_state, fit.problem, fit.state)

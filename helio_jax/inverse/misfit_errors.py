@@ -17,13 +17,17 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import slopes_of_normal
 from helio_jax.inverse.edges import neighbour_links, ranked
 from helio_jax.inverse.quality import MIN_REGION, floating
+from helio_jax.inverse.samples import add_common_modes
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.verdict import Misfit
+from helio_jax.inverse.verdict import Misfit, expected_chi_square
+from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import REASONS, Reconstruction
 
 MAX_SLOPE_ERROR = 4.0
 """Largest error of a slope, as in the prior of slopes (`linear`): a misfit of a facet that grazes the beam implies
 any."""
+SEED = 12
+"""Of the amplitudes of the common-mode error."""
 _FLOATING = REASONS.index("floating")
 
 
@@ -103,6 +107,19 @@ def path_error(
         return accumulated(errors, raster, known if known.any() else frame) / np.sqrt(3.0)
     found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0)
     return (found - np.median(found[frame])) / np.sqrt(3.0)
+
+
+def with_path_error(
+    rec: Reconstruction, misfit: Misfit, stack: MicrographStack, settings: ReconstructSettings
+) -> Reconstruction:
+    """Widen the error bars of a tested map by `path_error`, as a common-mode error, and flag what then floats."""
+    if rec.height_samples is None or rec.chi_square is None:
+        return rec
+    expected = expected_chi_square(stack, rec, rec.chi_square)
+    error = path_error(rec, misfit, Raster.of(stack), expected, settings)
+    samples = add_common_modes(rec.height_samples, [error], SEED)
+    std = np.sqrt(np.mean(samples**2, axis=0))
+    return flag_floating(rec.replace(height_samples=samples, height_std=std))
 
 
 def flag_floating(rec: Reconstruction) -> Reconstruction:

@@ -271,19 +271,19 @@ def enclosed_by(sharp: np.ndarray) -> np.ndarray:
     """Number the regions that sharp edges enclose, edges included; 0 elsewhere [y, x]."""
     room = np.pad(sharp, 4)
     closed = _filled(binary_closing(room, _SQUARE))[4:-4, 4:-4]
-    return _numbered(binary_opening(closed, _SQUARE), LEAST_PIXELS)
+    return numbered(binary_opening(closed, _SQUARE), LEAST_PIXELS)
 
 
 def segments(sharp: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Number the segments into which sharp edges part a region; the edges belong to the nearest; 0 outside [y, x]."""
-    number = _numbered(inside & ~sharp, LEAST_SEGMENT)
+    number = numbered(inside & ~sharp, LEAST_SEGMENT)
     if not number.any():
         return inside.astype(int)
     nearest = distance_transform_edt(number == 0, return_distances=False, return_indices=True)
     return np.where(inside, number[tuple(np.asarray(nearest))], 0)
 
 
-def _numbered(mask: np.ndarray, least: int) -> np.ndarray:
+def numbered(mask: np.ndarray, least: int) -> np.ndarray:
     """Number the connected parts of a mask that have so many pixels at least."""
     number = np.asarray(label(mask)[0], np.intp)  # type: ignore[index]  # SciPy's stubs take the result for a number
     is_large = np.bincount(number.ravel()) >= least

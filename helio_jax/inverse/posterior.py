@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
-from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import splu
 
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface, along
+from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.residuals import (
     SLOPE_STD,
     FixedTerms,
@@ -186,58 +186,6 @@ class Posterior:
         )
 
 
-@dataclass(frozen=True)
-class ModelError:
-    """What is assumed of errors in the predicted data: Gaussian averages of independent ones.
-
-    Attributes:
-        share: of the variance assumed of every datum [detector, y, x].
-        length: standard deviation of the Gaussian average along y and x, in pixels of the full raster.
-        stride: thinning of the raster; each datum then stands for stride x stride ones.
-    """
-
-    share: np.ndarray
-    length: tuple[float, float]
-    stride: int = 1
-
-    @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviation of the mean error of a datum's pixels, in deviations assumed of it [detector, y, x]."""
-        apart = np.subtract.outer(np.arange(self.stride), np.arange(self.stride))
-        agreement = [np.mean(np.exp(-0.25 * (apart / max(n, 1e-3)) ** 2)) for n in self.length]
-        return self.stride * np.sqrt(self.share * np.prod(agreement))
-
-    def average(self, white: np.ndarray) -> np.ndarray:
-        """Average white noise to errors of variance 1 that agree between neighbours; its own transpose."""
-        lengths = [n / self.stride for n in self.length]
-        smooth = gaussian_filter(white, lengths, axes=(-2, -1))
-        return smooth / np.prod([_averaged_std(n) for n in lengths])
-
-    def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
-        """Draw errors of the data [detector * y * x, sample], in deviations assumed of them.
-
-        `white` is the counts' noise; what the model has of the variance is taken from it.
-        """
-        n, shape = white.shape[1], self.share.shape
-        model = self.deviation * self.average(rng.standard_normal((n, *shape)))
-        counts = np.sqrt(1.0 - self.share) * white.T.reshape(n, *shape)
-        return (model + counts).reshape(n, -1).T
-
-    def covariance(self, influence: np.ndarray) -> np.ndarray:
-        """Compute the covariance of the sums of such errors weighted by `influence` [detector * y * x, parameter]."""
-        images = influence.T.reshape(-1, *self.share.shape)
-        model, counts = self.average(self.deviation * images), np.sqrt(1.0 - self.share) * images
-        both = np.concatenate([model, counts], axis=1)
-        return np.einsum("pkyx,qkyx->pq", both, both)
-
-
-def _averaged_std(length: float) -> float:
-    """Compute the standard deviation of white noise after a Gaussian average over `length` pixels."""
-    impulse = np.zeros(2 * int(4.0 * length + 1.0) + 1)
-    impulse[impulse.size // 2] = 1.0
-    return float(np.sqrt(np.sum(gaussian_filter(impulse, length) ** 2)))
-
-
 class _Rows:
     """Collects sparse rows block by block."""
 
@@ -343,17 +291,24 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
 
 
-def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: ModelError | None = None) -> Posterior:
+def sample_posterior(
+    linear: Linearised,
+    n_samples: int,
+    seed: int = 0,
+    error: ModelError | None = None,
+    edge_error: EdgeError | None = None,
+) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
-    With a `ModelError` the fit is still the one that takes all errors of the data for independent, as it was done; its
-    spread is that of data whose errors are not.
+    With a `ModelError` or an `EdgeError` the fit is still the one that takes all errors for independent, as it was
+    done; its spread is that of data, or edges, whose errors are not.
 
     Args:
-        linear: residuals at the fit, from `linearise`, those of the data first.
+        linear: residuals at the fit, from `linearise`, those of the data first, then those of the edges.
         n_samples: samples.
         seed: of the noise.
         error: what is assumed of the predicted data.
+        edge_error: what is assumed of the edges between pixels.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
@@ -365,13 +320,13 @@ def sample_posterior(linear: Linearised, n_samples: int, seed: int = 0, error: M
     influence = (jc - linear.apply(answer)) @ np.linalg.inv(jc.T @ jc - border.T @ answer)
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((jc.shape[0], n_samples))
-    n_data = 0
-    covariance = np.zeros((jc.shape[1],) * 2)
-    if error is not None:
-        n_data = error.share.size
-        noise[:n_data] = error.draw(rng, noise[:n_data])
-        covariance = error.covariance(influence[:n_data])
-    covariance = covariance + influence[n_data:].T @ influence[n_data:]
+    n_done, covariance = 0, np.zeros((jc.shape[1],) * 2)
+    for assumed in (error, edge_error):
+        if assumed is not None:
+            rows = slice(n_done, n_done + assumed.share.size)
+            noise[rows], n_done = assumed.draw(rng, noise[rows]), rows.stop
+            covariance = covariance + assumed.covariance(influence[rows])
+    covariance = covariance + influence[n_done:].T @ influence[n_done:]
     instrument = influence.T @ noise
     surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731

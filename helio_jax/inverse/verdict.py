@@ -35,10 +35,32 @@ MULTIPLE_ERROR = 0.1
 """Assumed relative error of the traced multiple scattering: of paths, raster and what lies outside the image."""
 MODEL_ERROR = 0.01
 """Assumed relative error of the traced signal: of facets as large as a pixel. Counts without noise need it."""
+EDGE_PLACE = 12.0**-0.5
+"""Standard deviation of the place of an edge of the image, anywhere within a pixel [pixels]."""
+_NOISE = 2.0
+"""Second differences of the data up to so many of their standard deviations are taken for noise."""
 _CONTRADICTED = REASONS.index("contradicts the data")
 
 Trace = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3], instrument) -> masks and multiple scattering, both traced."""
+
+
+def edge_std(data: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Compute the standard deviation of data by where within its pixel an edge of the image lies [detector, y, x].
+
+    A map that is known from pixel to pixel shows masks and walls up to half a pixel off. The size of an edge is the
+    largest second difference of the data in four directions, beyond that of noise: a smooth image has none.
+
+    Args:
+        data: NaN where not observed [detector, y, x].
+        variance: of the data [detector, y, x].
+    """
+    ny, nx = data.shape[1:]
+    room = np.pad(data, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    beside = lambda dy, dx: room[:, 1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx]  # noqa: E731
+    ways = (0, 1), (1, 0), (1, 1), (1, -1)
+    change = np.max([np.abs(np.nan_to_num(beside(*w) - 2.0 * data + beside(-w[0], -w[1]))) for w in ways], axis=0)
+    return EDGE_PLACE * np.maximum(change - _NOISE * np.sqrt(6.0 * np.nan_to_num(variance)), 0.0)
 
 
 def data_std(variance: np.ndarray, model: np.ndarray, corrections: Corrections, albedo: np.ndarray) -> np.ndarray:
@@ -109,22 +131,36 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPa
     return Misfit(model - signal, data_std(variance, model, c, albedo), albedo * phi, normals)
 
 
-def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
-    """Compute (model - data) / standard deviation of a fit's surface, albedo and read-out [detector, y, x].
-
-    Data that were not observed have none: 0.
+def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> Misfit:
+    """Trace a fit's surface and compare it, with the fit's albedo and read-out, with the data.
 
     Raises:
         PredictionError: the surface is too rough or steep to be traced.
     """
-    from helio_jax.inverse.state import predict_corrections
+    from helio_jax.inverse.state import moved_optics, predict_corrections
     from helio_jax.inverse.steps import expected
 
     state = predict_corrections(problem, state, trace)
     albedo = problem.patches_at(state.parameters).albedo
     model = expected(problem, state, is_noisy=True)
     std = data_std(problem.variance, model, state.held.corrections, albedo)
-    return np.where(problem.is_observed, (model - problem.data) / std, 0.0)
+    optics = moved_optics(problem.optics, problem.moves(state.parameters))
+    gain = np.exp(problem.priors.gain * state.parameters.log_gain)[:, None, None, None]
+    phi = gain * albedo * form_factor(optics, state.surface.height)
+    return Misfit(
+        np.where(problem.is_observed, model - problem.signal, np.nan), std, phi, state.surface.normals(problem.shift)
+    )
+
+
+def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
+    """Compute (model - data) / standard deviation of a fit's surface, albedo and read-out [detector, y, x].
+
+    To rank explanations: edges of the image count as known to a pixel only (`edge_std`), or the places of the edges
+    would decide, of which no map on this raster knows more. Data that were not observed have none: 0. Raises as
+    `misfit_of_state`.
+    """
+    found = misfit_of_state(problem, state, trace)
+    return np.nan_to_num(found.difference / np.hypot(found.std, edge_std(problem.signal, problem.variance)))
 
 
 def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:

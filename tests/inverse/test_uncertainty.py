@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.correlated_errors import ModelError
 from helio_jax.inverse.posterior import (
     Linearised,
-    ModelError,
     exact_height_covariance,
     linearise,
     sample_posterior,

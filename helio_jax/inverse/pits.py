@@ -1,0 +1,131 @@
+"""Pits in a flat substrate: their outlines, and their levels by trial.
+
+A pit masks nothing of the substrate around it, which looks as if there were no pit. So the pixels that the flat
+substrate does not explain are the pit, to the pixel; a pit in a pit is what the flat floor of the outer one does not
+explain. The level of a floor is the one whose masks, wall and multiple scattering explain the micrographs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import binary_closing, binary_opening, distance_transform_edt, median_filter
+from scipy.optimize import minimize_scalar
+
+from helio_jax.errors import PredictionError
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.levels import GAIN, at_level
+from helio_jax.inverse.objects import LEAST_PIXELS, numbered
+from helio_jax.inverse.quality import squares
+
+LIMIT = 3.0
+"""Mean square residual, over detectors, above which a flat floor does not explain a pixel."""
+LEAST_FLOOR = 0.15
+"""Least share of a pit's pixels that show its floor: a wall alone has no level."""
+MOST_PITS = 8
+"""More pits are not looked for."""
+DEPTHS = 0.0625, 0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0
+"""Depths that are tried, in widths of the pit ..."""
+REFINEMENTS = 6
+"""... and how many more around the best one."""
+_SQUARE = np.ones((3, 3))
+
+
+class Pits(NamedTuple):
+    """Flat floors below a flat substrate at height 0.
+
+    Attributes:
+        surface: with floors and the walls that the beam sees.
+        number: of every pixel's pit, 0: the substrate [y, x].
+        misfit: of the data expected on it.
+    """
+
+    surface: Surface
+    number: np.ndarray
+    misfit: float
+
+
+@dataclass(frozen=True)
+class PitSearch:
+    """Outlines and levels of pits by trial.
+
+    Attributes:
+        residuals: of a surface, (model - data) / standard deviation [detector, y, x].
+        pitch: dy, dx, um.
+        beam_shift: `Instrument.beam_shift`.
+        report: called with what is tried next.
+    """
+
+    residuals: Callable[[Surface], np.ndarray]
+    pitch: tuple[float, float]
+    beam_shift: tuple[float, float]
+    report: Callable[[str], None] = lambda said: None
+
+    def find(self, shape: tuple[int, int]) -> Pits | None:
+        """Find the pits of an image; None where a flat substrate explains it, or no pit does better."""
+        flat = Surface(*np.zeros((3, *shape)))
+        pits = Pits(flat, np.zeros(shape, int), self.misfit(flat))
+        places = [(inside, 0.0) for inside in self.outlines(flat, np.ones(shape, bool))]
+        for _ in range(MOST_PITS):
+            if not places:
+                break
+            inside, above = places.pop(0)
+            deeper, level = self.sunk(pits, inside, above)
+            if deeper.misfit < pits.misfit - GAIN:
+                pits = deeper
+                inner = self.outlines(pits.surface, floor_of(pits.surface, inside))
+                places = [(within, level) for within in inner] + places
+        return pits if pits.number.any() else None
+
+    def misfit(self, surface: Surface) -> float:
+        """Half the chi-square of the data expected on a surface; infinite where nothing can be predicted."""
+        try:
+            return 0.5 * float(np.sum(squares(self.residuals(surface))))
+        except PredictionError:
+            return np.inf
+
+    def outlines(self, surface: Surface, where: np.ndarray) -> list[np.ndarray]:
+        """Find the regions of some pixels that a surface does not explain, the largest first [y, x]."""
+        is_unexplained = where & (median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT)
+        closed = binary_closing(np.pad(binary_opening(is_unexplained, np.ones((2, 2))), 1), _SQUARE)[1:-1, 1:-1]
+        number = numbered(closed, LEAST_PIXELS)
+        return [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]
+
+    def sunk(self, pits: Pits, inside: np.ndarray, above: float) -> tuple[Pits, float]:
+        """Sink a region below the floor around it, to the level that explains the data best.
+
+        Args:
+            pits: found so far.
+            inside: the region [y, x].
+            above: height of the floor around it, um.
+
+        Returns:
+            The pits, and the level of the region, um; one whose floor the beam does not see is none.
+        """
+        beam = self.beam_shift if any(self.beam_shift) else None
+        width = 2.0 * float(np.max(np.asarray(distance_transform_edt(np.pad(inside, 1), sampling=self.pitch))))
+
+        def trial(depth: float) -> Surface:
+            return at_level(inside, pits.surface, -depth, above, self.pitch, beam)
+
+        def misfit(depth: float) -> float:
+            self.report(f"trying a pit of {inside.sum()} pixels, {depth - above:.0f} um deep")
+            surface = trial(depth)
+            is_floor_seen = np.sum(floor_of(surface, inside)) >= max(LEAST_PIXELS, LEAST_FLOOR * inside.sum())
+            return self.misfit(surface) if is_floor_seen else np.inf
+
+        depths = [width * share for share in DEPTHS]
+        tried = [misfit(depth) for depth in depths]
+        best = int(np.argmin(tried))
+        bounds = depths[max(best - 1, 0)], depths[min(best + 1, len(depths) - 1)]
+        found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": REFINEMENTS})
+        value, depth = min((tried[best], depths[best]), (float(found.fun), float(found.x)))
+        number = np.where(inside, pits.number.max() + 1, pits.number)
+        return Pits(trial(depth), number, value), above - depth
+
+
+def floor_of(surface: Surface, inside: np.ndarray) -> np.ndarray:
+    """Mark the pixels of a region at its lowest level: its flat floor, without the walls that the beam sees [y, x]."""
+    lowest = surface.height[inside].min()
+    return inside & (surface.height <= lowest + 1e-6 * abs(lowest))

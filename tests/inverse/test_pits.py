@@ -1,0 +1,85 @@
+"""Pits in a flat substrate: outlines from what flat floors do not explain, levels by trial."""
+
+import numpy as np
+import pytest
+
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.correlated_errors import EdgeError
+from helio_jax.inverse.edges import find_edges
+from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of
+from helio_jax.inverse.verdict import EDGE_PLACE, edge_std
+
+SHAPE = 40, 50
+Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]
+OUTER = (np.abs(X - 25) < 11) & (np.abs(Y - 20) < 9)
+INNER = (np.abs(X - 27) < 5) & (np.abs(Y - 21) < 4)
+PITCH = 10.0
+
+
+def found(depths, beam_shift=(0.0, 0.0)):
+    """Search pits where each pixel's one residual is its height error over 30 um, beyond 0.9."""
+    truth = -depths[0] * OUTER - (depths[1] - depths[0]) * INNER
+    search = PitSearch(lambda s: (0.9 + np.abs(s.height - truth) / 30.0)[None], (PITCH, PITCH), beam_shift)
+    return truth, search.find(SHAPE)
+
+
+def test_a_pit_in_a_pit_has_two_outlines_and_two_levels():
+    """Both floors to 5 % of their depth, nothing beside them. Rejects one level for all."""
+    truth, pits = found((80.0, 130.0))
+    assert pits is not None and pits.number.max() >= 2
+    assert np.sum((pits.number > 0) != OUTER) <= 4  # corners
+    assert np.sum(np.abs(pits.surface.height - truth) > 0.05 * 130.0) <= 8
+
+
+def test_no_pit_where_the_substrate_explains_all():
+    assert found((0.0, 0.0))[1] is None
+
+
+def test_outlines_need_several_pixels():
+    """Single pixels, however wrong, are noise; a block of 4 x 5 is a region, to the pixel."""
+    wrong = np.zeros((2, *SHAPE))
+    wrong[:, 5, 5] = 100.0
+    wrong[0, 20:24, 30:35] = 2.0 * np.sqrt(LIMIT)
+    search = PitSearch(lambda _: wrong, (PITCH, PITCH), (0.0, 0.0))
+    regions = search.outlines(Surface(*np.zeros((3, *SHAPE))), np.ones(SHAPE, bool))
+    assert len(regions) == 1
+    rows, columns = np.nonzero(regions[0])
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 23, 30, 34)
+
+
+def test_a_wall_without_a_floor_has_no_level():
+    """Deeper than the beam reaches all levels are one wall: at 30 deg no deeper floor is accepted than one in view."""
+    _, pits = found((1e4, 1e4), (np.tan(np.radians(30.0)), 0.0))
+    assert pits is None or np.sum(floor_of(pits.surface, OUTER)) >= 0.15 * OUTER.sum()
+
+
+def test_edges_are_known_to_a_pixel():
+    """A step of 100 has a deviation of 100 / sqrt(12) at its two pixels, a ramp and noise (less than 3 %) have none."""
+    step = np.where(X < 25, 0.0, 100.0)[None]
+    assert edge_std(step, np.zeros((1, *SHAPE)))[0, 20, 24:26] == pytest.approx(EDGE_PLACE * 100.0)
+    assert np.all(edge_std(step, np.zeros((1, *SHAPE)))[0, :, :23] == 0.0)
+    assert np.all(edge_std(5.0 * X[None], np.zeros((1, *SHAPE))) < 1e-9 + 5.0 * EDGE_PLACE * ((X == 0) | (X == 49)))
+    noise = np.random.default_rng(1).normal(0.0, 10.0, (1, *SHAPE))
+    assert np.sqrt(np.mean(edge_std(noise, np.full((1, *SHAPE), 100.0)) ** 2)) < 0.3 * 10.0
+
+
+def test_errors_of_a_straight_rim_do_not_average():
+    """The mean over a straight rim of 30 edges has the deviation of one edge, over independent edges 1 / sqrt(30).
+
+    4000 draws leave 2.2 % of a variance. Rejects independent edges (a variance too low by 30).
+    """
+    height = np.maximum(X[:30] - 24.5, 0.0) * PITCH
+    slope = np.gradient(height, PITCH, axis=1)
+    surface = Surface(height, slope, 0.0 * slope)
+    edges = find_edges(height, slope, PITCH, 1, 0.01, 3.0), find_edges(height, 0.0 * slope, PITCH, 0, 0.01, 3.0)
+    error = EdgeError.of(surface, *edges)
+    on_rim = error.run > 0
+    assert on_rim.any() and len(np.unique(error.run[on_rim])) == on_rim.sum() // 30
+    rng = np.random.default_rng(2)
+    drawn = error.draw(rng, rng.standard_normal((error.run.size, 4000)))
+    first = error.run == error.run[on_rim][0]
+    share = float(error.share[first][0])
+    assert drawn[first].mean(0).var() == pytest.approx(share + (1.0 - share) / 30.0, rel=0.12)
+    assert drawn[~on_rim].var() == pytest.approx(1.0, rel=0.02)
+    influence = np.stack([first / 30.0, np.ones(first.size)], 1)
+    assert error.covariance(influence)[0, 0] == pytest.approx(share + (1.0 - share) / 30.0, rel=1e-9)
