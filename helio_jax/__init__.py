@@ -151,7 +151,14 @@ scores/               errors against something known
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
   sample_grid         heights of an oblique beam on a regular grid of the sample frame
-  roughness           ISO 25178 parameters, profiles, steps
+  sample_surface      the surface that is measured: regular grid of the sample frame, errors, flags
+  areal_filters       Gaussian S-filter and L-filter, F-operator (ISO 16610-61)
+  texture             hx.measure_texture: areal surface texture of ISO 25178, with errors
+  texture_parameters  height and hybrid parameters; all of them together
+  material_ratio      areal material ratio curve: Sk, Spk, Svk, Smr1, Smr2
+  autocorrelation     Sal, Str
+  profiles            hx.measure_profile: heights along a line
+  step_height         hx.measure_step_height: ISO 5436-1 type A, single steps
   spectrum            power spectra of regions
   ripple              wavelength and amplitude of a ripple
   regions             regions given by corners
@@ -280,6 +287,9 @@ _HOME = {
     "fisher": "inverse.fisher",
     "posterior_std": "inverse.fisher",
     "find_steps": "inverse.mask_steps",
+    "measure_profile": "measure.profiles",
+    "measure_step_height": "measure.step_height",
+    "measure_texture": "measure.texture",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",
