@@ -95,7 +95,7 @@ def core(quantile, low):
 def test_core_of_gaussian_heights():
     """Gaussian heights: the core lies from 30 to 70 %; Spk and Svk from the tails' closed form.
 
-    Catches the secant for the line (Sk 2.62 Sq in place of 2.56), and areas that are not doubled.
+    Catches the secant for the line (Sk 2.62 Sq in place of 2.57), and areas that are not doubled.
     """
     n, sigma = 400_000, 3.0
     z = sigma * stats.norm.ppf((np.arange(n) + 0.5) / n)
