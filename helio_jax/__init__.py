@@ -21,7 +21,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
   settings            base class of all settings tables
-  drawable            plot(), short repr and notebook view of the records
+  drawable            plot(), short repr, notebook view and to_xarray() of the records
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated
@@ -208,6 +208,7 @@ formats/              the only door to files
   tables              what the .mat tables hold
   export              writes files of other programs; the suffix selects the format
   export_formats      the table of these formats: what each holds
+  as_xarray           records as xarray datasets
   layers              named arrays on one raster, which every writer takes
   write_arrays        MAT, NPZ, CSV
   write_gwyddion      GWY, GSF

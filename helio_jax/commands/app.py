@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from helio_jax import __version__
-from helio_jax.commands.door import Command, Reads, Writes
+from helio_jax.commands.door import Command, Reads, Writes, with_force
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -19,7 +19,8 @@ class _Helio(typer.Typer):
     """An application whose commands are all checked by `door.Command`."""
 
     def command(self, name: str | None = None, *, cls: Any = Command, **options: Any) -> Any:
-        return super().command(name, cls=cls, **options)
+        register = super().command(name, cls=cls, **options)
+        return lambda function: register(with_force(function))
 
 
 app = _Helio(
@@ -73,7 +74,6 @@ H5WithPicture = Annotated[
 Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FILE.show.png beside the file.")]
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]

@@ -1,16 +1,18 @@
 """Checks of every command's outputs against its inputs before any work.
 
 A command's annotations mark which files it reads and which it writes. `Command` refuses an output that is an input, two
-outputs in one file, and an output that could not be written. Imports nothing heavy, so that `helio --help` is fast.
+outputs in one file, an output that could not be written, and one that exists, unless `--force` is given; every command
+that writes has that option. Imports nothing heavy, so that `helio --help` is fast.
 """
 
+import functools
 import inspect
 import itertools
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -38,12 +40,14 @@ class Writes:
         suffixes: that it may have, lower case; none: any.
         beside: suffixes of further files that are written beside it.
         within: names of the files that are written in it: it is a folder.
+        keeps: the command adds to what is there, or checks itself whether it is its own.
     """
 
     what: str = "a file"
     suffixes: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     within: tuple[str, ...] | None = None
+    keeps: bool = False
 
     def check_suffix(self, label: str, path: Path) -> None:
         """Refuse another suffix than those known (exit code 2)."""
@@ -69,6 +73,46 @@ def marks_of(function: Any) -> dict[str, Reads | Writes]:
     return {name: mark for name, mark in marks if isinstance(mark, (Reads, Writes))}
 
 
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+
+
+def with_force(function: Any) -> Any:
+    """Add the option `--force` to a command that writes, unless it has the option itself; `Command` acts on it."""
+    signature = inspect.signature(function)
+    has_outputs = any(isinstance(m, Writes) and not m.keeps for m in marks_of(function).values())
+    if "force" in signature.parameters or not has_outputs:
+        return function
+
+    @functools.wraps(function)
+    def command(*args: Any, force: bool = False, **given: Any) -> Any:
+        return function(*args, **given)
+
+    added = inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Force)
+    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore
+    command.__annotations__ = {**function.__annotations__, "force": Force}
+    return command
+
+
+def keep_existing(files: Iterable[tuple[str, Path]]) -> None:
+    """Refuse to replace files that exist; a run that is unfinished goes on, which replaces nothing.
+
+    Args:
+        files: what names each, and its path.
+    """
+    from helio_jax.errors import SceneError
+    from helio_jax.formats.parts import Parts
+    from helio_jax.formats.safe import check_new
+
+    files = list(files)
+    if any(Parts(path).exist for _, path in files):
+        return
+    for label, path in files:
+        try:
+            check_new(path)
+        except SceneError as e:
+            raise SceneError(f"{label}: {e}") from None
+
+
 class Command(TyperCommand):
     """A command of helio; commas between the numbers of an option are refused: they are separated by spaces."""
 
@@ -91,7 +135,8 @@ class Command(TyperCommand):
         marks = marks_of(self.callback)
         for label, mark, path in self._given(ctx, marks, Writes):
             mark.check_suffix(label, path)
-        outputs = [file for label, mark, path in self._given(ctx, marks, Writes) for file in mark.files(label, path)]
+        written = [(mark, mark.files(label, path)) for label, mark, path in self._given(ctx, marks, Writes)]
+        outputs = [file for _, files in written for file in files]
         if outputs:
             from helio_jax.formats.safe import check_outputs
             from helio_jax.workflows.scene_file import files_read
@@ -101,6 +146,8 @@ class Command(TyperCommand):
                 has_files = mark.names_files and path.suffix.lower() not in HDF5_SUFFIXES
                 inputs += files_read(path, label) if has_files else [(label, path)]
             check_outputs(inputs, outputs)
+            if not ctx.params.get("force"):
+                keep_existing(file for mark, files in written if not mark.keeps for file in files)
         return super().invoke(ctx)
 
     def _given(self, ctx: Any, marks: dict[str, Any], kind: type) -> Iterator[tuple[str, Any, Path]]:

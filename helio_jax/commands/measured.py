@@ -169,7 +169,9 @@ def pick(
         Path, typer.Argument(help="Scans of one sample, rotated between them (.h5 of helio import)."), Reads()
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Control points (CSV); those in the file are kept."), Writes()
+        Path,
+        typer.Option("--output", "-o", help="Control points (CSV); those in the file are kept."),
+        Writes(keeps=True),
     ],
 ) -> None:
     """Open a window to click the same points in all scans; every click is saved."""

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from helio_jax.commands.app import TOML, AsJson, Force, app
-from helio_jax.commands.door import Reads, Writes
+from helio_jax.commands.app import TOML, AsJson, app
+from helio_jax.commands.door import Force, Reads, Writes
 from helio_jax.workflows.shipped import Kind, list_shipped
 
 

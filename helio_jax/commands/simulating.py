@@ -31,7 +31,7 @@ from helio_jax.commands.app import (
     tell_micrographs,
     warn_if_contradicted,
 )
-from helio_jax.commands.door import Reads, Writes
+from helio_jax.commands.door import Force, Reads, Writes, keep_existing
 
 RUN = ("micrographs.h5", "height.h5", "scores.json", "report.html", "report.png")
 """What `run` writes in its folder (pipeline.py)."""
@@ -54,13 +54,17 @@ def run(
     restart: Restart = False,
     as_json: AsJson = False,
     strict: Strict = False,
+    force: Force = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
-    from helio_jax.workflows.pipeline import Executor
+    from helio_jax.workflows.pipeline import Executor, default_folder
     from helio_jax.workflows.pipeline import run as run_scene
+    from helio_jax.workflows.scene_file import load_scene
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
     executor = Executor(workers, processes, scheduler)
+    if output is None and not force:
+        keep_existing(("-o", default_folder(load_scene(scene, overrides)) / name) for name in RUN)
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
@@ -161,7 +165,9 @@ def study(
         Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml"), Reads()
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for the points and their index."), Writes(within=STUDY)
+        Path,
+        typer.Option("--output", "-o", help="Folder for the points and their index."),
+        Writes(within=STUDY, keeps=True),
     ],
     go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
     workers: Workers = None,
