@@ -208,6 +208,7 @@ formats/              the only door to files
   tables              what the .mat tables hold
   export              writes files of other programs; the suffix selects the format
   export_formats      the table of these formats: what each holds
+  history             what of a file's history can be repeated
   as_xarray           records as xarray datasets
   layers              named arrays on one raster, which every writer takes
   write_arrays        MAT, NPZ, CSV
@@ -228,6 +229,7 @@ workflows/            what joins the stages
   scene_file          scene files: TOML -> Scene
   shipped             scenes and instruments that come with the program, by name
   copy_scene          copies of those
+  rerun               repeats what made a file
   starting_file       starting files of a scene and an instrument
   merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
@@ -253,7 +255,7 @@ workflows/            what joins the stages
 commands/             the command line; no logic of its own
   app                 shared options and messages
   door                checks outputs against inputs before any work
-  simulating          run, simulate, rays, resume, study, spot, plate
+  simulating          run, simulate, rays, resume, rerun, study, spot, plate
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient

@@ -1,4 +1,4 @@
-"""Commands around the tracer: run, simulate, rays, resume, study, spot, plate. They parse, call and print only."""
+"""Commands around the tracer: run, simulate, rays, resume, rerun, study, spot, plate. They only parse, call, print."""
 
 import json
 import math
@@ -11,6 +11,7 @@ import typer
 from helio_jax.commands.app import (
     COLUMNS,
     FIGURE,
+    HDF5,
     AsJson,
     Bar,
     H5WithPicture,
@@ -157,6 +158,29 @@ def resume(
         return
     for file in resume_run(path, stage=Bar, say=say):
         print(file)
+
+
+@app.command()
+def rerun(
+    file: Annotated[Path, typer.Argument(help="Micrographs or heights (.h5) of a simulated scene."), Reads()],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the repetition, too (.h5)."), HDF5
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat what made a file, from its history: simulate, reconstruct; say whether the result is the same."""
+    from helio_jax import __version__, write
+    from helio_jax.workflows.rerun import rerun as repeat
+
+    done = repeat(file, say)
+    if output:
+        write(done.found, output)
+    if as_json:
+        print(json.dumps(done.as_dict()))
+        return
+    unit = "um" if done.what == "height" else "counts"
+    how = "equal bit for bit" if done.is_equal else f"not equal: the largest difference is {done.largest:.3g} {unit}"
+    print(f"{file}: {done.what} of the repetition {how}; made by version {done.version}, repeated by {__version__}")
 
 
 @app.command()
