@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from helio_jax import __version__
-from helio_jax.commands.door import Command, Reads, Writes, with_force
+from helio_jax.commands.door import Command, Reads, Writes, is_quiet, with_common_options
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -20,12 +20,12 @@ class _Helio(typer.Typer):
 
     def command(self, name: str | None = None, *, cls: Any = Command, **options: Any) -> Any:
         register = super().command(name, cls=cls, **options)
-        return lambda function: register(with_force(function))
+        return lambda function: register(with_common_options(function))
 
 
 app = _Helio(
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich alone takes 0.4 s to import
 )
@@ -86,7 +86,9 @@ Strict = Annotated[bool, typer.Option("--strict", help="Exit code 4 if the data 
 
 
 def say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)
+    """Print a message to stderr; with --quiet only a warning."""
+    if not is_quiet.get() or message.startswith("warning"):
+        print(message, file=sys.stderr, flush=True)
 
 
 def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
@@ -124,7 +126,7 @@ class Bar:
         say(label) if not sys.stderr.isatty() else None
 
     def __enter__(self) -> "Bar":
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not is_quiet.get():
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

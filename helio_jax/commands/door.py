@@ -1,8 +1,8 @@
 """Checks of every command's outputs against its inputs before any work.
 
 A command's annotations mark which files it reads and which it writes. `Command` refuses an output that is an input, two
-outputs in one file, an output that could not be written, and one that exists, unless `--force` is given; every command
-that writes has that option. Imports nothing heavy, so that `helio --help` is fast.
+outputs in one file, an output that could not be written, and one that exists, unless `--force` is given. Every command
+has `--quiet`, every command that writes `--force`. Imports nothing heavy, so that `helio --help` is fast.
 """
 
 import functools
@@ -10,6 +10,7 @@ import inspect
 import itertools
 import typing
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,20 +77,27 @@ def marks_of(function: Any) -> dict[str, Reads | Writes]:
 Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 
 
-def with_force(function: Any) -> Any:
-    """Add the option `--force` to a command that writes, unless it has the option itself; `Command` acts on it."""
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no messages, only results, warnings, errors.")]
+is_quiet: ContextVar[bool] = ContextVar("is_quiet", default=False)
+"""Whether the running command was given `--quiet`."""
+
+
+def with_common_options(function: Any) -> Any:
+    """Add `--quiet` to a command, and `--force` if it writes and has no such option itself; `Command` acts on both."""
     signature = inspect.signature(function)
     has_outputs = any(isinstance(m, Writes) and not m.keeps for m in marks_of(function).values())
-    if "force" in signature.parameters or not has_outputs:
-        return function
+    options = {"force": Force} if has_outputs and "force" not in signature.parameters else {}
+    options = options | {"quiet": Quiet}
 
     @functools.wraps(function)
-    def command(*args: Any, force: bool = False, **given: Any) -> Any:
-        return function(*args, **given)
+    def command(*args: Any, **given: Any) -> Any:
+        return function(*args, **{name: value for name, value in given.items() if name not in options})
 
-    added = inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Force)
-    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore
-    command.__annotations__ = {**function.__annotations__, "force": Force}
+    added = [
+        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in options.items()
+    ]
+    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore
+    command.__annotations__ = {**function.__annotations__, **options}
     return command
 
 
@@ -148,7 +156,11 @@ class Command(TyperCommand):
             check_outputs(inputs, outputs)
             if not ctx.params.get("force"):
                 keep_existing(file for mark, files in written if not mark.keeps for file in files)
-        return super().invoke(ctx)
+        token = is_quiet.set(bool(ctx.params.get("quiet")))
+        try:
+            return super().invoke(ctx)
+        finally:
+            is_quiet.reset(token)
 
     def _given(self, ctx: Any, marks: dict[str, Any], kind: type) -> Iterator[tuple[str, Any, Path]]:
         """Yield the paths given for marks of a kind: what names it (-o, STACK), the mark, the path."""
