@@ -4,6 +4,7 @@ Every command imports its dependencies itself, so that `helio --help` takes less
 JSON object with --json), stderr progress and messages. Exit codes: errors.py.
 """
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -105,16 +106,21 @@ def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
         say("warning: the data contradict this height map: do not trust it; the status above says where they differ")
 
 
-def tell_micrographs(stack: Any, output: Path, has_picture: bool) -> None:
-    """Print what was written in about ten lines, and draw it beside the file."""
+def tell_micrographs(stack: Any, output: Path, has_picture: bool, as_json: bool) -> None:
+    """Draw what was written beside the file, and print it in about ten lines or as JSON."""
     from helio_jax.figures.summary import summarise, text_lines
 
-    print("\n".join(text_lines(summarise(stack))))
-    if has_picture:
+    picture = output.with_suffix(PICTURE) if has_picture else None
+    if picture:
         from helio_jax.workflows.show import show
 
-        show(stack, output.with_suffix(PICTURE))
-        print(f"picture: {output.with_suffix(PICTURE)}")
+        show(stack, picture)
+    if as_json:
+        print(json.dumps(describe(output) | {"picture": picture and str(picture)}))
+        return
+    print("\n".join(text_lines(summarise(stack))))
+    if picture:
+        print(f"picture: {picture}")
 
 
 class Bar:
@@ -145,6 +151,21 @@ class Bar:
             self.bar.update(self.task, completed=done, total=total, description=f"{self.label} {note}".strip())
         elif note:
             say(f"  {self.label}: round {done + 1} of {total}, {note}")
+
+
+def print_result(as_json: bool, record: Any, *lines: str) -> None:
+    """Print a JSON-compatible record with --json, else lines, if there are any."""
+    if as_json:
+        print(json.dumps(record))
+    elif lines:
+        print("\n".join(lines))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Return what `helio info --json` prints of a file that was just written."""
+    from helio_jax.workflows.file_info import file_info
+
+    return file_info(path).as_dict()
 
 
 def print_table(rows: list[tuple[str, str, str]]) -> None:

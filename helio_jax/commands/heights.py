@@ -17,7 +17,9 @@ from helio_jax.commands.app import (
     Method,
     Strict,
     app,
+    describe,
     given_options,
+    print_result,
     print_table,
     set_options,
     warn_if_contradicted,
@@ -38,6 +40,7 @@ def reconstruct(
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
     strict: Strict = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
@@ -56,10 +59,13 @@ def reconstruct(
     write(result, output)
     if write_instrument:
         toml.write_instrument(result, write_instrument)
-    print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
-    for name, factor in result.provenance.get("sensitivity", {}).items():
-        print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
-    _print_instrument(result.provenance.get("instrument", {}))
+    if as_json:
+        print(json.dumps(describe(output) | {"is_contradicted": result.is_contradicted, "status": result.status}))
+    else:
+        print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
+        for name, factor in result.provenance.get("sensitivity", {}).items():
+            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+        _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
     warn_if_contradicted(result.is_contradicted, strict)
@@ -100,6 +106,7 @@ def report(
         Path | None, typer.Option(help="Scene file or height map to compare with."), Reads(names_files=True)
     ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
     from helio_jax.formats.hdf5 import read_height, read_stack
@@ -110,7 +117,7 @@ def report(
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
-    print(f"{output}\n{panel}")
+    print_result(as_json, {"report": str(output), "panel": str(panel)}, str(output), str(panel))
 
 
 @app.command()

@@ -27,6 +27,7 @@ from helio_jax.commands.app import (
     Workers,
     app,
     given_options,
+    print_result,
     print_table,
     say,
     tell_micrographs,
@@ -95,6 +96,7 @@ def simulate(
     scheduler: Scheduler = None,
     restart: Restart = False,
     picture: Picture = True,
+    as_json: AsJson = False,
 ) -> None:
     """Trace the micrographs of a scene and write them to an HDF5 file; repeat the command to resume it."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
@@ -106,13 +108,14 @@ def simulate(
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is None:
         return
-    print(f"{output}: {time.perf_counter() - start:.1f} s")
-    if "rays_per_pixel" in stack.provenance:
+    if not as_json:
+        print(f"{output}: {time.perf_counter() - start:.1f} s")
+    if "rays_per_pixel" in stack.provenance and not as_json:
         print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel on average")
         for one in stack.stacks:
             if (missed := one.provenance.get("n_above_target")) is not None:
                 print(f"  {one.name}: {missed} of {one.counts[0].size} pixels are above the target error")
-    tell_micrographs(stack, output, picture)
+    tell_micrographs(stack, output, picture, as_json)
 
 
 @app.command()
@@ -126,6 +129,7 @@ def rays(
     view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
     n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
     seed: Seed = None,
+    as_json: AsJson = False,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
     from helio_jax.formats.columns import write_columns
@@ -138,8 +142,11 @@ def rays(
     write_columns(output, atoms.columns())
     if directions:
         write_columns(directions, atoms.directions())
-    fates = ", ".join(f"{int((atoms.fate == i).sum())} {name}" for i, name in enumerate(FATES))
-    print(f"{output}: {atoms.fate.size} atoms: {fates}; mean order {atoms.order.mean():.3f}")
+    fates = {name: int((atoms.fate == i).sum()) for i, name in enumerate(FATES)}
+    mean_order = float(atoms.order.mean())
+    record = {"file": str(output), "atoms": int(atoms.fate.size), "fates": fates, "mean_order": mean_order}
+    shown = ", ".join(f"{n} {name}" for name, n in fates.items())
+    print_result(as_json, record, f"{output}: {atoms.fate.size} atoms: {shown}; mean order {mean_order:.3f}")
 
 
 @app.command()
@@ -147,6 +154,7 @@ def resume(
     path: Annotated[
         Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
     ],
+    as_json: AsJson = False,
 ) -> None:
     """Resume an interrupted or killed run or study; finished units are not traced again."""
     from helio_jax.workflows.pipeline import resume as resume_run
@@ -154,10 +162,10 @@ def resume(
     if (path / "study.json").is_file():
         from helio_jax.workflows.study import resume_study
 
-        print(resume_study(path, say=say))
-        return
-    for file in resume_run(path, stage=Bar, say=say):
-        print(file)
+        files = [str(resume_study(path, say=say))]
+    else:
+        files = [str(file) for file in resume_run(path, stage=Bar, say=say)]
+    print_result(as_json, {"files": files}, *files)
 
 
 @app.command()
@@ -198,13 +206,15 @@ def study(
     processes: Processes = False,
     shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, starting with the i-th.")] = None,
     scheduler: Scheduler = None,
+    as_json: AsJson = False,
 ) -> None:
     """Vary values of a scene: each point in its own folder, with an index of values and scores."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions
     from helio_jax.workflows.study import run_study
 
     options = SimulateOptions(executor=Executor(workers, processes, scheduler), shard=shard, say=say)
-    print(run_study(file, output, resume=go_on, options=options))
+    index = str(run_study(file, output, resume=go_on, options=options))
+    print_result(as_json, {"index": index}, index)
 
 
 @app.command()
@@ -248,6 +258,7 @@ def plate(
     channel_deg: Annotated[
         float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
     from helio_jax.formats.safe import atomic_path
@@ -259,5 +270,6 @@ def plate(
     with atomic_path(output) as part:
         about = f"made by helio plate from {instrument.name}, {thickness_um:g} um thick; units: um"
         part.write_text(found.obj(about), encoding="utf-8")
-    print(f"{output}: {len(found.faces)} triangles, {len(found.ends)} channels; in a scene:\n")
-    print(found.tables(output.name))
+    tables, n_faces, n_ends = found.tables(output.name), len(found.faces), len(found.ends)
+    record = {"file": str(output), "triangles": n_faces, "channels": n_ends, "tables": tables}
+    print_result(as_json, record, f"{output}: {n_faces} triangles, {n_ends} channels; in a scene:\n", tables)

@@ -1,5 +1,6 @@
-"""Habits of a command line: --quiet (results, warnings and errors stay), completion of words by the shell."""
+"""Habits of a command line: --quiet (results, warnings and errors stay), --json, completion of words by the shell."""
 
+import json
 import os
 import subprocess
 import sys
@@ -16,9 +17,40 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_it(name):
-    """Catches a command that is registered without the common options."""
-    assert "--quiet" in {option for param in COMMANDS[name].params for option in param.opts}
+def test_every_command_has_them(name):
+    """--quiet and --json; `schema` prints JSON anyway. Catches a command without the common options."""
+    options = {option for param in COMMANDS[name].params for option in param.opts}
+    assert "--quiet" in options and ("--json" in options or name == "schema")
+
+
+JSON_LINES = (
+    ("init instrument bshem.toml", "file"),
+    ("simulate step -o a.h5 --rays 8", "picture"),
+    ("export a.h5 -o a.mat", "not_written"),
+    ("import a.mat -o b.h5 --instrument bshem_wd4 --no-picture", "picture"),
+    ("reconstruct a.h5 -o height.h5 --method linear", "is_contradicted"),
+    ("report height.h5 -o r.html", "panel"),
+    ("show height.h5", "file"),
+    ("rays step -o rays.csv --pixel 3 4 --rays 32", "fates"),
+    ("resume a.h5", "files"),
+    ("rerun a.h5", "is_equal"),
+)
+
+
+def test_json_is_one_object(tmp_path, monkeypatch):
+    """stdout of each command with --json is one JSON object with its own key, and the files that it names exist.
+
+    Catches lines of text beside it, and numbers that JSON does not know.
+    """
+    monkeypatch.chdir(tmp_path)
+    for line, key in JSON_LINES:
+        done = CliRunner().invoke(app, [*line.split(), "--json", "--quiet"], catch_exceptions=False)
+        assert done.exit_code == 0, line
+        record = json.loads(done.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+        assert key in record, line
+        for name in ("file", "picture", "report", "panel"):
+            assert not isinstance(record.get(name), str) or (tmp_path / record[name]).is_file(), line
+    assert len(json.loads(CliRunner().invoke(app, ["cite", "--json"]).stdout)) > 1
 
 
 def test_messages_go_and_results_stay(tmp_path):
