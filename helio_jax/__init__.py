@@ -21,7 +21,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
   settings            base class of all settings tables
-  drawable            plot(), short repr and notebook view of the records
+  drawable            plot(), short repr, notebook view and to_xarray() of the records
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated
@@ -153,7 +153,14 @@ scores/               errors against something known
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
   sample_grid         heights of an oblique beam on a regular grid of the sample frame
-  roughness           ISO 25178 parameters, profiles, steps
+  sample_surface      the surface that is measured: regular grid of the sample frame, errors, flags
+  areal_filters       Gaussian S-filter and L-filter, F-operator (ISO 16610-61)
+  texture             hx.measure_texture: areal surface texture of ISO 25178, with errors
+  texture_parameters  height and hybrid parameters; all of them together
+  material_ratio      areal material ratio curve: Sk, Spk, Svk, Smr1, Smr2
+  autocorrelation     Sal, Str
+  profiles            hx.measure_profile: heights along a line
+  step_height         hx.measure_step_height: ISO 5436-1 type A, single steps
   spectrum            power spectra of regions
   ripple              wavelength and amplitude of a ripple
   regions             regions given by corners
@@ -203,6 +210,8 @@ formats/              the only door to files
   tables              what the .mat tables hold
   export              writes files of other programs; the suffix selects the format
   export_formats      the table of these formats: what each holds
+  history             what of a file's history can be repeated
+  as_xarray           records as xarray datasets
   layers              named arrays on one raster, which every writer takes
   write_arrays        MAT, NPZ, CSV
   write_gwyddion      GWY, GSF
@@ -222,6 +231,7 @@ workflows/            what joins the stages
   scene_file          scene files: TOML -> Scene
   shipped             scenes and instruments that come with the program, by name
   copy_scene          copies of those
+  rerun               repeats what made a file
   starting_file       starting files of a scene and an instrument
   merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
@@ -247,7 +257,7 @@ workflows/            what joins the stages
 commands/             the command line; no logic of its own
   app                 shared options and messages
   door                checks outputs against inputs before any work
-  simulating          run, simulate, rays, resume, study, spot, plate
+  simulating          run, simulate, rays, resume, rerun, study, spot, plate
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
@@ -282,6 +292,9 @@ _HOME = {
     "fisher": "inverse.fisher",
     "posterior_std": "inverse.fisher",
     "find_steps": "inverse.mask_steps",
+    "measure_profile": "measure.profiles",
+    "measure_step_height": "measure.step_height",
+    "measure_texture": "measure.texture",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

@@ -1,7 +1,7 @@
-"""What every record can do for a reader: `plot()`, a short `repr`, a thumbnail with a table in a notebook.
+"""What every record can do for a reader: `plot()`, a short `repr`, a notebook view; `to_xarray()` of those on a raster.
 
-Records lie below the figures and may not import them. The drawing functions are therefore found by name when they are
-first called, as the public names of the package are; no other module does so (tests/test_architecture.py).
+Records lie below figures and formats and may not import them. These functions are therefore found by name when they
+are first called, as the public names of the package are; no other module does so (tests/test_architecture.py).
 """
 
 import importlib
@@ -9,6 +9,7 @@ from typing import Any
 
 _DRAW = "helio_jax.workflows.show"
 _NOTEBOOK = "helio_jax.figures.notebook"
+_XARRAY = "helio_jax.formats.as_xarray"
 
 
 class Drawable:
@@ -35,3 +36,18 @@ class Drawable:
     def _repr_html_(self) -> str:
         """Return a thumbnail and a table, for notebooks."""
         return importlib.import_module(_NOTEBOOK).as_html(self)
+
+
+class OnRaster(Drawable):
+    """Base of records of arrays on one raster."""
+
+    def to_xarray(self, invalid: str = "nan") -> Any:
+        """Return the record as an xarray.Dataset; see `helio_jax.formats.as_xarray.to_xarray`.
+
+        Args:
+            invalid: what becomes of missing values: "nan", "keep" or "fill".
+
+        Raises:
+            MissingDependencyError: xarray is not installed: pip install 'helio-jax[xarray]'.
+        """
+        return importlib.import_module(_XARRAY).to_xarray(self, invalid)

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from helio_jax.arrays import check_axis, set_float_arrays
-from helio_jax.drawable import Drawable
+from helio_jax.drawable import OnRaster
 from helio_jax.errors import InputFileError
 
 
 @dataclass(frozen=True, repr=False)
-class HeightMap(Drawable):
+class HeightMap(OnRaster):
     """Heights on a regular x, y grid (checked when made).
 
     Attributes:

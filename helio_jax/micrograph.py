@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from helio_jax.arrays import as_float_array, as_json, check_axis, set_float_arrays
-from helio_jax.drawable import Drawable
+from helio_jax.drawable import Drawable, OnRaster
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 
@@ -59,7 +59,7 @@ class ScanAlignment:
 
 
 @dataclass(frozen=True, repr=False)
-class MicrographStack(Drawable):
+class MicrographStack(OnRaster):
     """Images of one scan, all detectors on one raster (frozen, checked when made).
 
     Attributes:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from helio_jax.arrays import check_axis, pitch, set_float_arrays
-from helio_jax.drawable import Drawable
+from helio_jax.drawable import OnRaster
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
 
@@ -38,7 +38,7 @@ def contradicted_share(reason: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, repr=False)
-class Reconstruction(Drawable):
+class Reconstruction(OnRaster):
     """Heights of the surface seen by the beam (frozen, checked when made).
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import AsJson, app
+from helio_jax.commands.app import AsJson, app, print_result
 from helio_jax.commands.door import Writes
 
 
@@ -30,18 +30,18 @@ def fetch_data(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder (default: the user's cache)."), Writes(within=())
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Download the paper's public micrographs (CC BY-SA), check their SHA-256 and print their paths."""
     from helio_jax.formats.fetch import CITATION, fetch_pack
 
-    for path in fetch_pack(output):
-        print(path)
-    print(CITATION)
+    files = [str(path) for path in fetch_pack(output)]
+    print_result(as_json, {"files": files, "citation": CITATION}, *files, CITATION)
 
 
 @app.command()
-def cite() -> None:
+def cite(as_json: AsJson = False) -> None:
     """Print the citations of this program and of the underlying papers."""
     from helio_jax.figures.report import CITATION
 
-    print("\n".join(CITATION))
+    print_result(as_json, list(CITATION), *CITATION)

@@ -4,6 +4,7 @@ Every command imports its dependencies itself, so that `helio --help` takes less
 JSON object with --json), stderr progress and messages. Exit codes: errors.py.
 """
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from helio_jax import __version__
-from helio_jax.commands.door import Command, Reads, Writes
+from helio_jax.commands.door import Command, Reads, Writes, is_quiet, with_common_options
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -19,12 +20,13 @@ class _Helio(typer.Typer):
     """An application whose commands are all checked by `door.Command`."""
 
     def command(self, name: str | None = None, *, cls: Any = Command, **options: Any) -> Any:
-        return super().command(name, cls=cls, **options)
+        register = super().command(name, cls=cls, **options)
+        return lambda function: register(with_common_options(function))
 
 
 app = _Helio(
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich alone takes 0.4 s to import
 )
@@ -73,7 +75,6 @@ H5WithPicture = Annotated[
 Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FILE.show.png beside the file.")]
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]
@@ -86,7 +87,9 @@ Strict = Annotated[bool, typer.Option("--strict", help="Exit code 4 if the data 
 
 
 def say(message: str) -> None:
-    print(message, file=sys.stderr, flush=True)
+    """Print a message to stderr; with --quiet only a warning."""
+    if not is_quiet.get() or message.startswith("warning"):
+        print(message, file=sys.stderr, flush=True)
 
 
 def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
@@ -103,16 +106,21 @@ def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
         say("warning: the data contradict this height map: do not trust it; the status above says where they differ")
 
 
-def tell_micrographs(stack: Any, output: Path, has_picture: bool) -> None:
-    """Print what was written in about ten lines, and draw it beside the file."""
+def tell_micrographs(stack: Any, output: Path, has_picture: bool, as_json: bool) -> None:
+    """Draw what was written beside the file, and print it in about ten lines or as JSON."""
     from helio_jax.figures.summary import summarise, text_lines
 
-    print("\n".join(text_lines(summarise(stack))))
-    if has_picture:
+    picture = output.with_suffix(PICTURE) if has_picture else None
+    if picture:
         from helio_jax.workflows.show import show
 
-        show(stack, output.with_suffix(PICTURE))
-        print(f"picture: {output.with_suffix(PICTURE)}")
+        show(stack, picture)
+    if as_json:
+        print(json.dumps(describe(output) | {"picture": picture and str(picture)}))
+        return
+    print("\n".join(text_lines(summarise(stack))))
+    if picture:
+        print(f"picture: {picture}")
 
 
 class Bar:
@@ -124,7 +132,7 @@ class Bar:
         say(label) if not sys.stderr.isatty() else None
 
     def __enter__(self) -> "Bar":
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not is_quiet.get():
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -143,6 +151,21 @@ class Bar:
             self.bar.update(self.task, completed=done, total=total, description=f"{self.label} {note}".strip())
         elif note:
             say(f"  {self.label}: round {done + 1} of {total}, {note}")
+
+
+def print_result(as_json: bool, record: Any, *lines: str) -> None:
+    """Print a JSON-compatible record with --json, else lines, if there are any."""
+    if as_json:
+        print(json.dumps(record))
+    elif lines:
+        print("\n".join(lines))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Return what `helio info --json` prints of a file that was just written."""
+    from helio_jax.workflows.file_info import file_info
+
+    return file_info(path).as_dict()
 
 
 def print_table(rows: list[tuple[str, str, str]]) -> None:

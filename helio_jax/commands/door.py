@@ -1,16 +1,19 @@
 """Checks of every command's outputs against its inputs before any work.
 
 A command's annotations mark which files it reads and which it writes. `Command` refuses an output that is an input, two
-outputs in one file, and an output that could not be written. Imports nothing heavy, so that `helio --help` is fast.
+outputs in one file, an output that could not be written, and one that exists, unless `--force` is given. Every command
+has `--quiet`, every command that writes `--force`. Imports nothing heavy, so that `helio --help` is fast.
 """
 
+import functools
 import inspect
 import itertools
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -38,12 +41,14 @@ class Writes:
         suffixes: that it may have, lower case; none: any.
         beside: suffixes of further files that are written beside it.
         within: names of the files that are written in it: it is a folder.
+        keeps: the command adds to what is there, or checks itself whether it is its own.
     """
 
     what: str = "a file"
     suffixes: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     within: tuple[str, ...] | None = None
+    keeps: bool = False
 
     def check_suffix(self, label: str, path: Path) -> None:
         """Refuse another suffix than those known (exit code 2)."""
@@ -69,6 +74,53 @@ def marks_of(function: Any) -> dict[str, Reads | Writes]:
     return {name: mark for name, mark in marks if isinstance(mark, (Reads, Writes))}
 
 
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+
+
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no messages, only results, warnings, errors.")]
+is_quiet: ContextVar[bool] = ContextVar("is_quiet", default=False)
+"""Whether the running command was given `--quiet`."""
+
+
+def with_common_options(function: Any) -> Any:
+    """Add `--quiet` to a command, and `--force` if it writes and has no such option itself; `Command` acts on both."""
+    signature = inspect.signature(function)
+    has_outputs = any(isinstance(m, Writes) and not m.keeps for m in marks_of(function).values())
+    options = {"force": Force} if has_outputs and "force" not in signature.parameters else {}
+    options = options | {"quiet": Quiet}
+
+    @functools.wraps(function)
+    def command(*args: Any, **given: Any) -> Any:
+        return function(*args, **{name: value for name, value in given.items() if name not in options})
+
+    added = [
+        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in options.items()
+    ]
+    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore
+    command.__annotations__ = {**function.__annotations__, **options}
+    return command
+
+
+def keep_existing(files: Iterable[tuple[str, Path]]) -> None:
+    """Refuse to replace files that exist; a run that is unfinished goes on, which replaces nothing.
+
+    Args:
+        files: what names each, and its path.
+    """
+    from helio_jax.errors import SceneError
+    from helio_jax.formats.parts import Parts
+    from helio_jax.formats.safe import check_new
+
+    files = list(files)
+    if any(Parts(path).exist for _, path in files):
+        return
+    for label, path in files:
+        try:
+            check_new(path)
+        except SceneError as e:
+            raise SceneError(f"{label}: {e}") from None
+
+
 class Command(TyperCommand):
     """A command of helio; commas between the numbers of an option are refused: they are separated by spaces."""
 
@@ -91,7 +143,8 @@ class Command(TyperCommand):
         marks = marks_of(self.callback)
         for label, mark, path in self._given(ctx, marks, Writes):
             mark.check_suffix(label, path)
-        outputs = [file for label, mark, path in self._given(ctx, marks, Writes) for file in mark.files(label, path)]
+        written = [(mark, mark.files(label, path)) for label, mark, path in self._given(ctx, marks, Writes)]
+        outputs = [file for _, files in written for file in files]
         if outputs:
             from helio_jax.formats.safe import check_outputs
             from helio_jax.workflows.scene_file import files_read
@@ -101,7 +154,13 @@ class Command(TyperCommand):
                 has_files = mark.names_files and path.suffix.lower() not in HDF5_SUFFIXES
                 inputs += files_read(path, label) if has_files else [(label, path)]
             check_outputs(inputs, outputs)
-        return super().invoke(ctx)
+            if not ctx.params.get("force"):
+                keep_existing(file for mark, files in written if not mark.keeps for file in files)
+        token = is_quiet.set(bool(ctx.params.get("quiet")))
+        try:
+            return super().invoke(ctx)
+        finally:
+            is_quiet.reset(token)
 
     def _given(self, ctx: Any, marks: dict[str, Any], kind: type) -> Iterator[tuple[str, Any, Path]]:
         """Yield the paths given for marks of a kind: what names it (-o, STACK), the mark, the path."""

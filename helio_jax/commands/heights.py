@@ -17,7 +17,9 @@ from helio_jax.commands.app import (
     Method,
     Strict,
     app,
+    describe,
     given_options,
+    print_result,
     print_table,
     set_options,
     warn_if_contradicted,
@@ -38,6 +40,7 @@ def reconstruct(
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
     strict: Strict = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
@@ -56,10 +59,13 @@ def reconstruct(
     write(result, output)
     if write_instrument:
         toml.write_instrument(result, write_instrument)
-    print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
-    for name, factor in result.provenance.get("sensitivity", {}).items():
-        print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
-    _print_instrument(result.provenance.get("instrument", {}))
+    if as_json:
+        print(json.dumps(describe(output) | {"is_contradicted": result.is_contradicted, "status": result.status}))
+    else:
+        print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
+        for name, factor in result.provenance.get("sensitivity", {}).items():
+            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+        _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
     warn_if_contradicted(result.is_contradicted, strict)
@@ -100,6 +106,7 @@ def report(
         Path | None, typer.Option(help="Scene file or height map to compare with."), Reads(names_files=True)
     ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
     from helio_jax.formats.hdf5 import read_height, read_stack
@@ -110,20 +117,38 @@ def report(
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
     panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
-    print(f"{output}\n{panel}")
+    print_result(as_json, {"report": str(output), "panel": str(panel)}, str(output), str(panel))
 
 
 @app.command()
 def measure(
     height: Annotated[Path, typer.Argument(help="Height map (.h5); with --steps micrographs (.h5)."), Reads()],
     facets: Annotated[bool, typer.Option("--facets", help="Planar facets: angles, sides, areas.")] = False,
-    profile: Annotated[tuple[float, float, float, float] | None, typer.Option(help="x0 y0 x1 y1 [um].")] = None,
-    step: Annotated[bool, typer.Option("--step", help="Also the height of the step that the profile crosses.")] = False,
-    roughness: Annotated[bool, typer.Option("--roughness", help="ISO 25178: Sa, Sq, Sz, Ssk, Sku, Sdq, Sdr.")] = False,
+    profile: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(help="x0 y0 x1 y1 in the sample frame [um]: a table of heights, s.d. and flags."),
+    ] = None,
+    step: Annotated[
+        bool, typer.Option("--step", help="Instead of the table: the single step that the profile crosses.")
+    ] = False,
+    step_height: Annotated[
+        bool,
+        typer.Option(
+            "--step-height", help="ISO 5436-1 type A: height of the ridge or groove that the profile crosses."
+        ),
+    ] = False,
+    step_edges: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="The edges of the ridge or groove along the profile [um] (default: found)."),
+    ] = None,
+    texture: Annotated[
+        bool,
+        typer.Option("--texture", "--roughness", help="ISO 25178: Sa, Sq, ..., Sdq, Sdr, Sk, ..., Sal, Str with s.d."),
+    ] = False,
     ripple: Annotated[bool, typer.Option("--ripple", help="The strongest ripple: wavelength, amplitude.")] = False,
     region: Annotated[
         list[str] | None,
-        typer.Option(help="'X,Y X,Y ...': corners in um, for roughness, ripple, cracks, edges (repeat)."),
+        typer.Option(help="'X,Y X,Y ...': corners in um, for texture, ripple, cracks, edges (repeat)."),
     ] = None,
     cracks: Annotated[bool, typer.Option("--cracks", help="Slits and grooves in the micrographs of --stack.")] = False,
     vertical_edges: Annotated[
@@ -139,27 +164,30 @@ def measure(
     ] = None,
     min_pixels: Annotated[int | None, typer.Option(help="Smallest facet.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE: max_turn_deg, along_axes, ... (repeat).")
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: l_filter_um, max_turn_deg, ... (repeat).")
     ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Facets, ripple, cracks or steps as a picture (.png, .pdf, .svg)."), FIGURE
     ] = None,
     table: Annotated[
-        Path | None, typer.Option(help="Cracks, vertical edges or steps, a row for each (.csv)."), CSV
+        Path | None, typer.Option(help="The profile, or cracks, vertical edges or steps, a row for each (.csv)."), CSV
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure facets, profiles, roughness, ripples, cracks, edges on a height map; steps on micrographs (--steps)."""
+    """Measure facets, profiles, texture, ripples, cracks, edges on a height map; steps on micrographs (--steps)."""
     from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.formats.safe import atomic_path
     from helio_jax.measure.crack_text import table as as_table
+    from helio_jax.measure.profiles import profile_table
     from helio_jax.workflows.measure import Wanted, measure_height_map
 
     wanted = Wanted(
         facets=facets,
         profile=profile,
         step=step,
-        roughness=roughness,
+        step_height=step_height,
+        edges=step_edges,
+        texture=texture,
         ripple=ripple,
         regions=tuple(region or ()),
         cracks=cracks,
@@ -176,7 +204,8 @@ def measure(
     else:
         images = read_stack(stack) if stack else None
         found, lines = measure_height_map(read_height(height), wanted, figure, images)
-        text = as_table(found)
+        text = profile_table(found["profile"]) if profile and not wanted.lines else as_table(found)
+        warn_if_contradicted(found["reconstructed"]["is_contradicted"], strict=False)
     if table:
         with atomic_path(table) as part:
             part.write_text(text, encoding="utf-8")

@@ -22,6 +22,7 @@ from helio_jax.commands.app import (
     SceneArg,
     app,
     given_options,
+    print_result,
     print_table,
     say,
     set_options,
@@ -47,6 +48,7 @@ def import_files(
         Reads(names_files=True),
     ] = None,
     picture: Picture = True,
+    as_json: AsJson = False,
 ) -> None:
     """Read measured or simulated micrographs of other programs and write them to an HDF5 file."""
     from helio_jax import MicrographSet, import_micrographs, write
@@ -56,8 +58,9 @@ def import_files(
     stacks = tuple(import_micrographs(path, given) for path in files)
     found = stacks[0] if len(stacks) == 1 else MicrographSet(stacks)
     write(found, output)
-    print(f"written to {output}")
-    tell_micrographs(found, output, picture)
+    if not as_json:
+        print(f"written to {output}")
+    tell_micrographs(found, output, picture, as_json)
 
 
 @app.command(epilog=f"\b\n{help_text()}\n\nWhat each file holds, frames and units: docs/exports.md.")
@@ -76,6 +79,7 @@ def export(
     grid: Annotated[
         float | None, typer.Option(help="Heights on a regular grid of this pitch in the sample frame [um].")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
     from helio_jax import Reconstruction, read
@@ -83,12 +87,11 @@ def export(
 
     found = read(file)
     left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore
-    print(output)
+    lines = [str(output), *(f"  not written: {what}" for what in left_out)]
     if isinstance(found, Reconstruction):
-        print(f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
+        lines.insert(1, f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
         warn_if_contradicted(found.is_contradicted, strict=False)
-    for what in left_out:
-        print(f"  not written: {what}")
+    print_result(as_json, {"file": str(output), "not_written": left_out}, *lines)
 
 
 @app.command()
@@ -169,8 +172,11 @@ def pick(
         Path, typer.Argument(help="Scans of one sample, rotated between them (.h5 of helio import)."), Reads()
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Control points (CSV); those in the file are kept."), Writes()
+        Path,
+        typer.Option("--output", "-o", help="Control points (CSV); those in the file are kept."),
+        Writes(keeps=True),
     ],
+    as_json: AsJson = False,
 ) -> None:
     """Open a window to click the same points in all scans; every click is saved."""
     from helio_jax.figures.pick import pick_points
@@ -178,7 +184,9 @@ def pick(
 
     before = read_points(output) if output.exists() else {}
     picks = pick_points(_read_set(scans), before, lambda found: write_points(output, found))
-    print(f"{output}: {sum(map(len, picks.values()))} picks in {len(picks)} scans")
+    n = sum(map(len, picks.values()))
+    record = {"file": str(output), "picks": n, "scans": len(picks)}
+    print_result(as_json, record, f"{output}: {n} picks in {len(picks)} scans")
 
 
 @app.command()

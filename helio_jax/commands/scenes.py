@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from helio_jax.commands.app import TOML, AsJson, Force, app
-from helio_jax.commands.door import Reads, Writes
+from helio_jax.commands.app import TOML, AsJson, app, print_result
+from helio_jax.commands.door import Force, Reads, Writes
 from helio_jax.workflows.shipped import Kind, list_shipped
 
 
@@ -55,13 +55,14 @@ def init(
         Path | None, typer.Argument(help="File to write (default: scene.toml or instrument.toml)."), TOML
     ] = None,
     force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a starting file of a scene or an instrument that works as it is, with every key and its meaning."""
     from helio_jax.workflows.starting_file import write_starting_file
 
     path = file or Path(f"{kind}.toml")
     write_starting_file(kind, path, force=force)
-    print(f"{path}: check it with helio validate {path}")
+    print_result(as_json, {"file": str(path)}, f"{path}: check it with helio validate {path}")
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Commands around the tracer: run, simulate, rays, resume, study, spot, plate. They parse, call and print only."""
+"""Commands around the tracer: run, simulate, rays, resume, rerun, study, spot, plate. They only parse, call, print."""
 
 import json
 import math
@@ -11,6 +11,7 @@ import typer
 from helio_jax.commands.app import (
     COLUMNS,
     FIGURE,
+    HDF5,
     AsJson,
     Bar,
     H5WithPicture,
@@ -26,12 +27,13 @@ from helio_jax.commands.app import (
     Workers,
     app,
     given_options,
+    print_result,
     print_table,
     say,
     tell_micrographs,
     warn_if_contradicted,
 )
-from helio_jax.commands.door import Reads, Writes
+from helio_jax.commands.door import Force, Reads, Writes, keep_existing
 
 RUN = ("micrographs.h5", "height.h5", "scores.json", "report.html", "report.png")
 """What `run` writes in its folder (pipeline.py)."""
@@ -54,13 +56,17 @@ def run(
     restart: Restart = False,
     as_json: AsJson = False,
     strict: Strict = False,
+    force: Force = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
-    from helio_jax.workflows.pipeline import Executor
+    from helio_jax.workflows.pipeline import Executor, default_folder
     from helio_jax.workflows.pipeline import run as run_scene
+    from helio_jax.workflows.scene_file import load_scene
 
     overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
     executor = Executor(workers, processes, scheduler)
+    if output is None and not force:
+        keep_existing(("-o", default_folder(load_scene(scene, overrides)) / name) for name in RUN)
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
@@ -90,6 +96,7 @@ def simulate(
     scheduler: Scheduler = None,
     restart: Restart = False,
     picture: Picture = True,
+    as_json: AsJson = False,
 ) -> None:
     """Trace the micrographs of a scene and write them to an HDF5 file; repeat the command to resume it."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
@@ -101,13 +108,14 @@ def simulate(
         stack = simulate_file(scene, output, overrides=overrides, options=options)
     if stack is None:
         return
-    print(f"{output}: {time.perf_counter() - start:.1f} s")
-    if "rays_per_pixel" in stack.provenance:
+    if not as_json:
+        print(f"{output}: {time.perf_counter() - start:.1f} s")
+    if "rays_per_pixel" in stack.provenance and not as_json:
         print(f"  {stack.provenance['rays_per_pixel']:.0f} rays per pixel on average")
         for one in stack.stacks:
             if (missed := one.provenance.get("n_above_target")) is not None:
                 print(f"  {one.name}: {missed} of {one.counts[0].size} pixels are above the target error")
-    tell_micrographs(stack, output, picture)
+    tell_micrographs(stack, output, picture, as_json)
 
 
 @app.command()
@@ -121,6 +129,7 @@ def rays(
     view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
     n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
     seed: Seed = None,
+    as_json: AsJson = False,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
     from helio_jax.formats.columns import write_columns
@@ -133,8 +142,11 @@ def rays(
     write_columns(output, atoms.columns())
     if directions:
         write_columns(directions, atoms.directions())
-    fates = ", ".join(f"{int((atoms.fate == i).sum())} {name}" for i, name in enumerate(FATES))
-    print(f"{output}: {atoms.fate.size} atoms: {fates}; mean order {atoms.order.mean():.3f}")
+    fates = {name: int((atoms.fate == i).sum()) for i, name in enumerate(FATES)}
+    mean_order = float(atoms.order.mean())
+    record = {"file": str(output), "atoms": int(atoms.fate.size), "fates": fates, "mean_order": mean_order}
+    shown = ", ".join(f"{n} {name}" for name, n in fates.items())
+    print_result(as_json, record, f"{output}: {atoms.fate.size} atoms: {shown}; mean order {mean_order:.3f}")
 
 
 @app.command()
@@ -142,6 +154,7 @@ def resume(
     path: Annotated[
         Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
     ],
+    as_json: AsJson = False,
 ) -> None:
     """Resume an interrupted or killed run or study; finished units are not traced again."""
     from helio_jax.workflows.pipeline import resume as resume_run
@@ -149,10 +162,33 @@ def resume(
     if (path / "study.json").is_file():
         from helio_jax.workflows.study import resume_study
 
-        print(resume_study(path, say=say))
+        files = [str(resume_study(path, say=say))]
+    else:
+        files = [str(file) for file in resume_run(path, stage=Bar, say=say)]
+    print_result(as_json, {"files": files}, *files)
+
+
+@app.command()
+def rerun(
+    file: Annotated[Path, typer.Argument(help="Micrographs or heights (.h5) of a simulated scene."), Reads()],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the repetition, too (.h5)."), HDF5
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat what made a file, from its history: simulate, reconstruct; say whether the result is the same."""
+    from helio_jax import __version__, write
+    from helio_jax.workflows.rerun import rerun as repeat
+
+    done = repeat(file, say)
+    if output:
+        write(done.found, output)
+    if as_json:
+        print(json.dumps(done.as_dict()))
         return
-    for file in resume_run(path, stage=Bar, say=say):
-        print(file)
+    unit = "um" if done.what == "height" else "counts"
+    how = "equal bit for bit" if done.is_equal else f"not equal: the largest difference is {done.largest:.3g} {unit}"
+    print(f"{file}: {done.what} of the repetition {how}; made by version {done.version}, repeated by {__version__}")
 
 
 @app.command()
@@ -161,20 +197,24 @@ def study(
         Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml"), Reads()
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for the points and their index."), Writes(within=STUDY)
+        Path,
+        typer.Option("--output", "-o", help="Folder for the points and their index."),
+        Writes(within=STUDY, keeps=True),
     ],
     go_on: Annotated[bool, typer.Option("--resume", help="Go on in a folder that holds this study.")] = False,
     workers: Workers = None,
     processes: Processes = False,
     shard: Annotated[str | None, typer.Option(help="i/N: run every N-th point, starting with the i-th.")] = None,
     scheduler: Scheduler = None,
+    as_json: AsJson = False,
 ) -> None:
     """Vary values of a scene: each point in its own folder, with an index of values and scores."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions
     from helio_jax.workflows.study import run_study
 
     options = SimulateOptions(executor=Executor(workers, processes, scheduler), shard=shard, say=say)
-    print(run_study(file, output, resume=go_on, options=options))
+    index = str(run_study(file, output, resume=go_on, options=options))
+    print_result(as_json, {"index": index}, index)
 
 
 @app.command()
@@ -218,6 +258,7 @@ def plate(
     channel_deg: Annotated[
         float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
     from helio_jax.formats.safe import atomic_path
@@ -229,5 +270,6 @@ def plate(
     with atomic_path(output) as part:
         about = f"made by helio plate from {instrument.name}, {thickness_um:g} um thick; units: um"
         part.write_text(found.obj(about), encoding="utf-8")
-    print(f"{output}: {len(found.faces)} triangles, {len(found.ends)} channels; in a scene:\n")
-    print(found.tables(output.name))
+    tables, n_faces, n_ends = found.tables(output.name), len(found.faces), len(found.ends)
+    record = {"file": str(output), "triangles": n_faces, "channels": n_ends, "tables": tables}
+    print_result(as_json, record, f"{output}: {n_faces} triangles, {n_ends} channels; in a scene:\n", tables)

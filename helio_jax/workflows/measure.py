@@ -1,4 +1,4 @@
-"""Measurements of `helio measure`: facets, profile, step, roughness, ripple, cracks, vertical edges.
+"""Measurements of `helio measure`: facets, profile, steps, texture, ripple, cracks, vertical edges.
 
 Each measurer returns a JSON-compatible record and lines of text; figures are drawn on request.
 """
@@ -20,30 +20,36 @@ from helio_jax.measure.crack_text import crack_lines, wall_lines
 from helio_jax.measure.cracks import find_cracks
 from helio_jax.measure.facets import Facets, FacetSettings, find_facets
 from helio_jax.measure.lines import LineSettings
+from helio_jax.measure.profiles import measure_profile
 from helio_jax.measure.regions import inside_polygon, parse_region
 from helio_jax.measure.ripple import compare_with_images, height_ripple, image_spectra
-from helio_jax.measure.roughness import measure_profile, measure_roughness, measure_step
 from helio_jax.measure.spectrum import RippleSettings
+from helio_jax.measure.step_height import StepHeight, measure_step, measure_step_height
+from helio_jax.measure.texture import Texture, TextureSettings, measure_texture
+from helio_jax.measure.texture_parameters import MEANINGS
 from helio_jax.measure.walls import WallSettings, find_walls
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 
 class Wanted(NamedTuple):
-    """Requested measurements; `profile` is x0, y0, x1, y1 [um]; `regions` (see `regions`) and `settings` apply to them.
+    """Requested measurements; `regions` (see `regions`) and `settings` apply to them.
 
-    `table`: a row for every crack and vertical edge will be written.
+    `profile`: x0, y0, x1, y1 in the sample frame [um]. `edges`: of the ridge or groove, along it [um]. `table`: a row
+    for every point of the profile, or for every crack and vertical edge, will be written.
     """
 
     facets: bool = False
     profile: tuple[float, float, float, float] | None = None
     step: bool = False
-    roughness: bool = False
+    texture: bool = False
     ripple: bool = False
     regions: tuple[str, ...] = ()
     cracks: bool = False
     vertical_edges: bool = False
     table: bool = False
+    step_height: bool = False
+    edges: tuple[float, float] | None = None
     settings: Mapping[str, Any] = {}
 
     @property
@@ -66,7 +72,13 @@ class _Job:
     lines: list[str] = field(default_factory=list)
 
 
-_SETTINGS = {"facets": FacetSettings, "ripple": RippleSettings, "cracks": LineSettings, "vertical_edges": WallSettings}
+_SETTINGS = {
+    "facets": FacetSettings,
+    "ripple": RippleSettings,
+    "cracks": LineSettings,
+    "vertical_edges": WallSettings,
+    "texture": TextureSettings,
+}
 """Settings of each measurement, by its field of `Wanted`."""
 
 
@@ -92,25 +104,30 @@ def _check(wanted: Wanted, has_figure: bool, has_stack: bool) -> None:
     w = wanted
     refused = (
         (
-            not (w.facets or w.profile or w.roughness or w.ripple or w.lines),
-            "measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --roughness, --ripple, --cracks, "
+            not (w.facets or w.profile or w.texture or w.ripple or w.lines),
+            "measure needs one or more of --facets, --profile X0 Y0 X1 Y1, --texture, --ripple, --cracks, "
             "--vertical-edges",
         ),
-        (w.step and not w.profile, "--step needs --profile X0 Y0 X1 Y1 across the step"),
+        (
+            (w.step or w.step_height) and not w.profile,
+            "--step and --step-height need --profile X0 Y0 X1 Y1 across the step",
+        ),
+        (w.edges and not w.step_height, "--step-edges are those of --step-height: add it"),
         (
             has_figure and w.facets + w.ripple + w.lines != 1,
             "--figure draws the facets, the ripple, or cracks and vertical edges: add --facets, --ripple, or --cracks "
             "and/or --vertical-edges, and none of the others",
         ),
         (
-            w.regions and not (w.ripple or w.roughness or w.lines),
-            "--region limits --ripple, --roughness, --cracks and --vertical-edges: add one of them",
+            w.regions and not (w.ripple or w.texture or w.lines),
+            "--region limits --ripple, --texture, --cracks and --vertical-edges: add one of them",
         ),
         (has_stack and not (w.ripple or w.cracks), "--stack is used by --ripple and --cracks: add one of them"),
         (w.cracks and not has_stack, "--cracks needs the micrographs: add --stack FILE.h5, from helio calibrate"),
         (
-            w.table and not w.lines,
-            "--table has a row for every crack and vertical edge: add --cracks or --vertical-edges",
+            w.table and bool(w.profile) + w.lines != 1,
+            "--table has a row for every point of a profile, or for every crack and vertical edge: add --profile, or "
+            "--cracks and/or --vertical-edges, not both",
         ),
     )
     for is_wrong, message in refused:
@@ -142,7 +159,7 @@ def measure_height_map(
     for is_wanted, measure in (
         (wanted.facets, _measure_facets),
         (wanted.profile, _measure_profile),
-        (wanted.roughness, _measure_roughness),
+        (wanted.texture, _measure_texture),
         (wanted.ripple, _measure_ripple),
         (wanted.lines, _measure_lines),
     ):
@@ -160,23 +177,61 @@ def _measure_facets(job: _Job) -> None:
 
 
 def _measure_profile(job: _Job) -> None:
-    """Read a profile and, if requested, its step."""
-    assert job.wanted.profile is not None  # the caller checks
-    line = measure_profile(job.rec, job.wanted.profile[:2], job.wanted.profile[2:])
-    job.found["profile"] = {"distance_um": line.distance, "height_um": line.height, "height_std_um": line.height_std}
-    if job.wanted.step:
+    """Read a profile and, if requested, its step heights, which take the place of its points in the printed lines."""
+    wanted = job.wanted
+    assert wanted.profile is not None  # the caller checks
+    line = measure_profile(job.rec, wanted.profile[:2], wanted.profile[2:])
+    job.found["profile"] = line.as_dict()
+    if wanted.step:
         step = measure_step(line)
         job.found["step"] = vars(step)
-        job.lines.append(f"step: {step.height:.2f} +- {step.height_std:.2f} um at {step.position:.0f} um")
-    else:
-        job.lines += [f"{d:10.2f} {h:10.3f}" for d, h in zip(line.distance, line.height, strict=True)]
+        job.lines += _step_lines("step", step)
+    if wanted.step_height:
+        step = measure_step_height(line, wanted.edges)
+        job.found["step_height"] = vars(step)
+        job.lines += _step_lines("step height (ISO 5436-1 type A)", step)
+    if not (wanted.step or wanted.step_height):
+        job.lines += line.lines()
 
 
-def _measure_roughness(job: _Job) -> None:
-    numbers = vars(measure_roughness(job.rec, np.any(job.regions, axis=0)))
-    job.found["roughness"] = numbers
-    units = {"Sa": "um", "Sq": "um", "Sz": "um", "Sdr": "%"}
-    job.lines += [f"{name:<9} {value:12.5g} {units.get(name, '')}".rstrip() for name, value in numbers.items()]
+def _step_lines(what: str, step: StepHeight) -> list[str]:
+    """Format a step height, and what it is made of."""
+    edges = " and ".join(f"{e:.1f}" for e in step.edges)
+    parts = ", ".join(f"{low:.0f} to {high:.0f}" for low, high in step.parts)
+    return [
+        f"{what}: {step.height:.3f} +- {step.std:.3f} um at {edges} um",
+        f"  lines of slope {step.slope:+.4f} over {parts} um; rms about them {step.rms:.3f} um",
+        f"  s.d. from: {step.errors}",
+    ]
+
+
+def _measure_texture(job: _Job) -> None:
+    texture = measure_texture(job.rec, job.settings["texture"], region=np.any(job.regions, axis=0))
+    job.found["texture"] = texture.as_dict()
+    job.lines += _texture_lines(texture)
+
+
+def _texture_lines(texture: Texture) -> list[str]:
+    """Format the scale-limited surface and a table of the parameters."""
+    how = texture.settings
+    filters = [
+        f"{name} {nesting:g} um" if nesting else f"no {name}"
+        for name, nesting in (("S-filter", how.s_filter_um), ("L-filter", how.l_filter_um))
+    ]
+    bias = "subtracted" if how.subtract_noise else "not subtracted"
+    lines = [
+        f"texture (ISO 25178-2) of the {texture.surface}: {', '.join(filters)}, form removed: {how.form}",
+        f"  {texture.n_pixels} valid heights, {texture.share:.1%} of their field; {texture.grid}",
+        f"  s.d. from: {texture.errors}",
+        f"  noise bias, if these errors are noise in the heights: {bias}",
+        f"  {'':<6}{'value':>12}{'s.d.':>12}{'noise bias':>12}",
+    ]
+    for name, p in texture.parameters.items():
+        numbers = "".join(f"{v:>12.5g}" if np.isfinite(v) else f"{'-':>12}" for v in (p.value, p.std, p.noise_bias))
+        lines.append(f"  {name:<6}{numbers} {p.unit:<3} {MEANINGS[name]}")
+    if np.isfinite(texture.Sal) and not np.isfinite(texture.Str):
+        lines.append("  Str: the autocorrelation does not fall to 0.2 within half the field in some direction")
+    return lines
 
 
 def _measure_ripple(job: _Job) -> None:
@@ -243,6 +298,7 @@ def reconstructed_area(rec: Reconstruction, max_std_um: float = 20.0) -> dict[st
     return {
         "share": float(known.mean()),
         "valid_share": float(good.mean()),
+        "is_contradicted": rec.is_contradicted,
         "max_std_um": max_std_um if rec.height_std is not None else None,
     }
 

@@ -324,6 +324,11 @@ def write_report_files(
     return panel_path
 
 
+def default_folder(scene: SceneFile) -> Path:
+    """Return where `run` writes if no folder is named."""
+    return Path("helio-out") / scene.name
+
+
 @dataclass(frozen=True)
 class RunResult:
     """What `run` made: scores, and where the files are."""
@@ -384,7 +389,7 @@ def run(
             "view(s): use helio simulate, which writes any scan"
         )
     scene.apertures()  # heights need them: an error before anything is traced
-    out = Path(folder) if folder else Path("helio-out") / scene.name
+    out = Path(folder) if folder else default_folder(scene)
     names = {label: name for label, name in RUN_FILES.items() if report or label not in ("report", "panel")}
     check_outputs(files_read(scene_path, "the scene", overrides), files_within("-o", out, names.values()))
     files = {label: out / name for label, name in names.items()}

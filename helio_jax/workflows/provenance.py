@@ -13,13 +13,22 @@ from helio_jax.trace.job import package_version
 from helio_jax.workflows.scene_file import SceneFile, resolved
 
 
-def with_provenance(stack: Micrographs, scene: SceneFile, scene_path: str | Path) -> Micrographs:
-    """Add scene text, resolved scene, versions, commit, machine, command line and time to the provenance."""
+def with_provenance(
+    stack: Micrographs, scene: SceneFile, scene_path: str | Path, scene_text: str | None = None
+) -> Micrographs:
+    """Add scene text, resolved scene, versions, commit, machine, command line and time to the provenance.
+
+    Args:
+        stack: simulated micrographs.
+        scene: their scene.
+        scene_path: its file; only its name counts where `scene_text` is given.
+        scene_text: text of that file.
+    """
     path = Path(scene_path)
     names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
     about = {
         "scene_file": path.name,
-        "scene_text": path.read_text(encoding="utf-8"),
+        "scene_text": path.read_text(encoding="utf-8") if scene_text is None else scene_text,
         "scene": resolved(scene),
         "versions": {name: package_version(name) for name in names},
         "git": git_commit(),

@@ -210,17 +210,53 @@ def test_bad_output_is_told_before_any_work(command, out, wrong, tmp_path, no_wo
 
 
 @pytest.mark.parametrize(("command", "out"), WRITING)
-def test_good_output_passes(command, out, tmp_path, no_work):
-    """Catches a door that refuses everything, or an output of before that may be replaced; it makes nothing itself."""
+def test_good_output_passes_and_is_then_kept(command, out, tmp_path, no_work):
+    """A new output passes; one of before is refused, first or beside it, and passes with --force. Nothing is made.
+
+    Catches a door that refuses everything, a command whose second call replaces what the first one made, and a
+    command without --force. Commands that add to what is there, or know their own, pass without.
+    """
     mark = MARKS[command][out]
     output = tmp_path / "results" if mark.within is not None else tmp_path / f"x{suffix(mark)}"
-    for _ in range(2):
-        found = CliRunner().invoke(app, line(command, tmp_path, **{out: output}))
-        assert str(found.exception) == "the command was entered", found
-        assert not output.exists() or output.stat().st_size
-        place = places(mark, output)[0] if mark.within != () else output / "any"
+    words = line(command, tmp_path, **{out: output})
+    assert "the command was entered" in said(CliRunner().invoke(app, words))[1] and not output.exists()
+    for place in places(mark, output):
         place.parent.mkdir(exist_ok=True)
         place.write_text("of before")
+        code, text = said(CliRunner().invoke(app, words))
+        if mark.keeps:
+            assert "the command was entered" in text
+        else:
+            assert code == 2 and f"{place.name} exists and is kept" in text and "--force" in text
+            assert "the command was entered" in said(CliRunner().invoke(app, [*words, "--force"]))[1]
+        assert place.read_text() == "of before"
+        place.unlink()
+
+
+@pytest.mark.parametrize("command", ["simulate", "run"])
+def test_an_unfinished_run_goes_on(command, tmp_path, no_work):
+    """Parts of an unfinished run beside its micrographs: the same command goes on, without --force.
+
+    Catches a rule that takes a resumed run for one that overwrites.
+    """
+    output = tmp_path / ("results" if command == "run" else "x.h5")
+    micrographs = output / "micrographs.h5" if command == "run" else output
+    micrographs.parent.mkdir(exist_ok=True)
+    micrographs.write_text("of before")
+    words = line(command, tmp_path, output=output)
+    assert "exists and is kept" in said(CliRunner().invoke(app, words))[1]
+    Parts(micrographs).begin({})
+    assert "the command was entered" in said(CliRunner().invoke(app, words))[1]
+
+
+def test_default_folder_of_a_run_is_kept(tmp_path, monkeypatch):
+    """Without -o, results of before in helio-out/NAME are kept, too. Catches a rule for stated paths only."""
+    monkeypatch.chdir(tmp_path)
+    before = tmp_path / "helio-out" / "sphere_a" / "height.h5"
+    before.parent.mkdir(parents=True)
+    before.write_text("of before")
+    code, text = said(CliRunner().invoke(app, ["run", "sphere_a"]))
+    assert code == 2 and "exists and is kept" in text and "--force" in text and before.read_text() == "of before"
 
 
 def test_library_refuses_as_well(tmp_path):

@@ -98,7 +98,7 @@ def test_command_and_errors(tmp_path):
     assert len(rows) == 64 and {"x_um", "direction_z", "plate_x_um", "order", "fate", "detector"} <= set(rows[0])
     assert np.load(tmp_path / "d.npz")["counts"].sum() > 50
     for bad, message in ((["--pixel", "121", "0"], "row from 0 to 120"), (["--view", "1"], "view must be 0 to 0")):
-        result = RUNNER.invoke(app, [*args[:4], *bad])
+        result = RUNNER.invoke(app, [*args[:4], *bad, "--force"])
         assert isinstance(result.exception, SceneError) and message in str(result.exception)
     plate = {
         "plate": {"kind": "scattering", "radius_um": 1e4, "working_distance_um": 4e3, "sample_distance_um": 4720.0}

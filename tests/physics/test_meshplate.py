@@ -244,7 +244,7 @@ def test_from_instrument_to_file(tmp_path, capsys):
     assert stack.plate is not None and 0 < stack.plate.sum() < stack.counts.sum()
     scene = load_scene(path)
     job = Job.of(scene, scene.trace, scene.build_body())
-    assert run("plate", instrument, "-o", tmp_path / "plate.obj", "--thickness-um", 301) == 0
+    assert run("plate", instrument, "-o", tmp_path / "plate.obj", "--thickness-um", 301, "--force") == 0
     assert Job.of(scene, scene.trace, scene.build_body()) != job
     with pytest.raises(SceneError, match=r"plate\.kind = 'mesh': that can be simulated only; heights"):
         pipeline.reconstruct(stack, "linear")

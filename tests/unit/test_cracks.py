@@ -201,7 +201,7 @@ def test_command_reports_cracks(tmp_path):
     assert float(rows[0]["left"]) == pytest.approx(16.0, abs=4.0) and rows[0]["depth_um"] == ""
     for wrong, has_stack, words in (
         (Wanted(cracks=True), False, "--stack"),
-        (Wanted(roughness=True, table=True), False, "--table"),
+        (Wanted(texture=True, table=True), False, "--table"),
         (Wanted(vertical_edges=True), True, "--stack"),
         (Wanted(), False, "--cracks"),
     ):

@@ -1,4 +1,4 @@
-"""Measurements on height maps against closed forms: a truncated octahedron, steps, sinusoids, planes."""
+"""Measurements on height maps against closed forms: a truncated octahedron, planes."""
 
 import json
 import math
@@ -7,34 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helio_jax.errors import GuardError, SceneError
-from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.errors import SceneError
 from helio_jax.measure.facets import find_facets
-from helio_jax.measure.roughness import measure_profile, measure_roughness, measure_step
-from helio_jax.reconstruction import Reconstruction
 from helio_jax.workflows.measure import Wanted, measure_height_map, reconstructed_area
+from tests.height_maps import PITCH, make_rec
 
-PITCH = 20.0
 TILT = math.degrees(math.acos(1 / math.sqrt(3)))
 """Angle between the faces {100} and {111} of a cube's lattice: 54.7356 deg."""
-
-
-def make_rec(height, n=(101, 101), incidence=0.0, noise=0.0, is_valid=None) -> Reconstruction:
-    """Return a height map of a formula of the surface's own x, y, solved along the beam."""
-    detector = Detector(name="d", polar_deg=45.0, half_angle_deg=10.0)
-    instrument = Instrument(
-        beam=Beam(incidence_deg=incidence), plate=Plate(working_distance_um=3000.0), detector=(detector,)
-    )
-    x, y = ((np.arange(k) - (k - 1) / 2) * PITCH for k in reversed(n))
-    grid_x, grid_y = np.meshgrid(x, y)
-    tx, _ = instrument.beam_shift
-    z = np.zeros(n)
-    for _ in range(200):  # a fixed point: the height seen at (X, Y) is that at x = X - z tan t
-        z = 0.5 * z + 0.5 * height(grid_x - z * tx, grid_y)
-    z = z + noise * np.random.default_rng(5).standard_normal(n)
-    valid = np.ones(n, bool) if is_valid is None else is_valid
-    up = np.zeros((*n, 3)) + [0.0, 0.0, 1.0]
-    return Reconstruction(z, x, y, instrument, "linear", up, np.ones(n), valid, np.where(valid, 0, 1))
 
 
 def octahedron(x, y):
@@ -127,57 +106,11 @@ def test_area_of_a_tilted_plane(incidence):
     assert sorted((facet.long_um, facet.short_um)) == pytest.approx(sorted((wide, deep)), rel=2e-3)
 
 
-def test_roughness_of_a_sinusoid():
-    """z = a cos(kx): Sa = 2a/pi, Sq = a/sqrt 2, Ssk = 0, Sku = 3/2, Sdq = ak/sqrt 2 times the cell's transfer.
-
-    Catches peak-to-valley for amplitude, excess kurtosis, and slopes of half the step.
-    """
-    a, k = 7.0, 2 * math.pi / 404.0  # 101 pixels hold five whole periods
-    rough = measure_roughness(make_rec(lambda x, y: a * np.cos(k * x)))
-    assert rough.Sa == pytest.approx(2 * a / math.pi, rel=2e-3)
-    assert rough.Sq == pytest.approx(a / math.sqrt(2), rel=1e-9)
-    assert abs(rough.Ssk) < 1e-9 and rough.Sku == pytest.approx(1.5, rel=1e-9)
-    assert rough.Sz == pytest.approx(2 * a, rel=1e-2)
-    between = math.sin(k * PITCH / 2) / (k * PITCH / 2)  # a slope is a mean over one pitch
-    assert rough.Sdq == pytest.approx(a * k / math.sqrt(2) * between, rel=6e-3)
-    assert rough.Sdr == pytest.approx(100 * rough.Sdq**2 / 2, rel=1e-2)
-
-
-def test_roughness_is_levelled_by_a_plane():
-    """A tilted plane has Sq = 0 and Sdr = 0; a roof of slopes +-0.5 on it has Sdr = sqrt(1.25) - 1."""
-    rec = make_rec(lambda x, y: 0.5 * x)
-    assert measure_roughness(rec).Sq < 1e-9 and measure_roughness(rec).Sdr < 1e-9
-    roof = measure_roughness(make_rec(lambda x, y: 0.5 * np.abs(x) + 0.3 * y))
-    assert roof.Sdr == pytest.approx(100 * (math.sqrt(1.25) - 1), rel=1e-9)
-    with pytest.raises(GuardError, match="16 or more valid pixels, got 0"):
-        measure_roughness(rec, np.zeros(rec.height.shape, bool))
-
-
-def test_step_on_a_slope():
-    """A step of 30 um on a slope of 0.1: between parallel lines. Catches the difference of the sides' means."""
-    line = measure_profile(make_rec(lambda x, y: 0.1 * x + 30.0 * (x > 5.0)), (-900.0, 40.0), (900.0, 40.0))
-    step = measure_step(line)
-    assert step.height == pytest.approx(30.0, abs=1e-6) and step.slope == pytest.approx(0.1, abs=1e-9)
-    assert abs(step.position - 905.0) < PITCH
-
-
-def test_profile_leaves_gaps_and_refuses_what_is_outside():
-    """Invalid pixels are NaN, not bridged; a point off the raster is named."""
-    valid = np.ones((101, 101), bool)
-    valid[:, 40:60] = False
-    rec = make_rec(lambda x, y: x, is_valid=valid)
-    line = measure_profile(rec, (-1000.0, 0.0), (1000.0, 0.0))
-    np.testing.assert_allclose(line.height[np.isfinite(line.height)], line.distance[np.isfinite(line.height)] - 1000.0)
-    assert 18 <= np.isnan(line.height).sum() <= 22
-    with pytest.raises(SceneError, match=r"profile end \(2000, 0\)"):
-        measure_profile(rec, (0.0, 0.0), (2000.0, 0.0))
-
-
 def test_measure_reports_json(tmp_path):
     """All parts at once are JSON, and the figure is drawn; no measurement is an error."""
-    wanted = Wanted(True, (-900.0, 0.0, 900.0, 0.0), False, True)
+    wanted = Wanted(facets=True, profile=(-900.0, 0.0, 900.0, 0.0), texture=True)
     found, lines = measure_height_map(make_rec(octahedron), wanted, tmp_path / "f.png")
-    assert set(json.loads(json.dumps(found))) == {"reconstructed", "facets", "profile", "roughness"}
+    assert set(json.loads(json.dumps(found))) == {"reconstructed", "facets", "profile", "texture"}
     assert len(found["facets"]["edges"]) == 12 and any("125." in line for line in lines)
     assert (tmp_path / "f.png").stat().st_size > 5000
     with pytest.raises(SceneError, match="--facets"):

@@ -306,7 +306,7 @@ def test_given_by_hand_needs_no_fit(spheres, tmp_path, capsys):
     assert turned.counts[:, 0, 0].tolist() == [3.0, 1.0, 2.0]
     assert turned.provenance["orient"]["margin"] is None
     with pytest.raises(SystemExit) as end:
-        main([*command, f"{b},{b},{a}"])
+        main([*command, f"{b},{b},{a}", "--force"])
     assert end.value.code == 2 and "must name the detector of each image once" in capsys.readouterr().err
 
 

@@ -97,9 +97,8 @@ def test_dependencies_are_those_that_are_imported():
     found -= {*sys.stdlib_module_names, "helio_jax"}
     imported = {canonicalize_name(IMPORT_NAMES.get(name, name)) for name in found}
     required = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"]}
-    optional = {
-        canonicalize_name(Requirement(t).name) for k in ("dask", "plates") for t in PROJECT["optional-dependencies"][k]
-    }
+    extras = PROJECT["optional-dependencies"]
+    optional = {canonicalize_name(Requirement(t).name) for k in ("dask", "plates", "xarray") for t in extras[k]}
     assert imported - required - optional == set(), "imported, but not in pyproject.toml"
     assert required - imported - OWN_DEPENDENCIES == set(), "in pyproject.toml, but not imported"
     assert optional - imported == set()

@@ -179,6 +179,6 @@ def test_measure_reports_ripples(tmp_path):
     assert record["wavelength_um"] == pytest.approx(WAVELENGTH, rel=0.02) and record["peak_over_floor"] > 5
     assert "agree" in record["micrographs"]["verdict"] and any("95." in line for line in lines)
     assert (tmp_path / "r.png").stat().st_size > 10_000
-    for wrong, words in ((Wanted(facets=True, regions=("0,0 9,9",)), "--region"), (Wanted(roughness=True), "--stack")):
+    for wrong, words in ((Wanted(facets=True, regions=("0,0 9,9",)), "--region"), (Wanted(texture=True), "--stack")):
         with pytest.raises(SceneError, match=words):
             measure_height_map(rec, wrong, None, stack)
