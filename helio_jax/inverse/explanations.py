@@ -41,6 +41,8 @@ MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate."""
 MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
+LESS_CONTRADICTED = 0.95
+"""An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
 HELD = 1e-4
@@ -80,7 +82,8 @@ def explain(
 ) -> Explanation:
     """Fit the heights, and other explanations where the data contradict the fit; arguments as `reconstruct_stack`.
 
-    Another explanation is kept where the data that are expected of it explain the micrographs better by `GAIN`.
+    Another explanation is kept where the data that are expected of it explain the micrographs better by `GAIN`, and
+    contradict it in fewer pixels (`LESS_CONTRADICTED`).
     """
     fits = _Fits(stack, settings, make_predict, report)
     best = fits.from_steps(AlbedoPatches.none(stack.shape[1:]))
@@ -89,10 +92,14 @@ def explain(
             return best
         try:
             residuals = fits.residuals(best.fit)
-            if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
+            if fits.contradicted(residuals) < MIN_CONTRADICTED:
                 return best
             found = other(best, residuals)
-            if found and improvement(residuals, fits.residuals(found.fit)) > GAIN:
+            if found is None:
+                continue
+            others = fits.residuals(found.fit)
+            is_less = fits.contradicted(others) < LESS_CONTRADICTED * fits.contradicted(residuals)
+            if is_less and improvement(residuals, others) > GAIN:
                 best = found
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
@@ -165,6 +172,10 @@ class _Fits:
     def residuals(self, fit: Fit) -> np.ndarray:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
+
+    def contradicted(self, residuals: np.ndarray) -> float:
+        """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit."""
+        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > LIMIT))
 
     def say(self, said: str) -> None:
         """Report what is tried."""
