@@ -20,6 +20,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
+  validity            the rule of is_valid: reasons, limits, words
   settings            base class of all settings tables
   drawable            plot(), short repr and notebook view of the records
   kernel              how inner loops are compiled (numba)

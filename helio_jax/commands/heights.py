@@ -20,7 +20,7 @@ from helio_jax.commands.app import (
     given_options,
     print_table,
     set_options,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Reads
 
@@ -38,9 +38,11 @@ def reconstruct(
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
     strict: Strict = False,
+    as_json: AsJson = False,
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
+    from helio_jax.figures.summary import trust_lines
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.scene_file import load_scene
@@ -56,13 +58,18 @@ def reconstruct(
     write(result, output)
     if write_instrument:
         toml.write_instrument(result, write_instrument)
-    print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
-    for name, factor in result.provenance.get("sensitivity", {}).items():
-        print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
-    _print_instrument(result.provenance.get("instrument", {}))
+    if as_json:
+        about = {"file": str(output), "method": result.method, "status": result.status, "trust": result.trust}
+        print(json.dumps(about))
+    else:
+        print(f"{output}: {result.method}, {result.status}")
+        print("\n".join(trust_lines(result.trust)))
+        for name, factor in result.provenance.get("sensitivity", {}).items():
+            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+        _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
-    warn_if_contradicted(result.is_contradicted, strict)
+    warn(result.trust, strict)
 
 
 @app.command()
@@ -75,6 +82,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same beam positions."""
+    from helio_jax.figures.summary import trust_lines
     from helio_jax.formats.hdf5 import read_height
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -84,11 +92,14 @@ def evaluate(
     scores = pipeline.evaluate(rec, found)
     if as_json:
         center = list(found.region.center) if found.region else None
-        print(json.dumps(scores.as_dict() | {"center_um": center}))
+        print(json.dumps(scores.as_dict() | {"center_um": center, "trust": rec.trust}))
+        warn(rec.trust)
         return
     if found.region and fit_center:
         print(f"  centre fitted at x = {found.region.center[0]:.1f} um, y = {found.region.center[1]:.1f} um")
     print_table(scores.as_table())
+    print("\n".join(trust_lines(rec.trust)))
+    warn(rec.trust)
 
 
 @app.command()
@@ -176,6 +187,7 @@ def measure(
     else:
         images = read_stack(stack) if stack else None
         found, lines = measure_height_map(read_height(height), wanted, figure, images)
+        warn(found["trust"])
         text = as_table(found)
     if table:
         with atomic_path(table) as part:
@@ -189,10 +201,9 @@ def _print_instrument(found: dict[str, Any]) -> None:
         if unit in ("um", "deg"):
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} from the stated value (prior {prior:g})")
     if found.get("inflation", 1.0) > 1.0:
+        common = found.get("common_mode_um", 0.0)
         print(
-            "  the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars "
-            f"are inflated by {found['inflation']:.1f} (plus up to {found.get('common_mode_um', 0.0):.0f} um for the "
-            "resulting height error)"
+            f"  error bars are inflated by {found['inflation']:.1f}; common to all heights: up to {common:.0f} um more"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())

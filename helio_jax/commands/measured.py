@@ -26,7 +26,7 @@ from helio_jax.commands.app import (
     say,
     set_options,
     tell_micrographs,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Reads, Writes
 from helio_jax.formats.export_formats import SUFFIXES, help_text
@@ -80,13 +80,14 @@ def export(
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
     from helio_jax import Reconstruction, read
     from helio_jax import export as write_foreign
+    from helio_jax.figures.summary import trust_lines
 
     found = read(file)
     left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore
     print(output)
     if isinstance(found, Reconstruction):
-        print(f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
-        warn_if_contradicted(found.is_contradicted, strict=False)
+        print("\n".join(f"  {line}" for line in (f"{found.method}, {found.status}", *trust_lines(found.trust))))
+        warn(found.trust)
     for what in left_out:
         print(f"  not written: {what}")
 

@@ -29,7 +29,7 @@ from helio_jax.commands.app import (
     print_table,
     say,
     tell_micrographs,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Reads, Writes
 
@@ -56,6 +56,7 @@ def run(
     strict: Strict = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
+    from helio_jax.figures.summary import trust_lines
     from helio_jax.workflows.pipeline import Executor
     from helio_jax.workflows.pipeline import run as run_scene
 
@@ -64,16 +65,17 @@ def run(
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
-        warn_if_contradicted(result.is_contradicted, strict)
+        warn(result.trust, strict)
         return
     print(f"\n{result.name}: {result.method}, {result.status}")
     print_table(result.scores.as_table())
+    print("\n".join(trust_lines(result.trust)))
     print("\nfiles:")
     for label, path in result.files.items():
         print(f"  {label:<12} {path}")
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
-    warn_if_contradicted(result.is_contradicted, strict)
+    warn(result.trust, strict)
 
 
 @app.command()
@@ -142,8 +144,10 @@ def resume(
     path: Annotated[
         Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
     ],
+    picture: Picture = True,
 ) -> None:
     """Resume an interrupted or killed run or study; finished units are not traced again."""
+    from helio_jax.formats.hdf5 import read_micrographs
     from helio_jax.workflows.pipeline import resume as resume_run
 
     if (path / "study.json").is_file():
@@ -151,8 +155,11 @@ def resume(
 
         print(resume_study(path, say=say))
         return
-    for file in resume_run(path, stage=Bar, say=say):
+    files = resume_run(path, stage=Bar, say=say)
+    for file in files:
         print(file)
+    if files == [path]:
+        tell_micrographs(read_micrographs(path), path, picture)
 
 
 @app.command()

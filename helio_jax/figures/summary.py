@@ -16,12 +16,10 @@ from helio_jax.figures.wording import UNITS, amount, angle, duration, length, le
 from helio_jax.heightmap import HeightMap
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.scene import Scene
 
 Rows = list[tuple[str, str]]
-VALID_RULE = "a height is valid if enough data determine it and the data do not contradict it"
-"""What `is_valid` states, in words."""
 MAX_SCANS = 8
 """A summary lists at most this many scans of a set."""
 KINDS = {"expected": "expected counts", "poisson": "counts with noise", "measured": "measured counts"}
@@ -152,14 +150,22 @@ def _reconstruction_rows(rec: Reconstruction) -> Rows:
         rows.append(("heights", f"{heights.min():.4g} to {heights.max():.4g} um above {_level(rec)}"))
     if rec.height_std is not None and rec.is_valid.any():
         rows.append(("standard dev.", f"{np.nanmedian(rec.height_std[rec.is_valid]):.3g} um (median of valid heights)"))
-    rows.append(("valid", f"{share(float(rec.is_valid.mean()))} of the pixels: {VALID_RULE}"))
-    numbers = ((reason, float(np.mean(rec.reason == k))) for k, reason in enumerate(REASONS) if k)
-    causes = [f"{reason} {share(part)}" for reason, part in numbers if part]
-    rows += [("not valid", ", ".join(causes))] if causes else []
-    if rec.is_contradicted:
-        rows.append(("WARNING", "the data contradict this height map: do not trust it"))
+    rows += trust_rows(rec.trust)
+    rows += [("WARNING", "; ".join(rec.warnings))] if rec.warnings else []
     rows += [("status", rec.status)] if rec.status else []
     return [*rows, ("beam", _beam_text(rec.instrument)), *_made_rows(rec.provenance)]
+
+
+def trust_rows(trust: Mapping[str, Any]) -> Rows:
+    """Write what is valid, by which rule, and why the rest is not (of `Reconstruction.trust`)."""
+    causes = [f"{reason} {share(part)}" for reason, part in trust["not_valid"].items()]
+    rows = [("valid", f"{share(trust['valid_share'])} of the pixels: {trust['valid_rule']}")]
+    return rows + ([("not valid", ", ".join(causes))] if causes else [])
+
+
+def trust_lines(trust: Mapping[str, Any]) -> list[str]:
+    """Write the same as sentences for the terminal."""
+    return [f"{label}: {text}" for label, text in trust_rows(trust)]
 
 
 def _level(rec: Reconstruction) -> str:

@@ -33,8 +33,9 @@ from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
-from helio_jax.inverse.verdict import LIMIT, local_chi_square, residuals_of_state
+from helio_jax.inverse.verdict import local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
+from helio_jax.validity import CHI_SQUARE_LIMIT
 
 MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate."""
@@ -85,7 +86,7 @@ def explain(
             return best
         try:
             residuals = fits.residuals(best.fit)
-            if np.mean(local_chi_square(residuals, stack.is_observed) > LIMIT) < MIN_CONTRADICTED:
+            if np.mean(local_chi_square(residuals, stack.is_observed) > CHI_SQUARE_LIMIT) < MIN_CONTRADICTED:
                 return best
             found = other(best, residuals)
             if found and improvement(residuals, fits.residuals(found.fit)) > GAIN:

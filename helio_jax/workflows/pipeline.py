@@ -299,7 +299,8 @@ def reconstruct(
     others = [f"{name} ({kind})" for name, kind in one.materials.items() if kind != "cosine"]
     if not others:
         return rec
-    return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
+    law = f"NOT the cosine law, which heights assume, holds for {', '.join(others)}"
+    return replace(rec, warnings=(*rec.warnings, law))
 
 
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
@@ -331,7 +332,7 @@ class RunResult:
     name: str
     method: str
     status: str
-    is_contradicted: bool
+    trust: dict[str, Any]
     scores: Scores
     files: dict[str, Path]
 
@@ -342,7 +343,7 @@ class RunResult:
             "name": self.name,
             "method": self.method,
             "status": self.status,
-            "is_contradicted": self.is_contradicted,
+            "trust": self.trust,
             **self.scores.as_dict(),
             "files": files,
         }
@@ -404,4 +405,4 @@ def run(
         if report:
             title = f"{scene.name}: simulated, reconstructed, scored"
             write_report_files(files["report"], stack, rec, truth, scores, title=title)
-    return RunResult(scene.name, rec.method, rec.status, rec.is_contradicted, scores, files)
+    return RunResult(scene.name, rec.method, rec.status, rec.trust, scores, files)
