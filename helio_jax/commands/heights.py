@@ -42,7 +42,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
-    from helio_jax.figures.summary import trust_lines
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.scene_file import load_scene
@@ -82,7 +82,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same beam positions."""
-    from helio_jax.figures.summary import trust_lines
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_height
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -111,8 +111,13 @@ def report(
         Path | None, typer.Option(help="Scene file or height map to compare with."), Reads(names_files=True)
     ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+    panel: Annotated[
+        Path | None, typer.Option(help="Panel for print (.png, .pdf, .svg; default: .png beside the report)."), FIGURE
+    ] = None,
+    steps: Annotated[bool, typer.Option("--steps", help="Also measure steps in the micrographs of --stack.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
+    """Write one self-contained HTML report of a height map, and a panel on one page."""
     from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -120,8 +125,15 @@ def report(
     rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
-    panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
-    print(f"{output}\n{panel}")
+    title = images.name if images else height.stem
+    drawn = pipeline.write_report_files(
+        output, images, rec, known, scores, title=title, panel_path=panel, with_steps=steps
+    )
+    if as_json:
+        print(json.dumps({"report": str(output), "panel": str(drawn), "trust": rec.trust}))
+    else:
+        print(f"{output}\n{drawn}")
+    warn(rec.trust)
 
 
 @app.command()

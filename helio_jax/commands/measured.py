@@ -80,7 +80,7 @@ def export(
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
     from helio_jax import Reconstruction, read
     from helio_jax import export as write_foreign
-    from helio_jax.figures.summary import trust_lines
+    from helio_jax.figures.trust import trust_lines
 
     found = read(file)
     left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore

@@ -56,7 +56,7 @@ def run(
     strict: Strict = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
-    from helio_jax.figures.summary import trust_lines
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.workflows.pipeline import Executor
     from helio_jax.workflows.pipeline import run as run_scene
 

@@ -1,14 +1,18 @@
 """Data that the printed panel and the interactive report draw: ranges, fractions, surface cells, profiles.
 
-Raster images stay in the beam frame; profiles and surface cells use the surface points' own positions, so that shapes
-are true and occluded parts show as gaps. Draws nothing.
+Raster images stay in the beam frame; profiles are cut in the sample frame, and surface cells use the surface points'
+own positions, so that shapes are true and occluded parts show as gaps. Draws nothing.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from helio_jax.arrays import pitch
+from helio_jax.measure.sample_grid import heights_at
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.validity import MIN_IMAGES
 
 REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377", "#66ccee")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
@@ -16,6 +20,13 @@ DETECTOR_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa33
 """One colour per detector, repeated (Tol's bright scheme)."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""
+
+
+def is_checkable(rec: Reconstruction) -> bool:
+    """Return whether residuals test anything: a photometric method fits its three unknowns to three images exactly."""
+    if rec.residuals is None:
+        return False
+    return rec.method == "refine" or bool((np.isfinite(rec.residuals).sum(0) > MIN_IMAGES).any())
 
 
 def surface_cells(rec: Reconstruction) -> np.ndarray:
@@ -43,13 +54,6 @@ def cell_corners(rec: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
 def cell_means(values: np.ndarray) -> np.ndarray:
     """Average values [y, x, ...] over the four corners of each raster cell [y-1, x-1, ...]."""
     return 0.25 * (values[1:, 1:] + values[1:, :-1] + values[:-1, 1:] + values[:-1, :-1])
-
-
-def apex_pixel(height: np.ndarray) -> tuple[int, int]:
-    """Find the pixel (row, column) farthest above or below the median height; NaN is ignored."""
-    away = np.abs(height - np.nanmedian(height)) if np.isfinite(height).any() else np.zeros(height.shape)
-    row, column = np.unravel_index(np.argmax(np.where(np.isfinite(away), away, -1.0)), height.shape)
-    return int(row), int(column)
 
 
 def highest_valid(rec: Reconstruction) -> tuple[int, int] | None:
@@ -94,32 +98,59 @@ def residual_rms(residuals: np.ndarray) -> np.ndarray:
     return np.sqrt(np.divide((total**2).sum(0), n, out=np.full(n.shape, np.nan), where=n > 0))
 
 
-def profile_line(
-    rec: Reconstruction, height: np.ndarray, along: str, pixel: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Read one raster line of `height` through `pixel`, at the surface points' own positions.
+@dataclass(frozen=True)
+class Profile:
+    """Heights along a line of the sample frame through a point.
 
-    Returns:
-        Positions along "x" or "y" [um], heights [um], and the indices before which the beam leaves a gap.
+    Attributes:
+        along: "x" or "y".
+        place: of the line, e.g. "y = 40 µm".
+        at: positions along it [um].
+        height: valid heights there [um]; NaN: not valid, or not seen by the beam.
+        height_std: standard deviation of the height at a fixed x, y [um], or None.
+        truth: true heights [um], or None.
     """
-    line = (pixel[0], slice(None)) if along == "x" else (slice(None), pixel[1])
-    points = rec.instrument.surface_position(rec.raster_x[None, :], rec.raster_y[:, None], height)
-    at = points[0 if along == "x" else 1] + np.zeros_like(height)
-    step = pitch(rec.raster_x if along == "x" else rec.raster_y)
-    return at[line], height[line], np.flatnonzero(np.abs(np.diff(at[line])) > _LONGEST_EDGE * step) + 1
+
+    along: str
+    place: str
+    at: np.ndarray
+    height: np.ndarray
+    height_std: np.ndarray | None
+    truth: np.ndarray | None
 
 
-def profile_band(
-    rec: Reconstruction, height: np.ndarray, along: str, pixel: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Outline height +- height_std along one raster line: positions and heights [um], without missing points."""
-    assert rec.height_std is not None  # callers check
-    low, high = (profile_line(rec, height + s * rec.height_std, along, pixel) for s in (-1, 1))
-    use = np.isfinite(low[1]) & np.isfinite(high[1])
-    return tuple(np.concatenate([low[k][use], high[k][use][::-1]]) for k in (0, 1))  # type: ignore[return-value]
+def profiles(rec: Reconstruction, true_height: np.ndarray | None = None, level: float = 0.0) -> list[Profile]:
+    """Cut the surface along x and along y through the highest valid point; empty where no height is valid.
 
+    The beam shifts a point sideways with its height. An error of h at a beam position is therefore one of
+    (1 + p tx + q ty) h at a fixed x, y, for the slopes p, q and the beam's shifts tx, ty per height
+    (docs/conventions.md, Raster).
 
-def profile_place(rec: Reconstruction, along: str, pixel: tuple[int, int]) -> str:
-    """Name the raster line of a profile through `pixel`, e.g. "Y = 40 µm"."""
-    row, column = pixel
-    return f"Y = {rec.raster_y[row]:.0f} µm" if along == "x" else f"X = {rec.raster_x[column]:.0f} µm"
+    Args:
+        rec: the heights.
+        true_height: true heights of the same raster [y, x], um.
+        level: subtracted from the reconstructed heights [um].
+    """
+    top = highest_valid(rec)
+    if top is None:
+        return []
+    use = rec.is_valid & np.isfinite(rec.height)
+    tx, ty = rec.instrument.beam_shift
+    nx, ny, nz = np.moveaxis(rec.normals, -1, 0)
+    turned = np.abs(1.0 - (nx * tx + ny * ty) / np.maximum(nz, 0.05))
+    upright = rec if rec.height_std is None else rec.replace(height_std=rec.height_std * turned)
+    out = []
+    for along, points, axis in (("x", rec.x, rec.raster_x), ("y", rec.y, rec.raster_y)):
+        step, middle = pitch(axis), float(points[top])
+        low, high = np.ceil((points[use].min() - middle) / step), np.floor((points[use].max() - middle) / step)
+        at = middle + step * np.arange(low, high + 1)
+        across = float((rec.y if along == "x" else rec.x)[top])
+        line = (at, np.array([across])) if along == "x" else (np.array([across]), at)
+        height, std = (found.ravel() for found in heights_at(upright, *line, use))
+        truth = None
+        if true_height is not None:
+            true = rec.replace(height=true_height, height_std=None)
+            truth = heights_at(true, *line, np.isfinite(true_height))[0].ravel()
+        place = f"{'y' if along == 'x' else 'x'} = {across + 0.0:.0f} µm"
+        out.append(Profile(along, place, at, height - level, None if rec.height_std is None else std, truth))
+    return out

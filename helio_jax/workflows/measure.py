@@ -16,7 +16,7 @@ from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.cracks import crack_panel
 from helio_jax.figures.overlay import facet_map
 from helio_jax.figures.ripple import ripple_panel
-from helio_jax.figures.summary import trust_lines
+from helio_jax.figures.trust import trust_lines
 from helio_jax.measure.crack_text import crack_lines, wall_lines
 from helio_jax.measure.cracks import find_cracks
 from helio_jax.measure.facets import Facets, FacetSettings, find_facets
