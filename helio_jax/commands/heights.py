@@ -65,7 +65,7 @@ def reconstruct(
         print(f"{output}: {result.method}, {result.status}")
         print("\n".join(trust_lines(result.trust)))
         for name, factor in result.provenance.get("sensitivity", {}).items():
-            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name.removeprefix('log_')}")
         _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt

@@ -239,7 +239,7 @@ def profile_plot(cut: Profile) -> Picture:
         style = {"mode": "lines", "line": {"color": color, "width": width}, "hovertemplate": hover}
         return {"type": "scatter", "x": at, "y": z.astype(np.float32), "name": name, **style}
 
-    at = np.round(cut.at, 2).astype(np.float32)
+    at = cut.at.astype(np.float32)
     traces = [] if cut.truth is None else [line(cut.truth, "truth", "#999999", 4.0)]
     if cut.height_std is not None:
         edge = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
@@ -280,9 +280,9 @@ def convergence_plot(changes: Sequence[float], tolerance: float | None) -> Pictu
 def bar_plot(title: str, names: Sequence[str], values: Sequence[float], unit: str) -> Picture:
     """Draw one bar for each name, horizontally."""
     shown = [html.escape(name) for name in names]
-    hover = f"%{{y}}<br><b>%{{x:.3~g}}</b> {unit}<extra></extra>"
+    hover = "%{y}<br><b>%{x:.3~g}</b><extra></extra>"
     bars = {"type": "bar", "orientation": "h", "x": list(values), "y": shown, "hovertemplate": hover}
-    layout = _lines_layout(title, unit, "")
+    layout = _lines_layout(title, unit.replace("um", "µm"), "")
     layout["margin"]["l"] = 150
     layout["yaxis"]["autorange"] = "reversed"
     alt = f"{title}: " + ", ".join(f"{name} {value:.3g} {unit}" for name, value in zip(names, values, strict=True))
@@ -315,6 +315,6 @@ def _layout(title: str, **more: Any) -> dict[str, Any]:
 def _lines_layout(title: str, x: str, y: str) -> dict[str, Any]:
     """Return the layout of curves."""
     axes = {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}}
-    legend = {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)"}
+    legend = {"orientation": "h", "x": 0, "y": -0.22, "yanchor": "top", "bgcolor": "rgba(0,0,0,0)"}
     layout = _layout(title, **axes, legend=legend)
-    return layout | {"margin": {"l": 75, "r": 10, "t": 64, "b": 45}}
+    return layout | {"margin": {"l": 75, "r": 10, "t": 40, "b": 90}}

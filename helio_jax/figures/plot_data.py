@@ -5,6 +5,7 @@ own positions, so that shapes are true and occluded parts show as gaps. Draws no
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,8 @@ REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
 DETECTOR_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#999999")
 """One colour per detector, repeated (Tol's bright scheme)."""
+_LEAST_LEAN = 0.2
+"""Least 1 - tx dh/dX - ty dh/dY: the error at a fixed x, y is enlarged by up to 5."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""
 
@@ -122,9 +125,9 @@ class Profile:
 def profiles(rec: Reconstruction, true_height: np.ndarray | None = None, level: float = 0.0) -> list[Profile]:
     """Cut the surface along x and along y through the highest valid point; empty where no height is valid.
 
-    The beam shifts a point sideways with its height. An error of h at a beam position is therefore one of
-    (1 + p tx + q ty) h at a fixed x, y, for the slopes p, q and the beam's shifts tx, ty per height
-    (docs/conventions.md, Raster).
+    Where the beam shifts points along the line only, the heights are those of the file, pixel by pixel. An error h of a
+    height shifts its point, too: at a fixed x, y it is h / (1 - tx dh/dX - ty dh/dY), with the beam's shifts tx, ty per
+    height (docs/conventions.md, Slopes and normals).
 
     Args:
         rec: the heights.
@@ -134,23 +137,51 @@ def profiles(rec: Reconstruction, true_height: np.ndarray | None = None, level: 
     top = highest_valid(rec)
     if top is None:
         return []
-    use = rec.is_valid & np.isfinite(rec.height)
     tx, ty = rec.instrument.beam_shift
-    nx, ny, nz = np.moveaxis(rec.normals, -1, 0)
-    turned = np.abs(1.0 - (nx * tx + ny * ty) / np.maximum(nz, 0.05))
-    upright = rec if rec.height_std is None else rec.replace(height_std=rec.height_std * turned)
+    down, along = (
+        np.gradient(rec.height, pitch(axis), axis=k) if axis.size > 1 else np.zeros(rec.height.shape)
+        for k, axis in enumerate((rec.raster_y, rec.raster_x))
+    )
+    leaning = 1.0 / np.clip(1.0 - tx * along - ty * down, _LEAST_LEAN, None)
+    upright = rec if rec.height_std is None else rec.replace(height_std=rec.height_std * leaning)
+    true = None if true_height is None else rec.replace(height=true_height, height_std=None)
     out = []
-    for along, points, axis in (("x", rec.x, rec.raster_x), ("y", rec.y, rec.raster_y)):
-        step, middle = pitch(axis), float(points[top])
-        low, high = np.ceil((points[use].min() - middle) / step), np.floor((points[use].max() - middle) / step)
-        at = middle + step * np.arange(low, high + 1)
-        across = float((rec.y if along == "x" else rec.x)[top])
-        line = (at, np.array([across])) if along == "x" else (np.array([across]), at)
-        height, std = (found.ravel() for found in heights_at(upright, *line, use))
+    for name, shift_across in (("x", ty), ("y", tx)):
+        cut = _raster_line if abs(shift_across) < 1e-9 else _searched_line
+        at, height, std = cut(upright, name, top)
+        across = float((rec.y if name == "x" else rec.x)[top])
         truth = None
-        if true_height is not None:
-            true = rec.replace(height=true_height, height_std=None)
-            truth = heights_at(true, *line, np.isfinite(true_height))[0].ravel()
-        place = f"{'y' if along == 'x' else 'x'} = {across + 0.0:.0f} µm"
-        out.append(Profile(along, place, at, height - level, None if rec.height_std is None else std, truth))
+        if true is not None:
+            line = (at, np.array([across])) if name == "x" else (np.array([across]), at)
+            truth = heights_at(true, *line, np.isfinite(true.height))[0].ravel()
+        place = f"{'y' if name == 'x' else 'x'} = {across + 0.0:.0f} µm".replace("-", "−")
+        out.append(Profile(name, place, at, height - level, std, truth))
     return out
+
+
+def _raster_line(rec: Reconstruction, along: str, top: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Return the valid heights of the raster line through a pixel, where the beam shifts points along it only."""
+    line = (top[0], slice(None)) if along == "x" else (slice(None), top[1])
+    at, step = (rec.x, pitch(rec.raster_x)) if along == "x" else (rec.y, pitch(rec.raster_y))
+    at = at[line]
+    gap = np.flatnonzero(np.diff(at) > _LONGEST_EDGE * step) + 1  # not seen by the beam
+    height = np.where(rec.is_valid, rec.height, np.nan)[line]
+    std = (
+        None if rec.height_std is None else np.insert(np.where(rec.is_valid, rec.height_std, np.nan)[line], gap, np.nan)
+    )
+    return np.insert(at, gap, 0.5 * (at[gap - 1] + at[gap])), np.insert(height, gap, np.nan), std
+
+
+def _searched_line(rec: Reconstruction, along: str, top: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Search the valid heights along a line of the sample frame through a pixel, a pitch apart."""
+    points, axis = (rec.x, rec.raster_x) if along == "x" else (rec.y, rec.raster_y)
+    use, step, middle = rec.is_valid & np.isfinite(rec.height), pitch(axis), float(points[top])
+    low, high = np.ceil((points[use].min() - middle) / step), np.floor((points[use].max() - middle) / step)
+    at, across = middle + step * np.arange(low, high + 1), np.array([float((rec.y if along == "x" else rec.x)[top])])
+    line = (at, across) if along == "x" else (across, at)
+    height, std = (found.ravel() for found in heights_at(rec, *line, use))
+    height[int(-low)] = rec.height[top]  # exact, also beside pixels that are not valid
+    if rec.height_std is None:
+        return at, height, None
+    std[int(-low)] = rec.height_std[top]
+    return at, height, std

@@ -176,7 +176,8 @@ def _instrument(rec: Reconstruction) -> Section:
     png = base64.b64encode(canvas.figure_png(draw_instrument_views(rec.instrument), dpi=90)).decode()
     names = ", ".join(rec.instrument.detector_names)
     alt = html.escape(f"plate with the apertures of {names} from above, and the beam from the side")
-    text = f'<img alt="{alt}" src="data:image/png;base64,{png}">'
+    image = f'<img alt="{alt}" src="data:image/png;base64,{png}">'
+    text = f'<div class="scroll" role="region" tabindex="0" aria-label="drawing of the instrument">{image}</div>'
     return Section("Instrument", "", text + words.as_table(summarise(rec.instrument), about="instrument"))
 
 
@@ -279,6 +280,6 @@ def _convergence(rec: Reconstruction) -> Section:
     changes = table(rec.provenance).get("height_changes_um")
     is_known = isinstance(changes, list) and changes and all(isinstance(c, (int, float)) and c > 0 for c in changes)
     if not is_known:
-        return Section("Convergence", f"Left out: {rec.method} is not fitted by iterations. {rec.status}".strip())
+        return Section("Convergence", f"Left out: {rec.method} solves a stated number of times, nothing converges.")
     tolerance = numbers(rec.provenance, "reconstruct", "refine").get("tolerance_um")
     return Section("Convergence", rec.status, "", [draw.convergence_plot(changes, tolerance)])

@@ -55,7 +55,7 @@ details { background: var(--card); border: 1px solid var(--line); border-radius:
   padding: 6px 12px; }
 summary { cursor: pointer; }
 pre { overflow-x: auto; font-size: 0.82rem; }
-img { max-width: 100%; height: auto; background: #ffffff; border-radius: 6px; }
+img { min-width: 560px; max-width: 100%; height: auto; background: #ffffff; border-radius: 6px; }
 @media (max-width: 600px) { main { padding: 14px; } .wide { height: 420px; } th { white-space: normal; } }
 @media print { details, nav { display: none; } }
 """

@@ -6,6 +6,7 @@ Every function returns HTML; all text from files is escaped. Computes nothing bu
 import html
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,8 +29,8 @@ _SMALLEST_FACET = 0.01
 
 
 def escaped(text: Any) -> str:
-    """Escape a text and typeset its numbers."""
-    return html.escape(typeset(str(text)))
+    """Escape a text and typeset its numbers; a unit stays with its number."""
+    return html.escape(re.sub(r"(?<=\d) (?=%|µm|mm)", "\u00a0", typeset(str(text))))
 
 
 def as_table(rows: Sequence[Sequence[Any]], head: Sequence[str] = (), about: str = "") -> str:
@@ -72,7 +73,7 @@ def uncertainty_notes(rec: Reconstruction) -> str:
     notes = [f"{name}: {um:.3g} um of the highest point" for name, um in error_sources(rec)[:4]]
     weak = found.get("weak")
     for one in weak[:3] if isinstance(weak, list) else []:
-        terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in numbers(one, "of").items())
+        terms = ", ".join(f"{factor:+.2f} {name.removeprefix('log_')}" for name, factor in numbers(one, "of").items())
         left = numbers({"share": table(one).get("share")}).get("share", math.nan)
         notes.append(f"weakly determined, posterior over prior standard deviation {share(left)}: {terms}")
     common = numbers(found).get("common_mode_um", 0.0)

@@ -25,10 +25,7 @@ def verdict(rec: Reconstruction) -> tuple[str, str]:
     if not rec.is_valid.any():
         causes = rec.trust["not_valid"]
         worst = max(causes, key=lambda reason: causes[reason], default="no data")
-        return (
-            BAD,
-            f"no height is valid, mostly for the reason: {worst} ({share(causes.get(worst, 1.0))} of the pixels)",
-        )
+        return BAD, f"no height is valid; main reason: {worst} ({share(causes.get(worst, 1.0))} of the pixels)"
     if rec.is_contradicted:
         part = share(contradicted_share(rec.reason))
         return BAD, f"micrographs traced on it deviate from the data in {part} of the otherwise valid pixels"
@@ -80,7 +77,11 @@ def error_sources(rec: Reconstruction) -> list[tuple[str, float]]:
     effect, known = numbers(rec.provenance, "sensitivity"), table(rec.provenance, "instrument", "values")
     finite = rec.height[np.isfinite(rec.height)]
     top = float(np.abs(finite - np.median(finite)).max()) if finite.size else 0.0
-    found = [(name, abs(factor * std) * top) for name, factor in effect.items() if (std := _std(known.get(name)))]
+    found = [
+        (name.removeprefix("log_"), abs(factor * std) * top)
+        for name, factor in effect.items()
+        if (std := _std(known.get(name)))
+    ]
     return sorted(found, key=lambda item: -item[1])
 
 
