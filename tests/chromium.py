@@ -32,6 +32,7 @@ class Chromium:
             "--headless",
             "--no-sandbox",
             "--remote-debugging-pipe",
+            "--disable-dev-shm-usage",
             f"--user-data-dir={self._home}",
             "about:blank",
         ]
@@ -42,7 +43,7 @@ class Chromium:
                 os.dup2(end, number)
 
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._process = subprocess.Popen([program, *words, "about:blank"], preexec_fn=connect, close_fds=False, **quiet)
+        self._process = subprocess.Popen([program, *words], preexec_fn=connect, close_fds=False, **quiet)
         os.close(to_child)
         os.close(from_child)
         self.events: list[dict[str, Any]] = []
