@@ -170,6 +170,9 @@ figures/              pictures
   sheet               layout of a page in rows of cells
   panel               micrographs, heights, errors and profiles on one page
   report              HTML report
+  report_page         its template, style and script
+  report_text         its words and tables
+  trust               verdict, rule and limits of a height map in words
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   before_after        a scan before and after calibration

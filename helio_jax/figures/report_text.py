@@ -54,7 +54,7 @@ def score_table(scores: Scores) -> str:
     """Write the scores against the truth."""
     note = "<p>Percentages of heights are fractions of the known height H.</p>"
     rows = [(label, f"{value} {unit}") for label, value, unit in scores.as_table()]
-    return as_table(rows, ("against the truth", ""), "scores") + note
+    return as_table(rows, ("score against the truth", "value"), "scores") + note
 
 
 def causes(rec: Reconstruction) -> str:
@@ -100,7 +100,7 @@ def facet_tables(found: Facets, n_pixels: int) -> str:
     shown = [f for f in found.facets if f.n_pixels >= _SMALLEST_FACET * n_pixels][:MAX_ROWS]
     rows = [
         (
-            f"facet {f.number}",
+            f"{f.number}",
             f"{f.tilt_deg:.1f}",
             f"{f.azimuth_deg:.1f}",
             f"{f.area_um2 / 1e6:.4f} +- {f.area_std_um2 / 1e6:.4f}",
@@ -109,7 +109,7 @@ def facet_tables(found: Facets, n_pixels: int) -> str:
         )
         for f in shown
     ]
-    head = ("", "tilt (deg)", "azimuth (deg)", "area (mm²)", "sides (µm)", "rms (µm)")
+    head = ("facet", "tilt (deg)", "azimuth (deg)", "area (mm²)", "sides (µm)", "rms (µm)")
     text = as_table(rows, head, "facets")
     numbers_shown = {f.number for f in shown}
     edges = [e for e in found.edges if set(e.facets) <= numbers_shown][:MAX_ROWS]
@@ -130,10 +130,8 @@ def step_table(record: Mapping[str, Any]) -> str:
         height, std = step["height_um"], step["height_std_um"]
         sign = ">= " if step["is_lower_bound"] else ""
         said = "-" if height is None else f"{sign}{height:.2f} +- {std:.2f}"
-        rows.append(
-            (f"step {step['number']}", said, f"{step['falls_deg']:+.0f}", f"{step['p_wall']:.2f}", step["note"])
-        )
-    return as_table(rows, ("", "height (µm)", "falls towards (deg)", "probability of a wall", "note"), "steps")
+        rows.append((step["number"], said, f"{step['falls_deg']:+.0f}", f"{step['p_wall']:.2f}", step["note"]))
+    return as_table(rows, ("step", "height (µm)", "falls towards (deg)", "probability of a wall", "note"), "steps")
 
 
 def assumptions(rec: Reconstruction) -> list[str]:

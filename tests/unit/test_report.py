@@ -104,7 +104,7 @@ def test_report_is_complete_and_offline(tmp_path):
         "Instrument", "Micrographs", "Multiple scattering", "Height", "Surface", "Profiles", "Against the truth",
         "Uncertainty", "Validity and causes", VALID_RULE, MEANINGS["masked in too many detectors"],
         "Residuals and chi-square", "chi-square of the fit", f"D1 {np.mean(rec.residuals[0] ** 2):.2f}", "1.25",
-        "Facets", "facet 1", "Steps", "The fit took 2 levels from mask bands",
+        "Facets", "facet tilt (deg)", "Steps", "The fit took 2 levels from mask bands",
         "Convergence", "What was assumed", "assumed: 2 levels from mask bands", "gains are right within 2.0 %",
         "How it was made", "helio-jax 0.1.0", "seed 7",
         "10 atoms launched = 3 detected + 7 escaped + 0 stopped + 0 lost", "How to cite", "arXiv:2501.14833",
