@@ -278,8 +278,8 @@ def _steps(found: Mapping[str, Any] | str, rec: Reconstruction) -> Section:
 
 def _convergence(rec: Reconstruction) -> Section:
     changes = table(rec.provenance).get("height_changes_um")
-    is_known = isinstance(changes, list) and changes and all(isinstance(c, (int, float)) and c > 0 for c in changes)
-    if not is_known:
+    changes = changes if isinstance(changes, list) else []
+    if not changes or not all(isinstance(c, (int, float)) and c > 0 for c in changes):
         return Section("Convergence", f"Left out: {rec.method} solves a stated number of times, nothing converges.")
     tolerance = numbers(rec.provenance, "reconstruct", "refine").get("tolerance_um")
     return Section("Convergence", rec.status, "", [draw.convergence_plot(changes, tolerance)])
