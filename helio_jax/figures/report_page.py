@@ -49,7 +49,7 @@ figure { margin: 0; min-width: 0; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 8px 0; }
 th, td { padding: 3px 14px 3px 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
 th { font-weight: normal; color: var(--quiet); white-space: nowrap; }
-td { overflow-wrap: anywhere; min-width: 3.5em; }
+td { overflow-wrap: break-word; min-width: 3.5em; }
 .number { text-align: right; overflow-wrap: normal; white-space: nowrap; }
 details { background: var(--card); border: 1px solid var(--line); border-radius: 6px; margin: 6px 0;
   padding: 6px 12px; }
