@@ -20,6 +20,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
+  validity            the rule of is_valid: reasons, limits, words
   settings            base class of all settings tables
   drawable            plot(), short repr, notebook view and to_xarray() of the records
   kernel              how inner loops are compiled (numba)
@@ -178,6 +179,9 @@ figures/              pictures
   sheet               layout of a page in rows of cells
   panel               micrographs, heights, errors and profiles on one page
   report              HTML report
+  report_page         its template, style and script
+  report_text         its words and tables
+  trust               verdict, rule and limits of a height map in words
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   before_after        a scan before and after calibration

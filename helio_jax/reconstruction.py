@@ -14,27 +14,7 @@ from helio_jax.arrays import check_axis, pitch, set_float_arrays
 from helio_jax.drawable import OnRaster
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
-
-REASONS = (
-    "valid",
-    "too few images",
-    "masked in too many detectors",
-    "depth jump",
-    "outside the data",
-    "floating",
-    "contradicts the data",
-)
-"""Meaning of the integers of `Reconstruction.reason`."""
-
-MAX_CONTRADICTED = 0.05
-"""Largest share of contradicted pixels, among those that nothing else makes invalid, of a height map that its data do
-not contradict as a whole."""
-
-
-def contradicted_share(reason: np.ndarray) -> float:
-    """Compute the share of pixels that contradict the data among those that nothing else makes invalid."""
-    is_contradicted = reason == REASONS.index("contradicts the data")
-    return float(np.sum(is_contradicted) / max(1, np.sum(is_contradicted | (reason == 0))))
+from helio_jax.validity import CONTRADICTED, MAX_CONTRADICTED, NONE_VALID, REASONS, VALID_RULE, contradicted_share
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,13 +31,15 @@ class Reconstruction(OnRaster):
         albedo: relative reflectivity, substrate = 1 [y, x].
         height_std: standard deviation of each height [y, x], um, or None if the method gives none.
         height_samples: joint posterior deviations of all heights [sample, y, x], um, or None; see `spread`.
-        is_valid: True where enough data determine the height [y, x].
-        reason: index into `REASONS` [y, x].
+        is_valid: True where the height may be trusted, by `validity.VALID_RULE` [y, x].
+        reason: index into `validity.REASONS` [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
         chi_square: mean square deviation, in standard deviations, of the data of each pixel and its neighbours from the
             micrographs traced on this height map [y, x]; None: not tested. See `inverse.verdict`.
         gain, offset: fitted or assumed, data = gain * model + offset [detector].
         status: one sentence on how the method ended.
+        warnings: what to know before the heights are trusted, most important first; that the data contradict the map as
+            a whole, and that no height is valid, is added and removed by itself.
         provenance: history, on which no step depends (JSON-compatible).
     """
 
@@ -78,6 +60,7 @@ class Reconstruction(OnRaster):
     offset: np.ndarray | None = None
     border: Literal["flat", "free"] = "flat"
     status: str = ""
+    warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,10 +89,13 @@ class Reconstruction(OnRaster):
             object.__setattr__(self, name, value.astype(kind))
         if self.reason.max(initial=0) >= len(REASONS):
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
+        own = {CONTRADICTED: self.is_contradicted, NONE_VALID: not self.is_valid.any()}
+        others = [" ".join(text.split()) for text in self.warnings if text not in own]
+        object.__setattr__(self, "warnings", (*(text for text, holds in own.items() if holds), *others))
 
     def _in_short(self) -> str:
         ny, nx = self.height.shape
-        return f"by {self.method}: {ny} x {nx} (y, x), {self.is_valid.mean():.1%} valid"
+        return f"by {self.method}: {ny} x {nx} (y, x), {self.valid_share:.1%} valid"
 
     def spread(self, number: Callable[[np.ndarray], float]) -> tuple[float, float]:
         """Compute a number derived from the heights, and its posterior standard deviation (NaN without samples).
@@ -144,6 +130,23 @@ class Reconstruction(OnRaster):
     def is_contradicted(self) -> bool:
         """Whether the data contradict the height map as a whole: `MAX_CONTRADICTED`."""
         return contradicted_share(self.reason) > MAX_CONTRADICTED
+
+    @property
+    def valid_share(self) -> float:
+        """Share of the pixels with a valid height."""
+        return float(np.mean(self.is_valid & np.isfinite(self.height)))
+
+    @property
+    def trust(self) -> dict[str, Any]:
+        """What is to be trusted, as a JSON-compatible record: share and rule of valid heights, causes, warnings."""
+        shares = {reason: float(np.mean(self.reason == k)) for k, reason in enumerate(REASONS) if k}
+        return {
+            "valid_share": self.valid_share,
+            "valid_rule": VALID_RULE,
+            "not_valid": {reason: share for reason, share in shares.items() if share},
+            "is_contradicted": self.is_contradicted,
+            "warnings": list(self.warnings),
+        }
 
     def beam_positions(self, pixels: np.ndarray) -> np.ndarray:
         """Convert pixel coordinates (column, row) [n, 2] to beam positions (x, y) [n, 2], um."""

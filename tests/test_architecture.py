@@ -2,7 +2,7 @@
 
 Each level may import only from levels below; stages of one level are blind to one another:
 commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward, trace, formats > scene >
-nouns > settings, arrays, kernel, block_fit > errors, spelling.
+nouns > settings, arrays, kernel, block_fit > errors, spelling, validity.
 """
 
 import ast
@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
-    {"errors", "spelling"},
+    {"errors", "spelling", "validity"},
     {"arrays", "settings", "kernel", "robust", "block_fit", "drawable"},
     {"detector"},
     {"instrument"},

@@ -92,18 +92,18 @@ def say(message: str) -> None:
         print(message, file=sys.stderr, flush=True)
 
 
-def warn_if_contradicted(is_contradicted: bool, strict: bool) -> None:
-    """Warn of a height map that its own data contradict; with `strict`, end with exit code 4.
+def warn(trust: dict[str, Any], strict: bool = False) -> None:
+    """Print the warnings of a height map (`Reconstruction.trust`); with `strict`, a contradicted one ends the command.
 
     Raises:
-        GuardError: with `strict`.
+        GuardError: with `strict`, if the data contradict the map.
     """
     from helio_jax.errors import GuardError
 
-    if is_contradicted and strict:
-        raise GuardError("the data contradict the height map (--strict): it is written, see its status above")
-    if is_contradicted:
-        say("warning: the data contradict this height map: do not trust it; the status above says where they differ")
+    for text in trust["warnings"]:
+        say(f"warning: {text}")
+    if trust["is_contradicted"] and strict:
+        raise GuardError("the data contradict the height map (--strict): it is written, see its status")
 
 
 def tell_micrographs(stack: Any, output: Path, has_picture: bool, as_json: bool) -> None:

@@ -22,7 +22,7 @@ from helio_jax.commands.app import (
     print_result,
     print_table,
     set_options,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Reads
 
@@ -44,6 +44,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct a height map from three or more micrographs."""
     from helio_jax import write
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.scene_file import load_scene
@@ -60,15 +61,17 @@ def reconstruct(
     if write_instrument:
         toml.write_instrument(result, write_instrument)
     if as_json:
-        print(json.dumps(describe(output) | {"is_contradicted": result.is_contradicted, "status": result.status}))
+        about = {"method": result.method, "status": result.status, "trust": result.trust}
+        print(json.dumps(describe(output) | about))
     else:
-        print(f"{output}: {result.method}, {result.status}; {result.is_valid.mean():.1%} of the pixels valid")
+        print(f"{output}: {result.method}, {result.status}")
+        print("\n".join(trust_lines(result.trust)))
         for name, factor in result.provenance.get("sensitivity", {}).items():
-            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name}")
+            print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name.removeprefix('log_')}")
         _print_instrument(result.provenance.get("instrument", {}))
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
-    warn_if_contradicted(result.is_contradicted, strict)
+    warn(result.trust, strict)
 
 
 @app.command()
@@ -81,6 +84,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same beam positions."""
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_height
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -90,11 +94,14 @@ def evaluate(
     scores = pipeline.evaluate(rec, found)
     if as_json:
         center = list(found.region.center) if found.region else None
-        print(json.dumps(scores.as_dict() | {"center_um": center}))
+        print(json.dumps(scores.as_dict() | {"center_um": center, "trust": rec.trust}))
+        warn(rec.trust)
         return
     if found.region and fit_center:
         print(f"  centre fitted at x = {found.region.center[0]:.1f} um, y = {found.region.center[1]:.1f} um")
     print_table(scores.as_table())
+    print("\n".join(trust_lines(rec.trust)))
+    warn(rec.trust)
 
 
 @app.command()
@@ -106,9 +113,13 @@ def report(
         Path | None, typer.Option(help="Scene file or height map to compare with."), Reads(names_files=True)
     ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
+    panel: Annotated[
+        Path | None, typer.Option(help="Panel for print (.png, .pdf, .svg; default: .png beside the report)."), FIGURE
+    ] = None,
+    steps: Annotated[bool, typer.Option("--steps", help="Also measure steps in the micrographs of --stack.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write one self-contained HTML report of a height map, and a PNG panel beside it."""
+    """Write one self-contained HTML report of a height map, and a panel on one page."""
     from helio_jax.formats.hdf5 import read_height, read_stack
     from helio_jax.workflows import pipeline
     from helio_jax.workflows.truth import load_truth
@@ -116,8 +127,12 @@ def report(
     rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
     scores = pipeline.evaluate(rec, known) if known else None
-    panel = pipeline.write_report_files(output, images, rec, known, scores, title=height.stem)
-    print_result(as_json, {"report": str(output), "panel": str(panel)}, str(output), str(panel))
+    title = images.name if images else height.stem
+    drawn = pipeline.write_report_files(
+        output, images, rec, known, scores, title=title, panel_path=panel, with_steps=steps
+    )
+    print_result(as_json, {"report": str(output), "panel": str(drawn), "trust": rec.trust}, str(output), str(drawn))
+    warn(rec.trust)
 
 
 @app.command()
@@ -205,7 +220,7 @@ def measure(
         images = read_stack(stack) if stack else None
         found, lines = measure_height_map(read_height(height), wanted, figure, images)
         text = profile_table(found["profile"]) if profile and not wanted.lines else as_table(found)
-        warn_if_contradicted(found["reconstructed"]["is_contradicted"], strict=False)
+        warn(found["trust"])
     if table:
         with atomic_path(table) as part:
             part.write_text(text, encoding="utf-8")
@@ -218,10 +233,9 @@ def _print_instrument(found: dict[str, Any]) -> None:
         if unit in ("um", "deg"):
             print(f"  {name}: {value:+.2f} +- {std:.2f} {unit} from the stated value (prior {prior:g})")
     if found.get("inflation", 1.0) > 1.0:
+        common = found.get("common_mode_um", 0.0)
         print(
-            "  the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars "
-            f"are inflated by {found['inflation']:.1f} (plus up to {found.get('common_mode_um', 0.0):.0f} um for the "
-            "resulting height error)"
+            f"  error bars are inflated by {found['inflation']:.1f}; common to all heights: up to {common:.0f} um more"
         )
     for weak in found.get("weak", [])[:3]:
         terms = ", ".join(f"{factor:+.2f} {name}" for name, factor in weak["of"].items())

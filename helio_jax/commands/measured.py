@@ -27,7 +27,7 @@ from helio_jax.commands.app import (
     say,
     set_options,
     tell_micrographs,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Reads, Writes
 from helio_jax.formats.export_formats import SUFFIXES, help_text
@@ -84,13 +84,14 @@ def export(
     """Write micrographs or heights for another program; the suffix of the file selects the format."""
     from helio_jax import Reconstruction, read
     from helio_jax import export as write_foreign
+    from helio_jax.figures.trust import trust_lines
 
     found = read(file)
     left_out = write_foreign(found, output, view=view, detector=detector, invalid=invalid, grid=grid)  # type: ignore
     lines = [str(output), *(f"  not written: {what}" for what in left_out)]
     if isinstance(found, Reconstruction):
-        lines.insert(1, f"  {found.method}, {found.status}; {found.is_valid.mean():.1%} of the pixels valid")
-        warn_if_contradicted(found.is_contradicted, strict=False)
+        lines[1:1] = [f"  {line}" for line in (f"{found.method}, {found.status}", *trust_lines(found.trust))]
+        warn(found.trust)
     print_result(as_json, {"file": str(output), "not_written": left_out}, *lines)
 
 

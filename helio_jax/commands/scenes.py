@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -75,14 +75,14 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
+    from helio_jax.figures.summary import text_lines
     from helio_jax.workflows.validate import check_file
 
     found = check_file(file)
     if as_json:
         print(json.dumps(asdict(found)))
         return
-    for line in _instrument_lines(found.instrument):
-        print(f"  {line}")
+    print("\n".join(text_lines(found.about)))
     for key, value in (found.body or {}).items():
         print(f"  {key}: {value}")
     if found.body and found.body["n_open_edges"] and not found.body["n_inner_open_edges"]:
@@ -101,23 +101,6 @@ def validate(
     else:
         about += "; it has no [sample] and no [scan]"
     print(f"{file}: ok, {'a scene' if found.image else 'an instrument'} ({about})")
-
-
-def _instrument_lines(found: dict[str, Any]) -> list[str]:
-    """Format the summary of an instrument."""
-    lines = [
-        f"beam: {found['incidence_deg']:g} deg from the plate normal, travels towards azimuth {found['azimuth_deg']:g} "
-        f"deg; source {found['source']}",
-        f"plate: {found['plate']}, working distance {found['working_distance_um']:g} um, sample distance "
-        f"{found['sample_distance_um']:g} um",
-    ]
-    for detector in found["detectors"]:
-        angles = (
-            "" if detector["polar_deg"] is None else " at polar angle {polar_deg:g} deg, azimuth {azimuth_deg:g} deg"
-        )
-        channel = "" if detector["channel"] is None else ", channel {channel}"
-        lines.append(("detector {name!r}: {kind}" + angles + channel).format(**detector))
-    return lines
 
 
 @app.command()

@@ -31,7 +31,7 @@ from helio_jax.commands.app import (
     print_table,
     say,
     tell_micrographs,
-    warn_if_contradicted,
+    warn,
 )
 from helio_jax.commands.door import Force, Reads, Writes, keep_existing
 
@@ -59,6 +59,7 @@ def run(
     force: Force = False,
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
+    from helio_jax.figures.trust import trust_lines
     from helio_jax.workflows.pipeline import Executor, default_folder
     from helio_jax.workflows.pipeline import run as run_scene
     from helio_jax.workflows.scene_file import load_scene
@@ -70,16 +71,17 @@ def run(
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
-        warn_if_contradicted(result.is_contradicted, strict)
+        warn(result.trust, strict)
         return
     print(f"\n{result.name}: {result.method}, {result.status}")
     print_table(result.scores.as_table())
+    print("\n".join(trust_lines(result.trust)))
     print("\nfiles:")
     for label, path in result.files.items():
         print(f"  {label:<12} {path}")
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
-    warn_if_contradicted(result.is_contradicted, strict)
+    warn(result.trust, strict)
 
 
 @app.command()
@@ -154,9 +156,11 @@ def resume(
     path: Annotated[
         Path, typer.Argument(help="The file (OUT.h5) or folder of an unfinished simulate, run or study."), Reads()
     ],
+    picture: Picture = True,
     as_json: AsJson = False,
 ) -> None:
     """Resume an interrupted or killed run or study; finished units are not traced again."""
+    from helio_jax.formats.hdf5 import read_micrographs
     from helio_jax.workflows.pipeline import resume as resume_run
 
     if (path / "study.json").is_file():
@@ -166,6 +170,8 @@ def resume(
     else:
         files = [str(file) for file in resume_run(path, stage=Bar, say=say)]
     print_result(as_json, {"files": files}, *files)
+    if files == [str(path)] and not as_json:
+        tell_micrographs(read_micrographs(path), path, picture)
 
 
 @app.command()

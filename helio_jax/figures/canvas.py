@@ -148,6 +148,28 @@ def draw_image(
     return ax.imshow(image, cmap=cmap, vmin=limits[0], vmax=limits[1], **style)
 
 
+def contour_lines(x: np.ndarray, y: np.ndarray, values: np.ndarray, n: int = 8) -> tuple[float, list[np.ndarray]]:
+    """Find the contours of an image [y, x] at about `n` round levels.
+
+    Args:
+        x, y: positions of the columns and rows, two or more each.
+        values: the image; NaN leaves a gap.
+        n: levels at most.
+
+    Returns:
+        The distance of the levels, and the lines, each an array of points (x, y). A level at the median, which noise
+        would draw all over a flat surface, is omitted.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    finite = values[np.isfinite(values)]
+    levels = MaxNLocator(n).tick_values(float(finite.min()), float(finite.max()))
+    apart = float(levels[1] - levels[0])
+    levels = levels[np.abs(levels - np.median(finite)) > 0.2 * apart]
+    found = new_figure(1.0, 1.0, None).add_subplot().contour(x, y, np.ma.masked_invalid(values), levels)
+    return apart, [line for lines in found.allsegs for line in lines]
+
+
 def outline_text(text: Any, color: str = "black") -> None:
     """Draw a thin rim around a text, so that it can be read on any image."""
     from matplotlib import patheffects

@@ -1,9 +1,10 @@
 """Printed panel for papers: micrographs, heights, errors, profiles, numbers.
 
-Maps are drawn in the beam frame; relief and profiles at the surface points' own positions. The interactive version of
-the same data is `report`.
+Maps are drawn in the beam frame, the relief at the surface points' own positions, profiles in the sample frame. The
+interactive version of the same data is `report`.
 """
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -11,51 +12,41 @@ import numpy as np
 from helio_jax.figures import canvas
 from helio_jax.figures.maps import draw_map, draw_relief, draw_validity, label_map
 from helio_jax.figures.plot_data import (
-    apex_pixel,
+    Profile,
+    highest_valid,
+    is_checkable,
     multiple_fraction,
     observed_counts,
-    profile_band,
-    profile_line,
-    profile_place,
+    profiles,
     residual_rms,
     robust_range,
     symmetric_range,
 )
 from helio_jax.figures.sheet import Sheet
+from helio_jax.figures.trust import COLORS, verdict, verdict_text
+from helio_jax.figures.wording import typeset
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, height_error
 
 PANEL_SCORES = (
     "recovered_height", "rms_region", "rms_image", "rms_valid", "ring_error", "shape_error", "slope_rms",
-    "coverage_1", "coverage_2", "valid_fraction", "level_um", "H_um",
+    "coverage_1", "coverage_2", "valid_fraction", "H_um",
 )  # fmt: skip
 WIDTH = 12.6
 """Width of the panel [inch]."""
 
 
-def _draw_profile(ax: canvas.Axes, rec: Reconstruction, truth: Truth | None, level: float, along: str) -> None:
-    """Draw the heights of one raster line through the apex, at the surface points' own positions.
-
-    Gaps that the beam does not see are dotted.
-    """
-    pixel = apex_pixel(rec.height if truth is None else truth.height)
-
-    def draw(height: np.ndarray, label: str, **style: Any) -> None:
-        at, z, cut = profile_line(rec, height, along, pixel)
-        ax.plot(np.insert(at, cut, np.nan), np.insert(z, cut, np.nan), label=label, **style)
-        for k in cut:
-            ax.plot(at[k - 1 : k + 1], z[k - 1 : k + 1], **{**style, "lw": 0.8, "ls": ":"})
-
-    height = rec.height - level
-    if truth is not None:
-        draw(truth.height, "truth", color="#222222", lw=2.2, alpha=0.45)
-    if rec.height_std is not None:
-        outline_x, outline_z = profile_band(rec, height, along, pixel)
-        ax.fill(outline_x, outline_z, color="#4477aa", alpha=0.3, lw=0, label="± 1 std")
-    draw(height, "reconstruction", color="#4477aa", lw=1.2)
-    place = profile_place(rec, along, pixel)
-    label_map(ax, f"Profile along {along} through the apex, {place}", f"{along} (µm)", "height (µm)")
+def _draw_profile(ax: canvas.Axes, cut: Profile) -> None:
+    """Draw the heights along a line of the sample frame; gaps where none is valid."""
+    if cut.truth is not None:
+        ax.plot(cut.at, cut.truth, label="truth", color="#222222", lw=2.2, alpha=0.45)
+    if cut.height_std is not None:
+        low, high = cut.height - cut.height_std, cut.height + cut.height_std
+        ax.fill_between(cut.at, low, high, color="#4477aa", alpha=0.3, lw=0, label="± 1 s.d.")
+    ax.plot(cut.at, cut.height, label="reconstruction", color="#4477aa", lw=1.2)
+    title = f"Profile through the highest valid point, along {cut.along} at {cut.place}"
+    label_map(ax, title, f"{cut.along} (µm), sample frame", "height (µm)")
     ax.grid(color="#dddddd", lw=0.5)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -64,23 +55,27 @@ def _draw_profile(ax: canvas.Axes, rec: Reconstruction, truth: Truth | None, lev
 
 
 def _draw_numbers(ax: canvas.Axes, rec: Reconstruction, scores: Scores | None) -> None:
-    """Write the headline numbers as a table."""
+    """Write the headline numbers as a table, and the verdict below it."""
     ax.set_axis_off()
     ax.set_title("Numbers", fontsize=10, loc="left")
-    valid = float(np.mean(rec.is_valid & np.isfinite(rec.height)))
-    rows = scores.as_table(PANEL_SCORES) if scores is not None else [("valid pixels", f"{100 * valid:.1f}", "%")]
-    rows = [
-        ("method", rec.method, ""),
-        ("incidence angle", f"{rec.instrument.beam.incidence_deg:g}", "deg"),
-        ("detectors", str(len(rec.instrument.detector)), ""),
-        *rows,
-    ]
+    heights = rec.height[rec.is_valid & np.isfinite(rec.height)]
+    rows = [("method", rec.method, "")]
+    if (top := highest_valid(rec)) is not None:
+        std = rec.height_std
+        error = "" if std is None or not np.isfinite(std[top]) else f" ± {std[top]:.{0 if std[top] >= 10 else 1}f}"
+        rows.append(("highest valid point", f"{rec.height[top]:.4g}{error}", "um"))
+        rows.append(("relief of the valid heights", f"{np.ptp(heights):.4g}", "um"))
+    if scores is None:
+        rows.append(("valid pixels", f"{100 * rec.valid_share:.1f}", "%"))
+    rows += [] if scores is None else scores.as_table(PANEL_SCORES)
     step = 1.0 / 16.0
+    text = {"transform": ax.transAxes, "fontsize": 8.5, "va": "top"}
     for k, (label, value, unit) in enumerate(rows):
-        text = {"transform": ax.transAxes, "fontsize": 8.5, "va": "top"}
         ax.text(0.0, 1.0 - k * step, label, color="#444444", **text)
         ax.text(1.03, 1.0 - k * step, value, ha="right", color="#000000", **text)
         ax.text(1.06, 1.0 - k * step, unit.replace("um", "µm").replace("deg", "°"), color="#444444", **text)
+    said = textwrap.fill(f"Verdict: {verdict_text(rec)}", 48)
+    ax.text(0.0, 1.0 - (len(rows) + 0.5) * step, typeset(said), color=COLORS[verdict(rec)[0]], **text)
 
 
 def _extra_maps(rec: Reconstruction, error: np.ndarray | None) -> list[tuple[np.ndarray, str, str, dict[str, Any]]]:
@@ -91,7 +86,8 @@ def _extra_maps(rec: Reconstruction, error: np.ndarray | None) -> list[tuple[np.
         out.append((error, "Height error (reconstructed - true)", "error (µm)", style))
     if rec.height_std is not None:
         out.append((rec.height_std, "Standard deviation of height", "std (µm)", {"cmap": canvas.FRACTION_MAP}))
-    if rec.residuals is not None:
+    if is_checkable(rec):
+        assert rec.residuals is not None
         out.append((residual_rms(rec.residuals), "Residuals, RMS over detectors", "std", {"cmap": canvas.FRACTION_MAP}))
     return [*out, (rec.albedo, "Albedo", "albedo (flat = 1)", {})]
 
@@ -119,7 +115,9 @@ def panel(
     per_row = 4 if n == 4 else 3
     top = -(-n // per_row)
     tall = Sheet.map_height(x, y, WIDTH / 3)
-    sheet = Sheet(WIDTH, [Sheet.map_height(x, y, WIDTH / per_row)] * top + [tall, max(tall, 2.8), 2.3])
+    cuts = profiles(rec, None if truth is None else truth.height, level)
+    rows = [Sheet.map_height(x, y, WIDTH / per_row)] * top + [tall, max(tall, 3.2)] + [2.3] * bool(cuts)
+    sheet = Sheet(WIDTH, rows)
     if stack is not None:
         for k, (name, image) in enumerate(zip(stack.instrument.detector_names, observed_counts(stack), strict=True)):
             ax = sheet.add(k // per_row, k % per_row, per_row)
@@ -131,8 +129,8 @@ def panel(
         draw_map(sheet.add(row, column, 3), x, y, extra[0], extra[1], extra[2], **extra[3])
     draw_validity(sheet.add(top + 1, 0, 3), rec)
     _draw_numbers(sheet.add(top + 1, 2, 3), rec, scores)
-    _draw_profile(sheet.add(top + 2, 0, 2), rec, truth, level, "x")
-    _draw_profile(sheet.add(top + 2, 1, 2), rec, truth, level, "y")
+    for column, cut in enumerate(cuts):
+        _draw_profile(sheet.add(top + 2, column, 2), cut)
     return sheet.figure
 
 

@@ -1,21 +1,35 @@
 """Data that the printed panel and the interactive report draw: ranges, fractions, surface cells, profiles.
 
-Raster images stay in the beam frame; profiles and surface cells use the surface points' own positions, so that shapes
-are true and occluded parts show as gaps. Draws nothing.
+Raster images stay in the beam frame; profiles are cut in the sample frame, and surface cells use the surface points'
+own positions, so that shapes are true and occluded parts show as gaps. Draws nothing.
 """
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from helio_jax.arrays import pitch
+from helio_jax.measure.sample_grid import heights_at
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.validity import MIN_IMAGES
 
 REASON_COLORS = ("#d9d9d9", "#4477aa", "#ee6677", "#ccbb44", "#222222", "#aa3377", "#66ccee")
 """One colour per entry of `REASONS` (Tol's bright scheme, distinct for the colour-blind)."""
 DETECTOR_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#999999")
 """One colour per detector, repeated (Tol's bright scheme)."""
+_LEAST_LEAN = 0.2
+"""Least 1 - tx dh/dX - ty dh/dY: the error at a fixed x, y is enlarged by up to 5."""
 _LONGEST_EDGE = 6.0
 """Longer edges between neighbouring surface points are gaps [pitches]."""
+
+
+def is_checkable(rec: Reconstruction) -> bool:
+    """Return whether residuals test anything: a photometric method fits its three unknowns to three images exactly."""
+    if rec.residuals is None:
+        return False
+    return rec.method == "refine" or bool((np.isfinite(rec.residuals).sum(0) > MIN_IMAGES).any())
 
 
 def surface_cells(rec: Reconstruction) -> np.ndarray:
@@ -43,13 +57,6 @@ def cell_corners(rec: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
 def cell_means(values: np.ndarray) -> np.ndarray:
     """Average values [y, x, ...] over the four corners of each raster cell [y-1, x-1, ...]."""
     return 0.25 * (values[1:, 1:] + values[1:, :-1] + values[:-1, 1:] + values[:-1, :-1])
-
-
-def apex_pixel(height: np.ndarray) -> tuple[int, int]:
-    """Find the pixel (row, column) farthest above or below the median height; NaN is ignored."""
-    away = np.abs(height - np.nanmedian(height)) if np.isfinite(height).any() else np.zeros(height.shape)
-    row, column = np.unravel_index(np.argmax(np.where(np.isfinite(away), away, -1.0)), height.shape)
-    return int(row), int(column)
 
 
 def highest_valid(rec: Reconstruction) -> tuple[int, int] | None:
@@ -94,32 +101,87 @@ def residual_rms(residuals: np.ndarray) -> np.ndarray:
     return np.sqrt(np.divide((total**2).sum(0), n, out=np.full(n.shape, np.nan), where=n > 0))
 
 
-def profile_line(
-    rec: Reconstruction, height: np.ndarray, along: str, pixel: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Read one raster line of `height` through `pixel`, at the surface points' own positions.
+@dataclass(frozen=True)
+class Profile:
+    """Heights along a line of the sample frame through a point.
 
-    Returns:
-        Positions along "x" or "y" [um], heights [um], and the indices before which the beam leaves a gap.
+    Attributes:
+        along: "x" or "y".
+        place: of the line, e.g. "y = 40 µm".
+        at: positions along it [um].
+        height: valid heights there [um]; NaN: not valid, or not seen by the beam.
+        height_std: standard deviation of the height at a fixed x, y [um], or None.
+        truth: true heights [um], or None.
     """
-    line = (pixel[0], slice(None)) if along == "x" else (slice(None), pixel[1])
-    points = rec.instrument.surface_position(rec.raster_x[None, :], rec.raster_y[:, None], height)
-    at = points[0 if along == "x" else 1] + np.zeros_like(height)
-    step = pitch(rec.raster_x if along == "x" else rec.raster_y)
-    return at[line], height[line], np.flatnonzero(np.abs(np.diff(at[line])) > _LONGEST_EDGE * step) + 1
+
+    along: str
+    place: str
+    at: np.ndarray
+    height: np.ndarray
+    height_std: np.ndarray | None
+    truth: np.ndarray | None
 
 
-def profile_band(
-    rec: Reconstruction, height: np.ndarray, along: str, pixel: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Outline height +- height_std along one raster line: positions and heights [um], without missing points."""
-    assert rec.height_std is not None  # callers check
-    low, high = (profile_line(rec, height + s * rec.height_std, along, pixel) for s in (-1, 1))
-    use = np.isfinite(low[1]) & np.isfinite(high[1])
-    return tuple(np.concatenate([low[k][use], high[k][use][::-1]]) for k in (0, 1))  # type: ignore[return-value]
+def profiles(rec: Reconstruction, true_height: np.ndarray | None = None, level: float = 0.0) -> list[Profile]:
+    """Cut the surface along x and along y through the highest valid point; empty where no height is valid.
+
+    Where the beam shifts points along the line only, the heights are those of the file, pixel by pixel. An error h of a
+    height shifts its point, too: at a fixed x, y it is h / (1 - tx dh/dX - ty dh/dY), with the beam's shifts tx, ty per
+    height (docs/conventions.md, Slopes and normals).
+
+    Args:
+        rec: the heights.
+        true_height: true heights of the same raster [y, x], um.
+        level: subtracted from the reconstructed heights [um].
+    """
+    top = highest_valid(rec)
+    if top is None:
+        return []
+    tx, ty = rec.instrument.beam_shift
+    down, along = (
+        np.gradient(rec.height, pitch(axis), axis=k) if axis.size > 1 else np.zeros(rec.height.shape)
+        for k, axis in enumerate((rec.raster_y, rec.raster_x))
+    )
+    leaning = 1.0 / np.clip(1.0 - tx * along - ty * down, _LEAST_LEAN, None)
+    upright = rec if rec.height_std is None else rec.replace(height_std=rec.height_std * leaning)
+    true = None if true_height is None else rec.replace(height=true_height, height_std=None)
+    out = []
+    for name, shift_across in (("x", ty), ("y", tx)):
+        cut = _raster_line if abs(shift_across) < 1e-9 else _searched_line
+        at, height, std = cut(upright, name, top)
+        across = float((rec.y if name == "x" else rec.x)[top])
+        truth = None
+        if true is not None:
+            line = (at, np.array([across])) if name == "x" else (np.array([across]), at)
+            truth = heights_at(true, *line, np.isfinite(true.height))[0].ravel()
+        place = f"{'y' if name == 'x' else 'x'} = {across + 0.0:.0f} µm".replace("-", "−")
+        out.append(Profile(name, place, at, height - level, std, truth))
+    return out
 
 
-def profile_place(rec: Reconstruction, along: str, pixel: tuple[int, int]) -> str:
-    """Name the raster line of a profile through `pixel`, e.g. "Y = 40 µm"."""
-    row, column = pixel
-    return f"Y = {rec.raster_y[row]:.0f} µm" if along == "x" else f"X = {rec.raster_x[column]:.0f} µm"
+def _raster_line(rec: Reconstruction, along: str, top: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Return the valid heights of the raster line through a pixel, where the beam shifts points along it only."""
+    line = (top[0], slice(None)) if along == "x" else (slice(None), top[1])
+    at, step = (rec.x, pitch(rec.raster_x)) if along == "x" else (rec.y, pitch(rec.raster_y))
+    at = at[line]
+    gap = np.flatnonzero(np.diff(at) > _LONGEST_EDGE * step) + 1  # not seen by the beam
+    height = np.where(rec.is_valid, rec.height, np.nan)[line]
+    std = (
+        None if rec.height_std is None else np.insert(np.where(rec.is_valid, rec.height_std, np.nan)[line], gap, np.nan)
+    )
+    return np.insert(at, gap, 0.5 * (at[gap - 1] + at[gap])), np.insert(height, gap, np.nan), std
+
+
+def _searched_line(rec: Reconstruction, along: str, top: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Search the valid heights along a line of the sample frame through a pixel, a pitch apart."""
+    points, axis = (rec.x, rec.raster_x) if along == "x" else (rec.y, rec.raster_y)
+    use, step, middle = rec.is_valid & np.isfinite(rec.height), pitch(axis), float(points[top])
+    low, high = np.ceil((points[use].min() - middle) / step), np.floor((points[use].max() - middle) / step)
+    at, across = middle + step * np.arange(low, high + 1), np.array([float((rec.y if along == "x" else rec.x)[top])])
+    line = (at, across) if along == "x" else (across, at)
+    height, std = (found.ravel() for found in heights_at(rec, *line, use))
+    height[int(-low)] = rec.height[top]  # exact, also beside pixels that are not valid
+    if rec.height_std is None:
+        return at, height, None
+    std[int(-low)] = rec.height_std[top]
+    return at, height, std

@@ -1,30 +1,63 @@
-"""One self-contained HTML report of a reconstruction: numbers, interactive maps, 3-D surface, provenance.
+"""One self-contained HTML report of a reconstruction: verdict, numbers, interactive figures, how it was made.
 
-The page holds plotly.js once and every figure (`interactive`) as JSON, so it opens offline and loads nothing. Figures
-are drawn when scrolled to, in the colours of the reader's light or dark scheme. All text from files is escaped.
-Computes no scores.
+The page (`report_page`) holds plotly.js once and every figure (`interactive`) as JSON, so it opens offline and loads
+nothing. What cannot be shown is left out with its reason. All text from files is escaped. Computes no scores.
 """
 
 import base64
 import html
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from helio_jax.errors import InputFileError, SceneError
-from helio_jax.figures.interactive import figure_json, plotly_script, report_groups
+from helio_jax.errors import SceneError
+from helio_jax.figures import canvas
+from helio_jax.figures import interactive as draw
+from helio_jax.figures import report_text as words
+from helio_jax.figures.instrument_page import draw_instrument_views
+from helio_jax.figures.interactive import Picture
+from helio_jax.figures.plot_data import is_checkable, profiles
+from helio_jax.figures.report_page import PAGE, SCRIPT, STYLE
+from helio_jax.figures.summary import summarise
+from helio_jax.figures.trust import BAD, CARE, GOOD, error_sources, limits, numbers, table, verdict
 from helio_jax.formats.safe import atomic_path
+from helio_jax.measure.facets import Facets
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
-from helio_jax.scores.metrics import Scores, Truth
+from helio_jax.scores.metrics import Scores, Truth, height_error
 
 CITATION = (
     "A. Radić, S. Lambrick, C. Zhao et al., Heliometric stereo: a new frontier in surface profilometry, "
     "arXiv:2501.14833 (the method).",
     "helio_jax, version as given under provenance (this software).",
 )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured on the heights for a report; a text says why something was not.
+
+    Attributes:
+        facets: planar facets.
+        steps: record of `measure_steps` on the micrographs.
+    """
+
+    facets: Facets | str = "they were not measured: helio measure --facets"
+    steps: Mapping[str, Any] | str = "they were not measured: helio measure --steps"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page: title, a note, HTML, and figures."""
+
+    title: str
+    note: str = ""
+    text: str = ""
+    pictures: list[Picture] = field(default_factory=list)
 
 
 def write_report(
@@ -34,10 +67,10 @@ def write_report(
     truth: Truth | None = None,
     scores: Scores | None = None,
     *,
-    panel_png: bytes | str | Path | None = None,
+    measured: Measured = Measured(),
     title: str = "Helium microscopy: height reconstruction",
 ) -> Path:
-    """Write the report as one HTML file, atomically.
+    """Write the report as one HTML file of less than 8 MB, atomically.
 
     Args:
         path: of the file to write.
@@ -45,188 +78,208 @@ def write_report(
         rec: the reconstruction.
         truth: true heights on the same raster, for the error map and the profiles.
         scores: from `evaluate_height`.
-        panel_png: the printed panel to embed, as bytes or as a file.
+        measured: facets and steps.
         title: heading of the page.
 
     Returns:
         The path.
 
     Raises:
-        InputFileError: the truth has another raster, or the panel cannot be read or is not a PNG.
+        InputFileError, GuardError: the truth does not fit the reconstruction (see `height_error`).
         SceneError: the suffix is not .html, or the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise SceneError(f"{path}: a report is HTML: give it the suffix .html, got {path.suffix!r}")
-    sections, figures = _sections(stack, rec, truth)
-    body = [f"<h1>{html.escape(title)}</h1>", _headline(stack, rec), _score_table(rec, scores)]
-    body += sections
-    if panel_png is not None:
-        body.append(f'<h2>Panel</h2><img alt="Printed panel" src="data:image/png;base64,{_read_png(panel_png)}">')
-    body += [_provenance(stack, rec, scores), "<h2>How to cite</h2><ul>"]
-    body += [f"<li>{html.escape(line)}</li>" for line in CITATION] + ["</ul>"]
+    found = sections(stack, rec, truth, scores, measured)
+    body, figures = [f"<h1>{html.escape(title)}</h1>", _headline(stack, rec), _contents(found)], {}
+    for number, section in enumerate(found):
+        note = f"<p>{words.escaped(section.note)}</p>" if section.note else ""
+        body.append(f'<h2 id="section-{number}">{html.escape(section.title)}</h2>{note}')
+        places = []
+        for picture in section.pictures:
+            place, alt = f"figure-{len(figures)}", html.escape(words.typeset(picture.alt))
+            figures[place] = draw.figure_json(picture.figure)
+            shown = f'<div id="{place}" class="{picture.kind}"></div>'
+            places.append(f'<figure class="{picture.kind}" aria-label="{alt}">{shown}</figure>')
+        body += [f'<div class="row">{"".join(places)}</div>'] if places else []
+        body.append(section.text)
     data = "{" + ",".join(f"{json.dumps(k)}:{v}" for k, v in figures.items()) + "}"
-    page = _PAGE.format(
+    page = PAGE.format(
         title=html.escape(title),
-        style=_STYLE,
+        style=STYLE,
         body="\n".join(body),
-        plotly=plotly_script(),
+        plotly=draw.plotly_script(),
         data=data.replace("<", "\\u003c"),
-        script=_SCRIPT,
+        script=SCRIPT,
     )
     with atomic_path(path) as part:
         part.write_text(page, encoding="utf-8")
     return path
 
 
-def _read_png(panel: bytes | str | Path) -> str:
-    """Return a PNG as base64 text."""
-    try:
-        data = panel if isinstance(panel, bytes) else Path(panel).read_bytes()
-    except OSError as e:
-        raise InputFileError(f"the panel {panel} cannot be read: {e.strerror}") from None
-    if not data.startswith(b"\x89PNG"):
-        raise InputFileError(f"the panel must be a PNG file, got {len(data)} bytes of something else")
-    return base64.b64encode(data).decode()
+def sections(
+    stack: MicrographStack | None,
+    rec: Reconstruction,
+    truth: Truth | None,
+    scores: Scores | None,
+    measured: Measured = Measured(),
+) -> list[Section]:
+    """Make all sections of a report, in reading order."""
+    error, level = (None, 0.0) if truth is None else height_error(rec, truth)
+    residuals = rec.residuals if is_checkable(rec) else None
+    n_maps = 3 + (error is not None) + (0 if residuals is None else len(residuals))
+    n_values = n_maps * rec.height.size + (
+        0 if stack is None else (1 + (stack.by_order is not None)) * stack.counts.size
+    )
+    step = draw.thinning_of(n_values, draw.MAX_MAP_VALUES)
+    return [
+        _instrument(rec),
+        *_micrographs(stack, step),
+        *_heights(rec, step),
+        _profiles(rec, truth, level),
+        *([] if error is None else [_errors(rec, error, scores, step)]),
+        _uncertainty(rec, step),
+        Section("Validity and causes", "Why pixels are not valid.", words.causes(rec), [draw.validity_map(rec, step)]),
+        _residuals(rec, residuals, step),
+        _facets(measured.facets, rec),
+        _steps(measured.steps, rec),
+        _convergence(rec),
+        Section("What was assumed", "", words.as_list(words.assumptions(rec))),
+        Section("How it was made", "", words.made(rec, stack) + words.provenance(rec, stack, scores)),
+        Section("How to cite", "", words.as_list(CITATION)),
+    ]
 
 
 def _headline(stack: MicrographStack | None, rec: Reconstruction) -> str:
-    """Return one paragraph: scan, instrument, method, and the status of the reconstruction."""
-    rows, columns = rec.height.shape
-    facts = [
-        f"{columns} x {rows} pixels",
-        f"{len(rec.instrument.detector)} detectors",
-        f"incidence {rec.instrument.beam.incidence_deg:g}°",
-        f"method {rec.method}",
-    ]
+    """Write verdict, warnings, and the numbers that a reader wants first."""
+    word, reason = verdict(rec)
+    tone = {GOOD: "good", CARE: "care", BAD: "bad"}[word]
+    rows = [row for row in summarise(rec) if row[0] not in ("verdict", "WARNING", "beam", "made")]
     if stack is not None:
-        facts.insert(0, f"{stack.name} ({stack.noise})")
-    status = f"<br>{html.escape(rec.status)}" if rec.status else ""
-    if rec.is_contradicted:
-        status = f'<br><strong class="warning">Warning: the data contradict this height map.</strong>{status}'
-    return f'<p class="facts">{html.escape(" · ".join(facts))}{status}</p>'
+        about = dict(summarise(stack))
+        rows.insert(2, ("micrographs", about["micrographs"]))
+        rows.insert(3, ("counts of", about["counts of"]))
+        rows[4:4] = [(label, text) for label, text in about.items() if label.startswith("- ")]
+    rows.append(("limited by", "; ".join(limits(rec))))
+    warned = [f'<p class="bad warning">Warning: {words.escaped(text)}.</p>' for text in rec.warnings]
+    said = f'<p class="verdict {tone}">This height map is {words.escaped(word)}: {words.escaped(reason)}.</p>'
+    return said + "".join(warned) + words.as_table(rows, about="headline numbers")
 
 
-def _score_table(rec: Reconstruction, scores: Scores | None) -> str:
-    """Return the scores as a table; without scores, the fraction of valid pixels."""
-    valid = 100 * float(np.mean(rec.is_valid & np.isfinite(rec.height)))
-    rows = [("valid pixels", f"{valid:.1f}", "%")] if scores is None else scores.as_table()
-    lines = []
-    for label, value, unit in rows:
-        shown = unit.replace("um", "µm").replace("deg", "°")
-        lines.append(f"<tr><th>{html.escape(label)}</th><td><b>{value}</b></td><td>{shown}</td></tr>")
-    note = "" if scores is None else "<p>Percentages of heights are fractions of the known height H.</p>"
-    return f"<h2>Numbers</h2><table><tr><th></th><th>this work</th><th></th></tr>{''.join(lines)}</table>{note}"
+def _contents(found: list[Section]) -> str:
+    links = (f'<a href="#section-{k}">{html.escape(section.title)}</a>' for k, section in enumerate(found))
+    return f'<nav aria-label="contents">{" ".join(links)}</nav>'
 
 
-def _provenance(stack: MicrographStack | None, rec: Reconstruction, scores: Scores | None) -> str:
-    """Return the provenance of all inputs, folded."""
-    parts: dict[str, Any] = {"reconstruction": dict(rec.provenance)}
-    for name in ("gain", "offset"):
-        value = getattr(rec, name)
-        if value is not None:
-            parts[name] = dict(zip(rec.instrument.detector_names, value.tolist(), strict=True))
-    parts["instrument"] = rec.instrument.model_dump(mode="json", exclude_none=True)
-    if stack is not None:
-        parts["micrographs"] = dict(stack.provenance)
-    if scores is not None:
-        parts["scores"] = scores.as_dict()
-    out = ["<h2>Provenance</h2>"]
-    for name, value in parts.items():
-        text = html.escape(json.dumps(value, indent=2, default=str, ensure_ascii=False))
-        out.append(f"<details><summary>{name}</summary><pre>{text}</pre></details>")
-    return "".join(out)
+def _instrument(rec: Reconstruction) -> Section:
+    png = base64.b64encode(canvas.figure_png(draw_instrument_views(rec.instrument), dpi=90)).decode()
+    names = ", ".join(rec.instrument.detector_names)
+    alt = html.escape(f"plate with the apertures of {names} from above, and the beam from the side")
+    image = f'<img alt="{alt}" src="data:image/png;base64,{png}">'
+    text = f'<div class="scroll" role="region" tabindex="0" aria-label="drawing of the instrument">{image}</div>'
+    return Section("Instrument", "", text + words.as_table(summarise(rec.instrument), about="instrument"))
 
 
-def _sections(
-    stack: MicrographStack | None, rec: Reconstruction, truth: Truth | None
-) -> tuple[list[str], dict[str, str]]:
-    """Return the HTML of all figure sections, and the figures' JSON by the id of their element."""
-    out: list[str] = []
-    figures: dict[str, str] = {}
-    for group in report_groups(stack, rec, truth):
-        places = []
-        for figure in group.figures:
-            place = f"figure-{len(figures)}"
-            figures[place] = figure_json(figure)
-            kind = {"mesh3d": "wide", "scatter": "half"}.get(figure["data"][0]["type"], "plot")
-            places.append(f'<div id="{place}" class="{kind}"></div>')
-        note = html.escape(group.note)
-        out.append(f'<h2>{group.title}</h2><p>{note}</p><div class="row">{"".join(places)}</div>')
-    return out, figures
+def _thinned(step: int) -> str:
+    return f" Thinned to 1 of {step} x {step} pixels; the data file holds all." if step > 1 else ""
 
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<main>
-{body}
-</main>
-<script>{plotly}</script>
-<script id="figures" type="application/json">{data}</script>
-<script>{script}</script>
-</body>
-</html>
-"""
+def _micrographs(stack: MicrographStack | None, step: int) -> list[Section]:
+    if stack is None:
+        return [Section("Micrographs", "Left out: they were not given (helio report --stack FILE.h5).")]
+    note = f"Over the beam positions, in {stack.unit} per pixel.{_thinned(step)}"
+    out = [Section("Micrographs", note, "", draw.micrograph_maps(stack, step))]
+    if multiple := draw.multiple_maps(stack, step):
+        out.append(Section("Multiple scattering", f"Share of the counts.{_thinned(step)}", "", multiple))
+    return out
 
-_STYLE = """
-:root { --text: #1c1e21; --quiet: #5b6168; --line: #d9dce0; --page: #ffffff; --card: #f6f7f9; }
-@media (prefers-color-scheme: dark) {
-  :root { --text: #e6e8ea; --quiet: #a2a8af; --line: #3a3f45; --page: #16181b; --card: #1e2125; }
-}
-body { margin: 0; background: var(--page); color: var(--text); font: 16px/1.5 system-ui, sans-serif; }
-main { max-width: 1240px; margin: 0 auto; padding: 24px; }
-h1 { font-size: 1.6rem; margin: 0 0 4px; }
-h2 { font-size: 1.15rem; margin: 36px 0 4px; border-top: 1px solid var(--line); padding-top: 16px; }
-p { margin: 0 0 10px; color: var(--quiet); }
-.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(340px, 1fr)); gap: 12px; }
-.plot { height: 380px; min-width: 0; }
-.half { height: 340px; min-width: 0; }
-.wide { height: 620px; min-width: 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 8px 0; }
-th, td { padding: 3px 14px 3px 0; border-bottom: 1px solid var(--line); text-align: right; }
-th:first-child { text-align: left; font-weight: normal; }
-td:last-child, tr:first-child th:last-child { text-align: left; color: var(--quiet); }
-details { background: var(--card); border: 1px solid var(--line); border-radius: 6px; margin: 6px 0;
-  padding: 6px 12px; }
-summary { cursor: pointer; }
-pre { overflow-x: auto; font-size: 0.82rem; }
-img { max-width: 100%; background: #ffffff; border-radius: 6px; }
-@media print { details { display: none; } }
-"""
 
-_SCRIPT = """
-const figures = JSON.parse(document.getElementById('figures').textContent);
-const scheme = window.matchMedia('(prefers-color-scheme: dark)');
-function colours() {
-  const css = getComputedStyle(document.documentElement);
-  const text = css.getPropertyValue('--text').trim(), line = css.getPropertyValue('--line').trim();
-  const change = {'font.color': text, 'font.family': 'system-ui, sans-serif', 'font.size': 12,
-    'paper_bgcolor': 'rgba(0,0,0,0)', 'plot_bgcolor': 'rgba(0,0,0,0)',
-    'modebar.bgcolor': 'rgba(0,0,0,0)', 'modebar.color': '#9aa0a6', 'modebar.activecolor': text};
-  for (const axis of ['xaxis', 'yaxis']) {
-    change[axis + '.gridcolor'] = line; change[axis + '.zerolinecolor'] = line; change[axis + '.linecolor'] = line;
-  }
-  return change;
-}
-function draw(place) {
-  const figure = figures[place.id];
-  const options = {responsive: true, displaylogo: false, plotlyServerURL: '',  // data stay on this machine
-    showSendToCloud: false, modeBarButtonsToRemove: ['sendChartToCloud', 'sendDataToCloud']};
-  Plotly.newPlot(place, figure.data, figure.layout, options).then(() => Plotly.relayout(place, colours()));
-}
-const places = Object.keys(figures).map(id => document.getElementById(id));
-const watch = new IntersectionObserver(seen => seen.forEach(entry => {
-  if (entry.isIntersecting) { watch.unobserve(entry.target); draw(entry.target); }
-}), {rootMargin: '400px'});
-places.forEach(place => watch.observe(place));
-scheme.addEventListener('change', () => places.filter(p => p.data).forEach(p => Plotly.relayout(p, colours())));
-window.addEventListener('beforeprint', () => places.filter(p => !p.data).forEach(draw));
-"""
+def _heights(rec: Reconstruction, step: int) -> list[Section]:
+    picture, apart = draw.height_map(rec)
+    note = "In the beam frame, one pixel per beam position; the cursor reads the file's value."
+    note += f" Contours every {apart:g} um." if apart else ""
+    note += "" if rec.is_valid.all() else " Grey: not valid."
+    note += " Cross: the highest valid point." if rec.is_valid.any() else ""
+    note += _thinned(draw.thinning_of(rec.height.size, draw.MAX_HEIGHT_VALUES))
+    albedo = draw.image_map(rec.raster_x, rec.raster_y, rec.albedo, "albedo", "(substrate = 1)", "Greys_r", step=step)
+    out = [Section("Height", note, "", [picture, albedo])]
+    about = "At the points' own positions, true to scale; drag to rotate. Gaps: not seen by the beam."
+    return [*out, Section("Surface", about, "", [draw.surface(rec)])]
+
+
+def _profiles(rec: Reconstruction, truth: Truth | None, level: float) -> Section:
+    cuts = profiles(rec, None if truth is None else truth.height, level)
+    if not cuts:
+        return Section("Profiles", "Left out: no height is valid.")
+    note = (
+        "Through the highest valid point, in the sample frame; gaps where no height is valid or the beam does not see."
+    )
+    note += "" if truth is None else f" A level of {level:.3g} um is removed, as in the scores."
+    return Section("Profiles", note, "", [draw.profile_plot(cut) for cut in cuts])
+
+
+def _errors(rec: Reconstruction, error: np.ndarray, scores: Scores | None, step: int) -> Section:
+    text = "" if scores is None else words.score_table(scores)
+    return Section("Against the truth", _thinned(step).strip(), text, [draw.error_map(rec, error, step)])
+
+
+def _uncertainty(rec: Reconstruction, step: int) -> Section:
+    notes = words.uncertainty_notes(rec)
+    if rec.height_std is None:
+        return Section("Uncertainty", "Left out: the method gave no error bars.", notes)
+    known = rec.height_std[rec.is_valid] if rec.is_valid.any() else rec.height_std
+    style = {"colors": "Magma", "limits": (0.0, draw.robust_range(known, 2.0)[1]), "step": step}
+    pictures = [draw.image_map(rec.raster_x, rec.raster_y, rec.height_std, "standard deviation", "um", **style)]
+    if sources := error_sources(rec):
+        names, values = zip(*sources, strict=True)
+        pictures.append(draw.bar_plot("share in the s.d. of the highest point", names, values, "um"))
+    return Section("Uncertainty", f"One standard deviation of each height.{_thinned(step)}", notes, pictures)
+
+
+def _residuals(rec: Reconstruction, residuals: np.ndarray | None, step: int) -> Section:
+    pictures = [] if residuals is None else draw.residual_maps(rec, residuals, step)
+    if residuals is not None:
+        note = f"(data - model) / standard deviation of each detector.{_thinned(step)}"
+    elif rec.residuals is None:
+        note = "Residuals are left out: the file holds none."
+    else:
+        note = (
+            "Residuals are left out: three images determine the three unknowns of each pixel, nothing is left to check."
+        )
+    if rec.chi_square is not None:
+        style = {"colors": "Magma", "limits": (0.0, 5.0), "step": step}
+        chi = draw.image_map(rec.raster_x, rec.raster_y, rec.chi_square, "chi-square, traced", "", **style)
+        pictures.append(chi)
+        note += (
+            " The traced map: micrographs traced on the finished heights against the data, mean square of 3 x 3 pixels."
+        )
+    else:
+        note += " The data have not been tested against micrographs traced on this map."
+    return Section("Residuals and chi-square", note, words.chi_square_table(rec, residuals), pictures)
+
+
+def _facets(found: Facets | str, rec: Reconstruction) -> Section:
+    if isinstance(found, str):
+        return Section("Facets", f"Left out: {found}.")
+    note = "Planar pieces of the surface; one that is curved falls into several."
+    return Section("Facets", note, words.facet_tables(found, rec.height.size))
+
+
+def _steps(found: Mapping[str, Any] | str, rec: Reconstruction) -> Section:
+    assumed = table(rec.provenance).get("assumed")
+    taken = f" The fit took {assumed}." if isinstance(assumed, str) and "mask bands" in assumed else ""
+    if isinstance(found, str):
+        return Section("Steps", f"Left out: {found}.{taken}")
+    if not found["steps"]:
+        return Section("Steps", f"None: no straight edge with mask bands was found.{taken}")
+    return Section("Steps", f"Heights of walls from the mask bands of the micrographs.{taken}", words.step_table(found))
+
+
+def _convergence(rec: Reconstruction) -> Section:
+    changes = table(rec.provenance).get("height_changes_um")
+    changes = changes if isinstance(changes, list) else []
+    if not changes or not all(isinstance(c, (int, float)) and c > 0 for c in changes):
+        return Section("Convergence", f"Left out: {rec.method} solves a stated number of times, nothing converges.")
+    tolerance = numbers(rec.provenance, "reconstruct", "refine").get("tolerance_um")
+    return Section("Convergence", rec.status, "", [draw.convergence_plot(changes, tolerance)])

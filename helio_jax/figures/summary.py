@@ -4,7 +4,6 @@ Rows of (label, text) for `helio info`, for the end of `helio simulate` and `hel
 plain text: um, deg.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,15 @@ import numpy as np
 from helio_jax.arrays import pitch
 from helio_jax.figures.image_numbers import image_numbers
 from helio_jax.figures.plot_data import highest_valid
+from helio_jax.figures.trust import table, trust_rows, verdict_text
 from helio_jax.figures.wording import UNITS, amount, angle, duration, length, lengths, plural, share, short
 from helio_jax.heightmap import HeightMap
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.scene import Scene
 
 Rows = list[tuple[str, str]]
-VALID_RULE = "a height is valid if enough data determine it and the data do not contradict it"
-"""What `is_valid` states, in words."""
 MAX_SCANS = 8
 """A summary lists at most this many scans of a set."""
 KINDS = {"expected": "expected counts", "poisson": "counts with noise", "measured": "measured counts"}
@@ -139,27 +137,29 @@ def _set_rows(scans: MicrographSet) -> Rows:
 
 def _reconstruction_rows(rec: Reconstruction) -> Rows:
     rows = [("height map", f"by {rec.method} from {plural(len(rec.instrument.detector), 'image')}")]
+    rows.append(("verdict", verdict_text(rec)))
     rows.append(("raster", f"{raster_text(rec.raster_x, rec.raster_y)} (beam frame)"))
-    top = highest_valid(rec)
-    if top is None:
-        rows.append(("highest point", "none: no height is valid"))
-    else:
-        z, std = rec.height[top], None if rec.height_std is None else rec.height_std[top]
-        error = "" if std is None or not np.isfinite(std) else f" +- {std:.{0 if std >= 10 else 1}f}"
-        place = f"x = {rec.x[top]:.0f} um, y = {rec.y[top]:.0f} um"
-        rows.append(("highest point", f"{z:.4g}{error} um at {place} (of the valid ones)"))
+    rows.append(("highest point", highest_text(rec)))
+    if rec.is_valid.any():
         heights = rec.height[rec.is_valid & np.isfinite(rec.height)]
-        rows.append(("heights", f"{heights.min():.4g} to {heights.max():.4g} um above {_level(rec)}"))
+        low, high = float(heights.min()), float(heights.max())
+        rows.append(("heights", f"{low:.4g} to {high:.4g} um above {_level(rec)}: relief {high - low:.4g} um"))
     if rec.height_std is not None and rec.is_valid.any():
         rows.append(("standard dev.", f"{np.nanmedian(rec.height_std[rec.is_valid]):.3g} um (median of valid heights)"))
-    rows.append(("valid", f"{share(float(rec.is_valid.mean()))} of the pixels: {VALID_RULE}"))
-    numbers = ((reason, float(np.mean(rec.reason == k))) for k, reason in enumerate(REASONS) if k)
-    causes = [f"{reason} {share(part)}" for reason, part in numbers if part]
-    rows += [("not valid", ", ".join(causes))] if causes else []
-    if rec.is_contradicted:
-        rows.append(("WARNING", "the data contradict this height map: do not trust it"))
+    rows += trust_rows(rec.trust)
+    rows += [("WARNING", "; ".join(rec.warnings))] if rec.warnings else []
     rows += [("status", rec.status)] if rec.status else []
-    return [*rows, ("beam", _beam_text(rec.instrument)), *_made_rows(rec.provenance)]
+    return [*rows, ("beam", _beam_text(rec.instrument)), *_made_rows(table(rec.provenance, "stack"))]
+
+
+def highest_text(rec: Reconstruction) -> str:
+    """Write the highest valid height with its standard deviation and its place in the sample frame."""
+    top = highest_valid(rec)
+    if top is None:
+        return "none: no height is valid"
+    z, std = rec.height[top], None if rec.height_std is None else rec.height_std[top]
+    error = "" if std is None or not np.isfinite(std) else f" +- {std:.{0 if std >= 10 else 1}f}"
+    return f"{z:.4g}{error} um at x = {rec.x[top] + 0.0:.0f} um, y = {rec.y[top] + 0.0:.0f} um (of the valid ones)"
 
 
 def _level(rec: Reconstruction) -> str:
@@ -220,8 +220,8 @@ def _scene_rows(scene: Scene) -> Rows:
 
 def _made_rows(provenance: Any) -> Rows:
     """Write where the data come from, as far as their history states it; the history of a file may hold anything."""
-    source, scan = _table(provenance, "source"), _table(provenance, "metadata", "meas_list")
-    trace, versions = _table(provenance, "scene", "trace"), _table(provenance, "versions")
+    source, scan = table(provenance, "source"), table(provenance, "metadata", "meas_list")
+    trace, versions = table(provenance, "scene", "trace"), table(provenance, "versions")
     parts = [f"imported from {source.get('file')} ({source.get('kind')})"] if source else []
     if isinstance(took := scan.get("scan_time"), (int, float)):
         parts.append(f"scanned in {duration(took)}")
@@ -234,10 +234,3 @@ def _made_rows(provenance: Any) -> Rows:
     parts += [f"helio_jax {versions['helio-jax']}"] if "helio-jax" in versions else []
     parts += [str(provenance["time"])] if "time" in provenance else []
     return [("made", short(", ".join(parts), 300))] if parts else []
-
-
-def _table(values: Any, *path: str) -> dict[str, Any]:
-    """Return a table within tables; an empty one if it is not there or no table."""
-    for name in path:
-        values = values.get(name) if isinstance(values, Mapping) else None
-    return dict(values) if isinstance(values, Mapping) else {}

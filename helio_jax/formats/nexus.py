@@ -17,7 +17,8 @@ from pydantic import ValidationError
 from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack, ScanAlignment
-from helio_jax.reconstruction import REASONS, Reconstruction
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.validity import REASONS, VALID_RULE
 
 Noun = MicrographStack | MicrographSet | Reconstruction
 
@@ -71,7 +72,7 @@ RECONSTRUCTION_FIELDS = (
     Field("raster_y", "height/raster_y", "um", "beam position y on the sample plane"),
     Field("normals", "normals", "", "unit surface normal (x, y, z), up"),
     Field("albedo", "albedo", "", "relative reflectivity, substrate = 1"),
-    Field("is_valid", "is_valid", "", "1 where enough data determine the height"),
+    Field("is_valid", "is_valid", "", f"1 where valid: {VALID_RULE}"),
     Field("reason", "reason", "", "why a height is not valid: " + ", ".join(f"{i} {r}" for i, r in enumerate(REASONS))),
     Field("residuals", "residuals", "", "(data - model) / standard deviation"),
     Field("chi_square", "chi_square", "", "mean square deviation of the data from the traced map, 3 x 3 pixels"),
@@ -80,6 +81,7 @@ RECONSTRUCTION_FIELDS = (
     Field("border", "border", "", "flat: heights count from the substrate at the border; free: their level is unknown"),
     Field("method", "method", "", "how the heights were found"),
     Field("status", "status", "", "how the method ended"),
+    Field("warnings", "warnings", "", "what to know before the heights are trusted, one a line"),
 )
 RECORDS = {"calibration": Calibration, "alignment": ScanAlignment, "materials": dict}
 """Attributes of a stack that are one JSON text each, at a place of their name."""
@@ -164,6 +166,8 @@ def _field_nodes(entry: str, obj: Any, fields: tuple[Field, ...], count_unit: st
             continue
         if isinstance(value, np.ndarray) and value.dtype == bool:
             value = value.astype(np.uint8)
+        if isinstance(value, tuple):
+            value = "\n".join(value)
         unit, meaning = f.unit.replace("counts", count_unit) if count_unit else f.unit, f.long_name
         if f.name in ("x", "y") and getattr(obj, "positions", None) is not None:
             unit, meaning = "", "number of the beam position" if f.name == "x" else "0: a list has one row"
@@ -238,6 +242,8 @@ def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: 
         provenance = _json_object(values, "provenance/data", place)
         given |= _records_in_provenance(noun, provenance) if version == "1.0" else _records(values, place)
         _check_record(noun, given)
+        if "warnings" in given:
+            given["warnings"] = tuple(filter(None, given["warnings"].split("\n")))
         return noun(**given, instrument=_instrument(values, place), provenance=provenance)
     except InputFileError as e:
         raise InputFileError(str(e) if str(e).startswith(place) else f"{place}: {e}") from None
@@ -248,7 +254,7 @@ def _make(noun: type, fields: tuple[Field, ...], values: dict[str, Any], place: 
 def _check_record(noun: type, given: dict[str, Any]) -> None:
     """Check the texts and numbers that the object does not check itself."""
     choices = {"fast_axis": ("x", "y"), "noise": ("expected", "poisson", "measured"), "border": ("flat", "free")}
-    for name in ("fast_axis", "noise", "unit", "name", "border", "method", "status"):
+    for name in ("fast_axis", "noise", "unit", "name", "border", "method", "status", "warnings"):
         if name in given and not isinstance(given[name], str):
             raise InputFileError(f"{name} must be a text, got numbers")
         if name in given and name in choices and given[name] not in choices[name]:

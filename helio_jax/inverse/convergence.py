@@ -47,6 +47,11 @@ def remaining_error(changes: Sequence[float], extrapolation: float) -> float:
     return max(slow, oscillating)
 
 
+def has_converged(changes: Sequence[float], tolerance: float) -> bool:
+    """Return whether the last change of the heights is below the tolerance [um]."""
+    return changes[-1] < tolerance
+
+
 def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
     """Describe how a fit ended, in a sentence.
 
@@ -60,7 +65,7 @@ def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool =
     last = f"the last of {len(changes)} iterations changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
     if is_interrupted:
         return f"interrupted: best so far; {last}"
-    if changes[-1] < tolerance:
+    if has_converged(changes, tolerance):
         return f"converged: {last}"
     if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):
         contraction = contraction_of(changes)

@@ -34,8 +34,9 @@ from helio_jax.inverse.quality import squares
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
-from helio_jax.inverse.verdict import LIMIT, local_chi_square, residuals_of_state
+from helio_jax.inverse.verdict import local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
+from helio_jax.validity import CHI_SQUARE_LIMIT
 
 MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate."""
@@ -175,7 +176,7 @@ class _Fits:
 
     def contradicted(self, residuals: np.ndarray) -> float:
         """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit."""
-        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > LIMIT))
+        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT))
 
     def say(self, said: str) -> None:
         """Report what is tried."""

@@ -14,9 +14,8 @@ from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import normal_of_slopes, slopes_of_normal
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
+from helio_jax.validity import MIN_IMAGES
 
-MIN_IMAGES = 3
-"""Images needed per pixel: three unknowns (albedo times normal)."""
 _ROBUST_ROUNDS = 8
 _DARK_LIMIT = 3.0
 _GRAZING = 0.3

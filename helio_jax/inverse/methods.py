@@ -15,6 +15,7 @@ from helio_jax.errors import GuardError
 from helio_jax.forward.optics import Raster
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
+from helio_jax.inverse.convergence import has_converged
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.misfit_errors import with_path_error
 from helio_jax.inverse.nearfield import photometric_heights
@@ -44,7 +45,7 @@ GEOMETRY_WARNING = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
     "their stated standard deviations; compare with nearfield"
 )
-"""Part of the status of a fit whose aperture angles or distance are unknown."""
+"""Warning of a fit whose aperture angles or distance are unknown."""
 
 if TYPE_CHECKING:
     from helio_jax.inverse.fit import Fit, Report
@@ -111,18 +112,39 @@ def _check_finite(rec: Reconstruction) -> None:
         raise GuardError("the reconstructed heights are not finite: please report it with the stack")
 
 
+def warnings_of(fit: "Fit") -> tuple[str, ...]:
+    """List what to know before the heights of a fit are trusted."""
+    tolerance = fit.problem.settings.tolerance_um
+    found = []
+    if fit.is_interrupted or not has_converged(fit.changes, tolerance):
+        found.append(
+            f"the fit has not converged: its last iteration changed the heights by {fit.changes[-1]:.2f} um (limit "
+            f"{tolerance:g} um)"
+        )
+    if fit.posterior is not None and fit.posterior.inflation > 1.0:
+        found.append(
+            "the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars are "
+            f"inflated by {fit.posterior.inflation:.1f}"
+        )
+    if fit.parameters.aim.size or fit.parameters.distance.size:
+        found.append(GEOMETRY_WARNING)
+    return tuple(found)
+
+
 def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     """Compute the change of the highest point per change of each gain and offset, per cent per per cent of signal.
 
     All other unknowns follow the forced change; heights count from the median.
     """
+    from helio_jax.inverse.instrument_report import plain_name
+
     if fit.posterior is None:
         return {}
     height = fit.surface.height - np.median(fit.surface.height)
     top = np.unravel_index(np.argmax(np.abs(height)), height.shape)
     std = {"log_gain": settings.refine.gain_std, "offset": settings.refine.offset_std}
     return {
-        name: float(response[top] / height[top] / std[name.split("[")[0]])
+        plain_name(name, fit.instrument.detector_names): float(response[top] / height[top] / std[name.split("[")[0]])
         for name, response in zip(fit.posterior.names, fit.posterior.response, strict=True)
         if name.split("[")[0] in std and height[top] != 0
     }
@@ -149,7 +171,6 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
         depth_jumps(fit.surface.height, fit.surface.slope_x, fit.joined_x, raster.dx, 1),
         depth_jumps(fit.surface.height, fit.surface.slope_y, fit.joined_y, raster.dy, 0),
     )
-    is_moved = bool(fit.parameters.aim.size or fit.parameters.distance.size)
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
@@ -170,7 +191,8 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
         gain=fit.gain,
         offset=fit.offset,
         border=settings.border,
-        status="; ".join(filter(None, (fit.status, assumed, GEOMETRY_WARNING if is_moved else ""))),
+        status="; ".join(filter(None, (fit.status, assumed))),
+        warnings=warnings_of(fit),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),

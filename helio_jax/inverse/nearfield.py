@@ -32,7 +32,7 @@ from helio_jax.reconstruction import Reconstruction
 
 Predict = Callable[[np.ndarray, np.ndarray], Corrections]
 """(heights [y, x] um, unit normals [y, x, 3]) -> masks and multiple scattering."""
-_UNPREDICTED = "; masks and multiple scattering could not be predicted"
+_UNPREDICTED = "masks and multiple scattering could not be predicted"
 
 
 def level(height: np.ndarray, settings: ReconstructSettings, weight: np.ndarray) -> np.ndarray:
@@ -189,13 +189,13 @@ def photometric_heights(
         expected = expected_chi_square(stack, rec, rec.chi_square)
         modes.append(path_error(rec, misfit, Raster.of(stack), expected, settings))
     if not modes:
-        return rec.replace(status=f"{rec.status}; no error bars{failure}")
+        return rec.replace(warnings=(*rec.warnings, f"no error bars: {failure}"))
     known = solver.optics, stack.instrument.uncertainty, settings
     difference = None if misfit is None else misfit.difference
     samples = bootstrap_heights(data, solver.variance, *known, lambda *drawn: solver.solve(*drawn)[0], difference)
     samples = add_common_modes(samples, modes, SEED + 1)
     std = np.sqrt(np.mean(samples**2, axis=0))
-    rec = rec.replace(height_samples=samples, height_std=std, status=f"{rec.status}{failure}")
+    rec = rec.replace(height_samples=samples, height_std=std, warnings=(*rec.warnings, *filter(None, [failure])))
     return rec if misfit is None else flag_floating(rec)
 
 

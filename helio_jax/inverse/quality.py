@@ -1,4 +1,7 @@
-"""Why a height should not be trusted: too few images, masks, a depth jump, or a region whose level nothing fixes."""
+"""Why a height should not be trusted: too few images, masks, a depth jump, or a region whose level nothing fixes.
+
+The limits that make up the rule of `is_valid` are those of `validity`.
+"""
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -9,10 +12,8 @@ from helio_jax.forward.surface import along
 from helio_jax.inverse.edges import ranked, trapezoid_gap
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS
+from helio_jax.validity import EXPLAINED, FACET_IMAGES, FLOATING, REASONS
 
-FACET_IMAGES = 2
-"""Data that fix the two slopes of a facet of known albedo."""
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked."""
 JOINED = 0.25
@@ -21,15 +22,10 @@ SMALLEST_JUMP = 0.1
 """Misfit of a cut edge, in pitches, below which it is no depth jump: noise cuts one edge in some hundreds."""
 TRUSTED = 0.5
 """A pixel with a datum of less robust weight than this is not explained by the model."""
-EXPLAINED = 3.0
-"""Mean square residual of a pixel and its eight neighbours, in that of most pixels and at least 1, up to which the
-model explains them: noise alone reaches it in one pixel of a million."""
 _LARGEST = 25.0
 """A datum counts with this square at most."""
 VEILED = 5.0
 """A datum whose assumed deviation is this many times that of its counts is not informative of a facet."""
-FLOATING = 0.2
-"""A region is floating when its level is uncertain by more than this share of its step to the substrate."""
 MIN_REGION = 16
 """Smaller regions are part of the jump that surrounds them [pixels]."""
 _FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))

@@ -22,15 +22,13 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.quality import squares
 from helio_jax.micrograph import MicrographStack
-from helio_jax.reconstruction import REASONS, Reconstruction, contradicted_share
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.validity import CHI_SQUARE_LIMIT, REASONS, contradicted_share
 
 if TYPE_CHECKING:
     from helio_jax.inverse.problem import FitProblem
     from helio_jax.inverse.state import FitState
 
-LIMIT = 2.5
-"""Mean square deviation of a pixel and its eight neighbours, in all detectors, from which on the data contradict the
-map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
 MULTIPLE_ERROR = 0.1
 """Assumed relative error of the traced multiple scattering: of paths, raster and what lies outside the image."""
 MODEL_ERROR = 0.01
@@ -175,7 +173,7 @@ def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square:
 def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], np.ndarray]) -> Reconstruction:
     """Return a height map with the verdict of its data: chi-square, reasons, and a sentence in its status.
 
-    Pixels must deviate by more than `LIMIT` times the chi-square of a right map (`expected_chi_square`).
+    Pixels must deviate by more than `CHI_SQUARE_LIMIT` times the chi-square of a right map (`expected_chi_square`).
 
     Args:
         rec: the height map.
@@ -190,13 +188,17 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
         said = "contradicts the data: no micrographs can be traced on a height map so rough or steep"
         return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
-    is_worse = (rec.reason == 0) & (chi_square > LIMIT * expected_chi_square(stack, rec, chi_square))
+    is_worse = (rec.reason == 0) & (chi_square > CHI_SQUARE_LIMIT * expected_chi_square(stack, rec, chi_square))
     reason = np.where(is_worse, _CONTRADICTED, rec.reason)
-    judged = rec.replace(chi_square=chi_square, reason=reason, is_valid=reason == 0)
+    names, square = stack.instrument.detector_names, np.where(stack.is_observed, squares(found), 0.0)
+    by_detector = square.sum((1, 2)) / np.maximum(stack.is_observed.sum((1, 2)), 1)
+    about = {"traced_chi_square": dict(zip(names, by_detector.tolist(), strict=True))}
+    judged = rec.replace(
+        chi_square=chi_square, reason=reason, is_valid=reason == 0, provenance={**rec.provenance, **about}
+    )
     if not judged.is_contradicted:
         return judged
-    by_detector = np.nanmean(squares(found), axis=(1, 2))
-    worst = stack.instrument.detector_names[int(np.argmax(by_detector))]
+    worst = names[int(np.argmax(by_detector))]
     said = (
         f"contradicts the data: micrographs traced on this height map deviate from the measured ones in "
         f"{contradicted_share(reason):.0%} of the pixels (most in detector {worst}): shape, instrument or scattering "

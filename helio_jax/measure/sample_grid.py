@@ -46,6 +46,27 @@ def resample_heights(rec: Reconstruction, grid_pitch: float, *, use_all: bool = 
             f"a grid of {grid_pitch:g} um has {x.size} x {y.size} pixels, at most {MAX_PIXELS / 1e6:g} million can be: "
             "choose a larger pitch"
         )
+    height, std = heights_at(rec, x, y, is_known)
+    return HeightMap(
+        height=height,
+        x=x,
+        y=y,
+        height_std=None if rec.height_std is None else std,
+        status=rec.status,
+        provenance={**rec.provenance},
+    )
+
+
+def heights_at(
+    rec: Reconstruction, x: np.ndarray, y: np.ndarray, is_known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the topmost height at every x, y of the sample frame [um], and its standard deviation [y, x]; NaN: unknown.
+
+    Args:
+        rec: heights; its standard deviations, if it has any, are interpolated as they are.
+        x, y: positions; a line has one x or one y.
+        is_known: which heights are used [y, x], at least one.
+    """
     cells = _Cells(rec, is_known)
     height, std = np.full((y.size, x.size), np.nan), np.full((y.size, x.size), np.nan)
     level_above, gap_above = 0.0, np.full(height.shape, np.nan)
@@ -59,14 +80,7 @@ def resample_heights(rec: Reconstruction, grid_pitch: float, *, use_all: bool = 
         std = np.where(meets & np.isfinite(height), found_std, std)
         is_open &= ~meets
         level_above, gap_above = level, gap
-    return HeightMap(
-        height=height,
-        x=x,
-        y=y,
-        height_std=None if rec.height_std is None else std,
-        status=rec.status,
-        provenance={**rec.provenance},
-    )
+    return height, std
 
 
 def _axis(values: np.ndarray, step: float) -> np.ndarray:

@@ -19,6 +19,7 @@ from helio_jax.formats.matlab import describe_matlab
 from helio_jax.formats.points import HEADER, read_points
 from helio_jax.formats.safe import check_size
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
+from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, read_bytes, read_height_map, read_table
 from helio_jax.scene.sample import MeshSample, check_body, load_mesh
@@ -101,6 +102,8 @@ def _of_hdf5(path: Path) -> Found:
     about = hdf5.describe(path)
     record = hdf5.read(path)
     del about["file"], about["bytes"]
+    if isinstance(record, Reconstruction):
+        about["trust"] = record.trust
     written = (
         "written",
         f"{about['created']} by {about['creator']} {about['creator_version']}, format {about['format']}",

@@ -16,6 +16,7 @@ from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.cracks import crack_panel
 from helio_jax.figures.overlay import facet_map
 from helio_jax.figures.ripple import ripple_panel
+from helio_jax.figures.trust import trust_lines
 from helio_jax.measure.crack_text import crack_lines, wall_lines
 from helio_jax.measure.cracks import find_cracks
 from helio_jax.measure.facets import Facets, FacetSettings, find_facets
@@ -154,8 +155,11 @@ def measure_height_map(
     how = _settings(wanted)
     regions = [inside_polygon(parse_region(text), rec.raster_x, rec.raster_y) for text in wanted.regions]
     job = _Job(rec, wanted, regions or [np.ones(rec.height.shape, bool)], how, figure, stack)
-    job.found["reconstructed"] = area = reconstructed_area(rec)
-    job.lines.append(f"reconstructed: {area['share']:.1%} of the raster")
+    job.found["trust"], job.found["reconstructed"] = rec.trust, reconstructed_area(rec)
+    job.lines += trust_lines(rec.trust)
+    if rec.height_std is not None:
+        area = job.found["reconstructed"]
+        job.lines.append(f"valid and known to {area['max_std_um']:g} um (s.d.): {area['share']:.1%} of the pixels")
     for is_wanted, measure in (
         (wanted.facets, _measure_facets),
         (wanted.profile, _measure_profile),

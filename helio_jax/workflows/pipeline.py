@@ -12,11 +12,11 @@ import numpy as np
 from helio_jax.alignment.align import AlignSettings, align_scans
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.calibration.noise import add_noise
-from helio_jax.errors import InputFileError, ResumeError, SceneError
+from helio_jax.errors import GuardError, InputFileError, ResumeError, SceneError
 from helio_jax.figures.before_after import save_before_after
 from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.panel import panel
-from helio_jax.figures.report import write_report
+from helio_jax.figures.report import Measured, write_report
 from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
@@ -24,8 +24,10 @@ from helio_jax.formats.safe import atomic_path, check_outputs, files_within, mak
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections
+from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.measure.facets import Facets, find_facets
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, evaluate_height
@@ -33,7 +35,7 @@ from helio_jax.trace.scan import Executor, trace_scene
 from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
 from helio_jax.workflows.corrections import make_predictor
-from helio_jax.workflows.provenance import with_provenance
+from helio_jax.workflows.provenance import this_run, with_provenance
 from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.truth import true_height
@@ -42,6 +44,8 @@ DEFAULT_EXECUTOR = Executor()
 """Threads of this process, one per CPU."""
 VERDICT_PATHS = 400_000
 """Paths of the multiple scattering by which a finished height map is tested against its data."""
+MAX_FACET_PIXELS = 60_000
+"""Pixels of a height map whose facets a report measures unasked: 2 s."""
 Stage = Callable[[str], Any]
 """Called with the name of each stage; a context manager that yields its progress callback."""
 RUN_FILES = {
@@ -296,10 +300,12 @@ def reconstruct(
     known = {"border": chosen.border, "workers": workers, "masks_by": "rays"}
     trace = make_predictor(one, VERDICT_PATHS, refine.substrate_um, **known)
     rec = reconstruct_stack(one, chosen, make_predict, report, trace)
+    rec = replace(rec, provenance={**rec.provenance, **this_run()})
     others = [f"{name} ({kind})" for name, kind in one.materials.items() if kind != "cosine"]
     if not others:
         return rec
-    return replace(rec, status=f"{rec.status}; NOT the cosine law, which heights assume, holds for {', '.join(others)}")
+    law = f"NOT the cosine law, which heights assume, holds for {', '.join(others)}"
+    return replace(rec, warnings=(*rec.warnings, law))
 
 
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
@@ -315,18 +321,48 @@ def write_report_files(
     scores: Scores | None,
     *,
     title: str,
+    panel_path: str | Path | None = None,
+    with_steps: bool = False,
 ) -> Path:
-    """Write the HTML report and the PNG panel beside it; return the panel's path."""
+    """Write the HTML report and the panel; return the panel's path.
+
+    Args:
+        path: of the report.
+        stack, rec, truth, scores, title: as in `write_report`.
+        panel_path: of the panel (.png, .pdf, .svg); default: a PNG beside the report.
+        with_steps: also measure steps on the micrographs, which takes 10 to 40 s.
+    """
     path = Path(path)
-    panel_path = path.with_suffix(".png")
+    panel_path = Path(panel_path) if panel_path else path.with_suffix(".png")
     save_figure(panel(stack, rec, truth, scores), panel_path)
-    write_report(path, stack, rec, truth, scores, panel_png=panel_path, title=title)
+    measured = Measured(_facets_of(rec), _steps_of(stack, with_steps))
+    write_report(path, stack, rec, truth, scores, measured=measured, title=title)
     return panel_path
 
 
 def default_folder(scene: SceneFile) -> Path:
     """Return where `run` writes if no folder is named."""
     return Path("helio-out") / scene.name
+
+
+def _facets_of(rec: Reconstruction) -> Facets | str:
+    """Find the facets for a report, or say why there are none."""
+    if rec.height.size > MAX_FACET_PIXELS:
+        return f"rasters of more than {MAX_FACET_PIXELS} pixels are measured on demand: helio measure --facets"
+    try:
+        return find_facets(rec)
+    except GuardError as e:
+        return str(e)
+
+
+def _steps_of(stack: MicrographStack | None, is_wanted: bool) -> dict[str, Any] | str:
+    """Find the steps for a report, or say why there are none."""
+    if not is_wanted or stack is None:
+        return "measured on demand in 10 to 40 s: helio report --stack FILE.h5 --steps"
+    try:
+        return find_steps(stack).as_dict()
+    except SceneError as e:
+        return str(e)
 
 
 @dataclass(frozen=True)
@@ -336,7 +372,7 @@ class RunResult:
     name: str
     method: str
     status: str
-    is_contradicted: bool
+    trust: dict[str, Any]
     scores: Scores
     files: dict[str, Path]
 
@@ -347,7 +383,7 @@ class RunResult:
             "name": self.name,
             "method": self.method,
             "status": self.status,
-            "is_contradicted": self.is_contradicted,
+            "trust": self.trust,
             **self.scores.as_dict(),
             "files": files,
         }
@@ -409,4 +445,4 @@ def run(
         if report:
             title = f"{scene.name}: simulated, reconstructed, scored"
             write_report_files(files["report"], stack, rec, truth, scores, title=title)
-    return RunResult(scene.name, rec.method, rec.status, rec.is_contradicted, scores, files)
+    return RunResult(scene.name, rec.method, rec.status, rec.trust, scores, files)

@@ -1,4 +1,4 @@
-"""Provenance of simulated micrographs: everything needed to reproduce them, stored in their file."""
+"""Provenance: what is needed to reproduce simulated micrographs and height maps, stored in their file."""
 
 import os
 import platform
@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from helio_jax.micrograph import Micrographs
 from helio_jax.trace.job import package_version
@@ -16,7 +17,7 @@ from helio_jax.workflows.scene_file import SceneFile, resolved
 def with_provenance(
     stack: Micrographs, scene: SceneFile, scene_path: str | Path, scene_text: str | None = None
 ) -> Micrographs:
-    """Add scene text, resolved scene, versions, commit, machine, command line and time to the provenance.
+    """Add scene text, resolved scene and `this_run` to the provenance.
 
     Args:
         stack: simulated micrographs.
@@ -25,18 +26,21 @@ def with_provenance(
         scene_text: text of that file.
     """
     path = Path(scene_path)
+    text = path.read_text(encoding="utf-8") if scene_text is None else scene_text
+    about = {"scene_file": path.name, "scene_text": text, "scene": resolved(scene)}
+    return replace(stack, provenance={**stack.provenance, **about, **this_run()})
+
+
+def this_run() -> dict[str, Any]:
+    """Return versions, commit, machine, command line and time."""
     names = ("helio-jax", "numpy", "numba", "embreex", "jax", "optimistix", "trimesh")
-    about = {
-        "scene_file": path.name,
-        "scene_text": path.read_text(encoding="utf-8") if scene_text is None else scene_text,
-        "scene": resolved(scene),
+    return {
         "versions": {name: package_version(name) for name in names},
         "git": git_commit(),
         "machine": {"processor": platform.machine(), "system": platform.system(), "cpus": os.cpu_count()},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
-    return replace(stack, provenance={**stack.provenance, **about})
 
 
 def git_commit() -> str:

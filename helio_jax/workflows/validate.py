@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from helio_jax.detector import Detector
+from helio_jax.figures.summary import Rows, summarise
 from helio_jax.instrument import Instrument
 from helio_jax.scene.plates import check_solid
 from helio_jax.scene.sample import check_body
@@ -27,7 +28,7 @@ class Checked:
     Attributes:
         file: its path.
         kind: "scene", or "instrument" for a file without the tables of a sample and a scan.
-        instrument: beam, plate and detectors, JSON-compatible.
+        instrument: beam, plate and detectors, JSON-compatible; `about`: the same in words.
         image: pixels in x and y and number of views; none of an instrument.
         body: triangles and spheres of the sample; none of an instrument.
         plate: triangles of a plate of kind "mesh".
@@ -38,6 +39,7 @@ class Checked:
     file: str
     kind: Kind
     instrument: dict[str, Any]
+    about: Rows
     image: dict[str, int] | None = None
     body: dict[str, Any] | None = None
     plate: dict[str, Any] | None = None
@@ -58,7 +60,7 @@ def check_file(name: str | Path) -> Checked:
     path = locate(name)
     replaced = tuple(replaced_lists(path))
     if not is_scene(read_tables(path)):
-        return Checked(str(path), "instrument", summarise(load_instrument(path)), replaced=replaced)
+        return Checked(str(path), "instrument", *_describe(load_instrument(path)), replaced=replaced)
     scene = load_scene(path)
     scene.read_laws()
     scene.read_rays()
@@ -67,7 +69,7 @@ def check_file(name: str | Path) -> Checked:
     return Checked(
         str(path),
         "scene",
-        summarise(scene),
+        *_describe(scene.instrument),
         image={"nx": nx, "ny": ny, "views": scene.scan.n_views},
         body=_check_sample(scene),
         plate=None if plate is None else check_solid(plate),
@@ -76,21 +78,22 @@ def check_file(name: str | Path) -> Checked:
     )
 
 
-def summarise(instrument: Instrument) -> dict[str, Any]:
-    """Summarise an instrument: beam, distances [um], and the direction of every detector [deg]."""
-    return {
+def _describe(instrument: Instrument) -> tuple[dict[str, Any], Rows]:
+    """Describe an instrument: beam, distances [um], the direction of every detector [deg]; and in words."""
+    record = {
         "incidence_deg": instrument.beam.incidence_deg,
         "azimuth_deg": instrument.beam.azimuth_deg,
         "source": instrument.beam.source,
         "plate": instrument.plate.kind,
         "working_distance_um": instrument.working_distance,
         "sample_distance_um": instrument.sample_distance,
-        "detectors": [_summarise_detector(d, instrument.working_distance) for d in instrument.detector],
+        "detectors": [_describe_detector(d, instrument.working_distance) for d in instrument.detector],
     }
+    return record, summarise(instrument)
 
 
-def _summarise_detector(detector: Detector, working_distance: float) -> dict[str, Any]:
-    """Summarise a detector: kind, polar angle and azimuth of its middle [deg], channel."""
+def _describe_detector(detector: Detector, working_distance: float) -> dict[str, Any]:
+    """Describe a detector: kind, polar angle and azimuth of its middle [deg], channel."""
     aim = detector.aim(working_distance)
     kind = "cone at infinity" if detector.at_infinity else "aperture" if aim else f"part {detector.part!r} of the plate"
     polar, azimuth = (None, None) if aim is None else (round(math.degrees(angle), 2) + 0.0 for angle in aim)

@@ -170,7 +170,8 @@ def test_stop_refuse_and_resume(small_scene, tmp_path):
     assert refused.returncode == 6 and "trace.seed: 1 (then), 5 (now)" in refused.stderr
     done = helio("resume", out)
     assert done.returncode == 0 and "units are finished" in done.stderr, done.stderr
-    assert {p.name for p in tmp_path.iterdir()} == {"scene.toml", "s.h5"}
+    assert {p.name for p in tmp_path.iterdir()} == {"scene.toml", "s.h5", "s.show.png"}  # as simulate leaves
+    assert "field of view" in done.stdout and "s.show.png" in done.stdout
 
 
 def test_imports_measured_files(shared, tmp_path):

@@ -160,15 +160,15 @@ def test_validate_says_what_it_read():
     """
     code, text = helio("validate", "bshem")
     assert code == 0 and "bshem: ok, an instrument (3 detectors; it has no [sample] and no [scan])" in text
-    assert "detector 'left': aperture at polar angle 30 deg, azimuth 120 deg, channel 2" in text
-    assert "beam: 30 deg from the plate normal" in text and "working distance 3000 um" in text
+    assert "- left       polar 30 deg, azimuth 120 deg, channel 2" in text
+    assert "beam         30 deg from the plate normal" in text and "substrate 3 mm below the plate" in text
     code, text = helio("validate", "sphere_a")
     assert code == 0 and "sphere_a: ok, a scene (121 x 121 pixels, 3 detectors)" in text
-    assert "sample distance 4720 um" in text
+    assert "substrate 4.72 mm below the plate (aimed at 4 mm)" in text
     mine = 'extends = "bshem"\n[[detector]]\nname = "up"\npolar_deg = 0.0\nhalf_angle_deg = 3.0\nat_infinity = true\n'
     Path("mine.toml").write_text(mine)
     code, text = helio("validate", "mine.toml")
-    assert code == 0 and "replaces all 3 of" in text and "'up': cone at infinity at polar angle 0 deg" in text
+    assert code == 0 and "replaces all 3 of" in text and "- up         polar 0 deg, azimuth 0 deg, at infinity" in text
     found = json.loads(helio("validate", "mine.toml", "--json")[1])
     assert found["kind"] == "instrument" and len(found["replaced"]) == 1 and found["image"] is None
     assert found["instrument"]["detectors"][0]["polar_deg"] == 0.0

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
-from helio_jax.inverse.verdict import LIMIT, local_chi_square
-from helio_jax.reconstruction import REASONS, contradicted_share
+from helio_jax.inverse.verdict import local_chi_square
+from helio_jax.validity import CHI_SQUARE_LIMIT as LIMIT
+from helio_jax.validity import REASONS, contradicted_share
 from helio_jax.workflows import pipeline
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"

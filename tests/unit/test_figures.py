@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from sphere_case import CAP, TAN, make_case
+from sphere_case import CAP, RADIUS, TAN, make_case
 
 from helio_jax.errors import SceneError
 from helio_jax.figures import plot_data
@@ -43,7 +43,7 @@ def test_panel_shows_all_and_the_numbers(case):
         "Height error",
         "Validity",
         "Standard",
-        "Profile along y",
+        "Profile through the highest valid point, along y",
     ):
         assert any(t.startswith(start) for t in titles(fig)), start
     text = {t.get_text() for ax in fig.axes for t in ax.texts}
@@ -123,18 +123,75 @@ def test_surface_is_cut_at_the_occlusion_edge_only(case):
     assert hole.sum() == 4 and hole[9:11, 19:21].all()
 
 
-def test_profile_is_at_the_points_own_positions(case):
-    """The apex is drawn at x = 0, not at X = H tan t; the occlusion gap is reported. Catches: raster positions."""
-    _, rec, truth = make_case(161, 91, pitch=20.0)
-    pixel = plot_data.apex_pixel(truth.height)
-    at, height, gaps = plot_data.profile_line(rec, truth.height, "x", pixel)
-    assert rec.raster_x[pixel[1]] == pytest.approx(CAP * TAN, abs=10.0)
-    assert at[np.argmax(height)] == pytest.approx(0.0, abs=20.0)
-    assert len(gaps) == 1 and 740 < at[gaps[0] - 1] < at[gaps[0]] < 1010
-    band = plot_data.profile_band(
-        rec.replace(height_std=np.full_like(height, 5.0) + 0 * truth.height), truth.height, "y", pixel
-    )
-    assert band[1].size == 2 * rec.raster_y.size and band[1].max() == pytest.approx(truth.height.max() + 5.0)
+def rotated(rec, degrees):
+    """Return a reconstruction whose beam travels towards another azimuth; heights as they are."""
+    beam = rec.instrument.beam.model_copy(update={"azimuth_deg": degrees})
+    return rec.replace(instrument=rec.instrument.model_copy(update={"beam": beam}))
+
+
+def test_profiles_run_through_the_highest_valid_point():
+    """Along x at the point's own y and along y at its own x, in the sample frame: the sphere's true outline, within the
+    chord of a pixel; a higher pixel that is not valid does not count; the occlusion gap is open.
+
+    Catches raster positions (apex at H tan t = 416 um), the pixel farthest from the median, a line at fixed raster x.
+    """
+    _, rec, _ = make_case(161, 91, pitch=20.0)
+    height = rec.height.copy()
+    height[3, 5] = 5000.0
+    is_valid = np.ones(height.shape, bool)
+    is_valid[3, 5] = False
+    rec = rec.replace(height=height, is_valid=is_valid, reason=np.where(is_valid, 0, 3))
+    row, column = plot_data.highest_valid(rec)
+    along_x, along_y = plot_data.profiles(rec)
+    assert along_x.place == "y = 0 µm" and abs(rec.x[row, column]) < 20.0
+    for cut in (along_x, along_y):
+        assert np.nanmax(cut.height) == rec.height[row, column]
+        z = np.sqrt(np.maximum(RADIUS**2 - cut.at**2, 0.0)) - (RADIUS - CAP)
+        known = (cut.height > 20.0) & (np.abs(cut.at) < 600.0)
+        assert known.sum() > 25 and np.abs(cut.height - z)[known].max() < 3.0
+    gap = np.isnan(along_x.height) & (along_x.at > 740) & (along_x.at < 1010)
+    assert gap.any() and np.isfinite(along_x.height[np.abs(along_x.at) < 700]).all()
+    assert plot_data.profiles(rec.replace(is_valid=~np.ones_like(is_valid), reason=np.ones_like(rec.reason))) == []
+
+
+def test_profile_beside_pixels_that_are_not_valid():
+    """The highest valid point is in both profiles though all its neighbours are not valid. Catches a search that needs
+    whole cells, which loses the very point that the profiles are about."""
+    _, rec, _ = make_case(41, 45, pitch=80.0)
+    row, column = plot_data.highest_valid(rec)
+    is_valid = rec.is_valid.copy()
+    is_valid[row - 1 : row + 2, column - 1 : column + 2] = False
+    is_valid[row, column] = True
+    rec = rec.replace(is_valid=is_valid, reason=np.where(is_valid, 0, 3))
+    assert [np.nanmax(cut.height) for cut in plot_data.profiles(rec)] == [rec.height[row, column]] * 2
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 90.0, 30.0])
+def test_band_of_a_profile_is_that_of_a_fixed_place(azimuth):
+    """On a plane of slope dh/dX = 0.3 a height error e at a beam position moves the surface at a fixed x by
+    e / (1 - tx dh/dX): seen by shifting the whole plane. Catches a band drawn along the beam, or the file's own s.d."""
+    _, rec, _ = make_case(41, 45, pitch=80.0)
+    rec = rotated(rec, azimuth)
+    height = 0.3 * rec.raster_x - 1e-4 * np.abs(rec.raster_y)[:, None]  # the highest point is not in a corner
+    flat = {"is_valid": np.ones(height.shape, bool), "reason": np.zeros(height.shape)}
+    plane = rec.replace(height=height, height_std=np.full(height.shape, 5.0), **flat)
+    cut, moved = (plot_data.profiles(r)[0] for r in (plane, plane.replace(height=height + 5.0)))
+    shift = np.interp(0.0, moved.at, moved.height) - np.interp(0.0, cut.at, cut.height)
+    tx = TAN * np.cos(np.radians(azimuth))
+    assert shift == pytest.approx(5.0 / (1.0 - 0.3 * tx), rel=2e-3)
+    assert np.interp(0.0, cut.at, cut.height_std) == pytest.approx(shift, rel=2e-3)
+
+
+def test_residuals_test_only_what_is_over_determined(case):
+    """Three images fix the three unknowns of a photometric pixel; a fit, or a fourth image, leaves something to check.
+
+    Catches a colourful map of rounding errors."""
+    _, rec, _ = case
+    assert plot_data.is_checkable(rec) and not plot_data.is_checkable(rec.replace(residuals=None))
+    assert not plot_data.is_checkable(rec.replace(method="nearfield"))
+    _, four, _ = make_case(21, 21, 4, pitch=160.0)
+    assert plot_data.is_checkable(four.replace(method="nearfield"))
+    assert "Residuals" not in " ".join(titles(panel(None, rec.replace(method="linear"))))
 
 
 def test_fractions_and_residuals(case):

@@ -110,7 +110,7 @@ def test_measure_reports_json(tmp_path):
     """All parts at once are JSON, and the figure is drawn; no measurement is an error."""
     wanted = Wanted(facets=True, profile=(-900.0, 0.0, 900.0, 0.0), texture=True)
     found, lines = measure_height_map(make_rec(octahedron), wanted, tmp_path / "f.png")
-    assert set(json.loads(json.dumps(found))) == {"reconstructed", "facets", "profile", "texture"}
+    assert set(json.loads(json.dumps(found))) == {"trust", "reconstructed", "facets", "profile", "texture"}
     assert len(found["facets"]["edges"]) == 12 and any("125." in line for line in lines)
     assert (tmp_path / "f.png").stat().st_size > 5000
     with pytest.raises(SceneError, match="--facets"):
