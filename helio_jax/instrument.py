@@ -160,12 +160,45 @@ class Uncertainty(Settings):
         return any(self.model_dump().values())
 
 
+class Covariance(Settings):
+    """How the errors of a calibrated geometry belong together: table `[covariance]` of an instrument file.
+
+    Written by `helio calibrate --known`; its parameters move the whole plate as `Optics.moved` does.
+    """
+
+    parameters: tuple[str, ...] = Field(min_length=1, max_length=300)
+    """Names of the parameters."""
+    units: tuple[Literal["um", "deg", ""], ...]
+    """Unit of each parameter; "": a ratio."""
+    std: tuple[float, ...]
+    """Standard deviation of each parameter, in its unit."""
+    correlation: tuple[tuple[float, ...], ...]
+    """Correlation matrix."""
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> "Covariance":
+        n = len(self.parameters)
+        if len(self.units) != n or len(self.std) != n or [len(row) for row in self.correlation] != [n] * n:
+            raise ValueError(f"units, std and correlation must be of {n} parameters: one each, and a square table")
+        matrix = np.array(self.correlation)
+        if min(self.std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
+            raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
+        if np.linalg.eigvalsh(matrix).min() < -0.01:
+            raise ValueError("correlation must not have negative eigenvalues: calibrate anew")
+        return self
+
+    def matrix(self) -> np.ndarray:
+        """Compute the covariance [parameter, parameter], in the parameters' units."""
+        return np.array(self.correlation) * np.outer(self.std, self.std)
+
+
 class Instrument(Drawable, Settings):
     """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians)."""
 
     beam: Beam = Beam()
     plate: Plate
     uncertainty: Uncertainty = Uncertainty()
+    covariance: Covariance | None = None
     detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")

@@ -19,7 +19,7 @@ from helio_jax.forward.radiosity import plan_radiosity, radiosity
 from helio_jax.forward.render import Corrections, detection_probability
 from helio_jax.forward.surface import unit_normal
 
-RADIOSITY_PIXELS = 41
+RADIOSITY_PIXELS = 25
 """Pixels along the longer side of the raster on which the derivative of the multiple scattering is computed, about."""
 
 

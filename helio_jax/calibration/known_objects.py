@@ -119,4 +119,9 @@ _KEYS: dict[str, tuple[str, ...]] = {
     "wedge": ("height", "slope", "facing"),
     "flat": (),
 }
-_NEEDED: dict[str, tuple[str, ...]] = {"ball": ("radius",), "step": ("height",), "wedge": ("height", "slope"), "flat": ()}
+_NEEDED: dict[str, tuple[str, ...]] = {
+    "ball": ("radius",),
+    "step": ("height",),
+    "wedge": ("height", "slope"),
+    "flat": (),
+}

@@ -40,22 +40,24 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
 
-OUTLINE = 0.15
-"""Pixels that are nearer to the object's outline than this share of the pitch are left out."""
+OUTLINE = 0.75, 0.5, 0.25
+"""Pixels that are nearer to the object's outline than this share of the pitch are left out, in the first rounds and all
+later ones: the model's derivatives do not know that a pixel may change sides. The outline is found anew when it has moved
+by half of that."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
-CONVERGED = 0.05
+CONVERGED = 0.1
 """The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
 STALE = 8.0
-"""Change of an unknown, in standard deviations, after which the derivatives of the multiple scattering are computed anew."""
+"""Change of an unknown [standard deviations] after which derivatives of the multiple scattering are computed anew."""
 SPIKE = 6.0
 """A pixel that differs from all its neighbours by so many standard deviations is left out."""
-_STEPS = 12
+_STEPS = 20
 _SEARCH_PIXELS = 31
 _SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
 Trace = Callable[[int, Instrument, dict[str, float]], np.ndarray]
-"""Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object by
-their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
+"""Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object
+by their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +242,7 @@ def _expected(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndar
     return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)
 
 
-def _find_place(scan: KnownScan, layout: _Layout, number: int, settings: KnownShapeSettings) -> tuple[np.ndarray, float]:
+def _find_place(scan: KnownScan, layout: _Layout, settings: KnownShapeSettings) -> tuple[np.ndarray, float]:
     """Find where the object lies, by a search over the image with the stated instrument, the read-out fitted.
 
     Returns:
@@ -254,9 +256,9 @@ def _find_place(scan: KnownScan, layout: _Layout, number: int, settings: KnownSh
         model=scan.model.thinned(stride),
     )  # fmt: skip
     inverse = np.where(coarse.is_used, 1.0 / coarse.sigma, 0.0)
-    base = layout.start[number]
+    base = layout.start[0]
     index = len(base) - len(scan.own)
-    nothing = no_multiple(coarse.model, base, layout.free[number])
+    nothing = no_multiple(coarse.model, base, layout.free[0])
 
     def misfit(place: np.ndarray) -> float:
         at = base.copy()
@@ -295,6 +297,7 @@ class _Fit:
             no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
         ]
         self.expanded_at = [np.full(len(self.x), np.inf) for _ in scans]
+        self.outlined_at = [np.full(4, np.inf) for _ in scans]
         self.deviation = np.ones(len(self.x))
         self.weights = [np.ones(s.counts.shape) for s in scans]
         self.used = [s.is_used for s in scans]
@@ -310,9 +313,7 @@ class _Fit:
     def split(self, z: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """Split whitened unknowns into those of the geometry, and the linear ones of the scans [detector, column]."""
         parts = np.split(z, self.offsets[:-1])
-        return parts[0], [
-            m + p * v.reshape(m.shape) for m, p, v in zip(self.mean, self.prior, parts[1:], strict=True)
-        ]
+        return parts[0], [m + p * v.reshape(m.shape) for m, p, v in zip(self.mean, self.prior, parts[1:], strict=True)]
 
     def joined(self) -> np.ndarray:
         """Join the present unknowns, whitened."""
@@ -364,10 +365,14 @@ class _Fit:
         for i, scan in enumerate(self.scans):
             at = self.layout.of_scan(i, self.x)
             own, seen = scan.model.object_of(at), see(scan.model, at)
+            lengths = np.array([own[name] for name in ("object x", "object y", "radius", "height")], float)
             if scan.known.kind != "flat":
                 self.multiple[i] = self._scattered_again(i, at, seen, instrument)
-            outline = straddles_outline(scan.model, at, OUTLINE * pitch(scan.model.raster.y))
-            self.used[i] = scan.is_used & ~outline & ~_ring(scan, own, seen, self.settings)
+            margin = OUTLINE[min(number, len(OUTLINE) - 1)] * pitch(scan.model.raster.y)
+            if number < len(OUTLINE) or np.max(np.abs(lengths - self.outlined_at[i])) > 0.5 * margin:
+                self.outlined_at[i] = lengths
+                outline = straddles_outline(scan.model, at, margin)
+                self.used[i] = scan.is_used & ~outline & ~_ring(scan, own, seen, self.settings)
             image = probability(scan.model, at, self.multiple[i])
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
@@ -438,7 +443,7 @@ def _started(
     for known in scan.known.starts():
         trial = replace(scan, known=known, own=object_unknowns(known, stack_reach, settings))
         layout = _Layout(instrument_unknowns(stated, settings), [trial])
-        place, misfit = _find_place(trial, layout, 0, settings)
+        place, misfit = _find_place(trial, layout, settings)
         own = [u._replace(stated=float(p)) for u, p in zip(trial.own[:2], place, strict=True)] + trial.own[2:]
         found.append((replace(trial, own=own), misfit))
     return min(found, key=lambda entry: entry[1])
@@ -488,7 +493,13 @@ def fit_known_shapes(
         report(number, settings.max_rounds, note)
         fit.update(number)
         solved = least_squares(
-            fit.residuals, fit.joined(), fit.derivatives, method="trf", max_nfev=_STEPS, xtol=1e-5, ftol=1e-7  # type: ignore[arg-type]
+            fit.residuals,
+            fit.joined(),
+            fit.derivatives,  # type: ignore[arg-type]  # SciPy's stubs know texts only
+            x_scale="jac",  # type: ignore[arg-type]
+            max_nfev=_STEPS,
+            xtol=1e-6,
+            ftol=1e-7,
         )
         before = fit.x
         fit.x, fit.linear = fit.split(solved.x)

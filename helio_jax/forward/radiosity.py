@@ -180,9 +180,7 @@ def _sliced(optics: Optics) -> Slices:
     return slice_apertures(optics, N_SLICES)
 
 
-def radiosity(
-    height: Any, normals: Any, optics: Optics, raster: Raster, plan: Plan, albedo: Any = None
-) -> jax.Array:
+def radiosity(height: Any, normals: Any, optics: Optics, raster: Raster, plan: Plan, albedo: Any = None) -> jax.Array:
     """Compute the multiple scattering, orders 2 and above [detector, y, x], for a fixed plan; differentiable.
 
     Of an atom that its own pixel has scattered: the albedo of that pixel is not included.
