@@ -35,10 +35,11 @@ class Row(NamedTuple):
 
 def table(fit: KnownFit) -> list[Row]:
     """List the unknowns of instrument and objects."""
-    columns = zip(fit.names, fit.units, fit.values, fit.stds, fit.stated_values, fit.priors, strict=True)
+    columns = zip(fit.names, fit.units, fit.values.tolist(), fit.stds.tolist(), strict=True)
+    priors = zip(fit.stated_values.tolist(), fit.priors.tolist(), strict=True)
     return [
-        Row(name, unit, *map(float, (v, s, at, p, (v - at) / p)), bool(s <= UNDETERMINED * p))
-        for name, unit, v, s, at, p in columns
+        Row(name, unit, value, std, stated, prior, (value - stated) / prior, std <= UNDETERMINED * prior)
+        for (name, unit, value, std), (stated, prior) in zip(columns, priors, strict=True)
     ]
 
 
@@ -135,7 +136,7 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     correlation = fit.covariance[:n, :n] / np.outer(size, size)
     covariance = Covariance(
         parameters=tuple(fit.names[:n]),
-        units=tuple(fit.units[:n]),
+        units=tuple(fit.units[:n]),  # type: ignore[arg-type]  # checked when made
         std=tuple(float(f"{s:.4g}") for s in fit.stds[:n]),
         correlation=tuple(tuple(np.round(row, 4).tolist()) for row in correlation),
     )

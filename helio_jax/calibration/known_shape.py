@@ -2,7 +2,7 @@
 
 The unknowns of `unknowns`, each with a prior, are fitted to one or several scans at once; plate, beam and apertures are
 common to all scans, each scan has its own object and read-out. Weights are robust (Cauchy); offsets of single scan
-lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering and what is left out
+lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering and excluded pixels
 are computed anew in every round, for the geometry of that round.
 """
 
@@ -42,8 +42,8 @@ from helio_jax.robust import cauchy_weight
 
 OUTLINE = 0.75, 0.5, 0.25
 """Pixels that are nearer to the object's outline than this share of the pitch are left out, in the first rounds and all
-later ones: the model's derivatives do not know that a pixel may change sides. The outline is found anew when it has moved
-by half of that."""
+later ones: the model's derivatives do not know that a pixel may change sides. The outline is found anew when it has
+moved by half of that."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
 CONVERGED = 0.1
@@ -55,6 +55,9 @@ SPIKE = 6.0
 _STEPS = 20
 _SEARCH_PIXELS = 31
 _SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
+"""First search: pixels of the thinned raster, reach over the width of the image, points along each axis."""
+_LATER_REACH, _LATER_SIDES, _LATER_ROUNDS = 0.8, (5, 5), (1, 2, 3)
+"""Searches about the place that a round has found: reach in pitches, points, before which rounds."""
 Trace = Callable[[int, Instrument, dict[str, float]], np.ndarray]
 """Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object
 by their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
@@ -242,45 +245,59 @@ def _expected(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndar
     return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)
 
 
-def _find_place(scan: KnownScan, layout: _Layout, settings: KnownShapeSettings) -> tuple[np.ndarray, float]:
-    """Find where the object lies, by a search over the image with the stated instrument, the read-out fitted.
+def _find_place(
+    scan: KnownScan,
+    base: np.ndarray,
+    multiple: Multiple,
+    reach: np.ndarray,
+    sides: tuple[int, ...],
+    settings: KnownShapeSettings,
+) -> tuple[np.ndarray, float]:
+    """Find where the object lies by a search about the place in `base`, read-out fitted, all else of `base` held.
+
+    Unlike a fit by derivatives it sees which pixels lie on the object.
+
+    Args:
+        scan: the data.
+        base: unknowns of the scan.
+        multiple: multiple scattering.
+        reach: of the search along x and y, um; 0: not searched.
+        sides: points along each axis in every stage, each 0.4 times as wide as the one before.
+        settings: priors of the read-out.
 
     Returns:
         The place (x, y) [um], and the misfit there.
     """
-    stride = max(1, round(max(scan.model.raster.shape) / _SEARCH_PIXELS))
-    thin = (slice(None), slice(None, None, stride), slice(None, None, stride))
-    columns = scan.columns._replace(modes=scan.columns.modes[thin])
-    coarse = replace(
-        scan, counts=scan.counts[thin], sigma=scan.sigma[thin], is_used=scan.is_used[thin], columns=columns,
-        model=scan.model.thinned(stride),
-    )  # fmt: skip
-    inverse = np.where(coarse.is_used, 1.0 / coarse.sigma, 0.0)
-    base = layout.start[0]
+    inverse = np.where(scan.is_used, 1.0 / scan.sigma, 0.0)
     index = len(base) - len(scan.own)
-    nothing = no_multiple(coarse.model, base, layout.free[0])
 
     def misfit(place: np.ndarray) -> float:
         at = base.copy()
         at[index : index + 2] = place
-        image = probability(coarse.model, at, nothing)
-        residual = (coarse.counts - _expected(coarse, _linear_start(coarse, image, inverse, settings), image)) * inverse
-        scale = 3.0 * float(robust_std(residual[coarse.is_used]))
+        image = probability(scan.model, at, multiple)
+        residual = (scan.counts - _expected(scan, _linear_start(scan, image, inverse, settings), image)) * inverse
+        scale = 3.0 * float(robust_std(residual[scan.is_used]))
         return float(np.sum(np.log1p((residual / scale) ** 2)) + residual.size * 2.0 * np.log(scale))
 
-    is_line = scan.known.kind in ("step", "wedge")
-    reach = _SEARCH_REACH * np.array([np.ptp(scan.model.raster.x), 0.0 if is_line else np.ptp(scan.model.raster.y)])
-    best, place = np.inf, np.zeros(2)
-    width = reach.copy()
-    for side in _SEARCH_SIDES:
-        steps = np.linspace(-1.0, 1.0, side)
+    place = base[index : index + 2].copy()
+    best = misfit(place)
+    for stage, side in enumerate(sides):
+        steps, width = np.linspace(-1.0, 1.0, side), reach * 0.4**stage
         grid = [place + width * [a, b] for a in steps for b in (steps if width[1] else [0.0])]
         found = [misfit(p) for p in grid]
         i = int(np.argmin(found))
         if found[i] < best:
             best, place = found[i], grid[i]
-        width = width * 0.4
     return place, best
+
+
+def _coarse(scan: KnownScan) -> KnownScan:
+    """Thin a scan for the first search."""
+    stride = max(1, round(max(scan.model.raster.shape) / _SEARCH_PIXELS))
+    thin = (slice(None), slice(None, None, stride), slice(None, None, stride))
+    columns = scan.columns._replace(modes=scan.columns.modes[thin])
+    images = {name: getattr(scan, name)[thin] for name in ("counts", "sigma", "is_used")}
+    return replace(scan, **images, columns=columns, model=scan.model.thinned(stride))
 
 
 class _Fit:
@@ -360,7 +377,9 @@ class _Fit:
         return out
 
     def update(self, number: int) -> None:
-        """Compute multiple scattering, weights, lines and what is left out, at the present unknowns."""
+        """Compute multiple scattering, weights, lines and excluded pixels, at the present unknowns."""
+        if number in _LATER_ROUNDS:
+            self.search_places()
         instrument = self.fitted()
         for i, scan in enumerate(self.scans):
             at = self.layout.of_scan(i, self.x)
@@ -384,6 +403,20 @@ class _Fit:
             )
             if number > 0:
                 self.lines[i] = _line_std(scan, misfit, self.weights[i])
+
+    def search_places(self) -> None:
+        """Move the objects to where the outline agrees with the data, the instrument held."""
+        for i, scan in enumerate(self.scans):
+            if scan.known.kind == "flat":
+                continue
+            at = self.layout.of_scan(i, self.x)
+            reach = _LATER_REACH * pitch(scan.model.raster.y) * np.array([1.0, float(scan.known.kind == "ball")])
+            place, _ = _find_place(scan, at, self.multiple[i], reach, _LATER_SIDES, self.settings)
+            first = len(at) - len(scan.own)
+            for index, value in ((first, place[0]), (first + 1, place[1])):
+                for column in self.layout.place[i][self.layout.free[i] == index]:
+                    self.x = self.x.copy()
+                    self.x[column] += (value - at[index]) / self.layout.scale[column]
 
     def _scattered_again(self, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
         """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
@@ -442,8 +475,11 @@ def _started(
     found = []
     for known in scan.known.starts():
         trial = replace(scan, known=known, own=object_unknowns(known, stack_reach, settings))
-        layout = _Layout(instrument_unknowns(stated, settings), [trial])
-        place, misfit = _find_place(trial, layout, settings)
+        layout, coarse = _Layout(instrument_unknowns(stated, settings), [trial]), _coarse(trial)
+        base, is_ball = layout.start[0], known.kind == "ball"
+        reach = 2.0 * _SEARCH_REACH * stack_reach * np.array([1.0, float(is_ball)])
+        nothing = no_multiple(coarse.model, base, layout.free[0])
+        place, misfit = _find_place(coarse, base, nothing, reach, _SEARCH_SIDES, settings)
         own = [u._replace(stated=float(p)) for u, p in zip(trial.own[:2], place, strict=True)] + trial.own[2:]
         found.append((replace(trial, own=own), misfit))
     return min(found, key=lambda entry: entry[1])

@@ -158,7 +158,7 @@ class PlacedShape(eqx.Module):
             shift: `Optics.beam_shift`.
         """
         axes, beam, local_shift, at = self._local(raster, shift)
-        hit = self.shape.hit(*at, local_shift)
+        hit = self.shape.hit(at[0], at[1], local_shift)
         x, y = jnp.meshgrid(raster.x, raster.y)
         # the local height is a distance along the beam: `beam[2]` of it per um of the sample's height
         start = jnp.einsum("j,jyx->yx", axes[:, 2], jnp.stack([x, y, jnp.zeros_like(x)]))
@@ -178,7 +178,7 @@ class PlacedShape(eqx.Module):
         along = axes.T @ jnp.append(direction, 0.0)
         level = along[:2] + along[2] * local_shift
         length = jnp.sqrt(level @ level)
-        slope = self.shape.horizon(*at, level / length, local_shift)
+        slope = self.shape.horizon(at[0], at[1], level / length, local_shift)
         return jnp.where(slope > NO_HORIZON, (slope * length - along[2]) / beam[2], NO_HORIZON)
 
 
