@@ -593,7 +593,11 @@ def _misfit(fit: _Fit, jacobian: np.ndarray, residual: np.ndarray, inverse: np.n
     """
     weight = np.concatenate([w[u] for w, u in zip(fit.weights, fit.used, strict=True)])
     effective = max(float(weight.sum()) - np.trace(np.eye(len(inverse)) - inverse), 1.0)
-    chi_square = float(residual @ residual) / effective
+    # robust weights make even the mean square of normal noise less than 1
+    node, share = np.polynomial.hermite_e.hermegauss(40)
+    normal = cauchy_weight(node, fit.settings.robust_limit)
+    expected = float(np.sum(share * normal * node**2) / np.sum(share * normal))
+    chi_square = float(residual @ residual) / effective / expected
     total, first = np.zeros_like(inverse), 0
     for scan in fit.scans:
         k, ny, nx = scan.counts.shape
