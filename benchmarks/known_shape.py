@@ -1,166 +1,151 @@
-"""What geometry a measured sphere asks for whose shape is known: the instrument by a standard, not by a reconstruction.
+"""Calibration by known shapes: are the instruments found, within the stated errors? On twins made by the tracer.
 
-python benchmarks/known_shape.py STACK.h5 SCENE.toml [--hold incidence,...]   (no stack: a sphere of our own)
+python benchmarks/known_shape.py [--instruments N] [--first SEED] [--pixels N] [--tiny]
+python benchmarks/known_shape.py --collect      (rows over all twins in the output folder so far)
 
-Incidence, polar angle of every aperture, distance and the sphere's place are fitted to the micrographs, with gain,
-offset and drift as `helio compare` has them, by least squares with Cauchy's weights: a foot that is unlike the scene's
-shall not decide. Printed with error bars (of the counts, scaled to the residuals left; the simulation's own noise is
-not in them, which makes a sphere of our own 4 of them wrong with 64 rays), chi-square per pixel, and from the median
-residual (robust). Held at what the scene says: what is named after --hold.
-
-The truth goes into it: whoever reconstructs the same sphere with this geometry scores nothing. It tells what in a
-reconstruction comes from the stated geometry, and may serve for other samples in the same instrument.
+A twin is a scan of a ball of known radius whose burial is not known, traced (`hx.simulate`, never `hx.render`) by an
+instrument drawn at random: plate shift up to 0.25 D, rotation +-2 deg, scale +-5 %, distance +-10 %, tilt +-3 deg,
+incidence +-1 deg, gains x0.5 to x2, offsets 1 to 3 times the signal, albedo ratio 0.85 to 1.1. To the counts come noise
+(the substrate's signal is 25 times that of one pixel), a pedestal over the stage, drift and offsets of scan lines. The
+fit is told the instrument as stated, the ball's radius and the variance of the noise, nothing else. Printed: root mean
+square of the pulls (value - true) / stated s.d. of every parameter that the scans determine, chi-square per pixel.
 """
 
 import argparse
+import json
+import math
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+import helio_jax as hx  # noqa: E402
 from benchmarks import rows  # noqa: E402
-from helio_jax.arrays import pitch, robust_std  # noqa: E402
-from helio_jax.formats.hdf5 import read_stack  # noqa: E402
-from helio_jax.inverse.linear import signal_of  # noqa: E402
-from helio_jax.micrograph import MicrographStack  # noqa: E402
-from helio_jax.scores.agreement import find_shift, normalise  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
-from helio_jax.workflows.compare import raster_of  # noqa: E402
-from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
+from helio_jax.calibration.known_objects import KnownObject  # noqa: E402
+from helio_jax.calibration.known_report import as_record  # noqa: E402
+from helio_jax.calibration.unknowns import OBJECT  # noqa: E402
+from helio_jax.forward.readout import pedestal_modes  # noqa: E402
+from helio_jax.instrument import Instrument  # noqa: E402
+from helio_jax.workflows.calibrate_known import calibrate_known  # noqa: E402
+from helio_jax.workflows.known_scene import known_scene  # noqa: E402
 
-STEP_DEG, STEP_UM = 1.0, 100.0
-"""Steps of the derivatives; places by a quarter of a pixel."""
-OUTLIER = 3.0
-"""Residuals, in robust standard deviations, from which on they count less (Cauchy)."""
-INCIDENCE, POLAR, FARTHER = 24.0, (3.0, -2.0, 1.0), -200.0
-"""The sphere of our own: incidence [deg]; polar angles [deg] and distance [um] more than the scene's."""
-
-
-def changed(scene: SceneFile, polar: np.ndarray, distance: float) -> dict[str, Any]:
-    """Return the settings of apertures whose polar angles are larger by so much [deg], the sample so far away [um]."""
-    aim = np.stack([np.radians(polar), np.zeros(len(polar))], 1)
-    moved = scene.moved(aim, 0.0)
-    centers: dict[str, Any] = {
-        f"detector.{k}.center_um": list(map(float, d.center_um or ())) for k, d in enumerate(moved.detector)
-    }
-    return centers | {"plate.sample_distance_um": float(distance)}
+RADIUS, FIELD, SUBSTRATE = 1000.0, 3630.0, 8000.0
+SNR, SIGNAL = 25.0, 3000.0
+PEDESTAL, DRIFT, LINES = 0.05, 0.03, 0.01
+"""Pedestal, drift and offsets of scan lines over the signal."""
+TWIN_RAYS = 512
+KNOWN = "ball radius=1000"
 
 
-class KnownShape:
-    """Micrographs, the scene that they are of, and which of its geometry is fitted."""
-
-    def __init__(self, stack: MicrographStack, path: Path, rays: int, held: list[str]) -> None:
-        self.stack, self.path, self.scene = stack, path, load_scene(path)
-        self.rays = rays
-        polar = [f"polar {name}" for name in self.scene.detector_names]
-        self.names = ["incidence", *polar, "distance", "place x", "place y"]
-        quarter = 0.25 * pitch(stack.y)
-        self.steps = np.array([STEP_DEG, *(STEP_DEG,) * len(polar), STEP_UM, quarter, quarter])
-        start = [self.scene.beam.incidence_deg, *(0.0,) * len(polar), self.scene.sample_distance]
-        self.start = np.array([*start, *find_shift(stack, self.simulated(np.array([*start, 0.0, 0.0]))[0])])
-        self.free = np.array([not any(name.startswith(h) for h in held) for name in self.names])
-
-    def simulated(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return detection probabilities and their variance, for values of all that is named."""
-        incidence, *polar, distance, x, y = at
-        changes = raster_of(self.stack, self.scene, (x, y)) | changed(self.scene, np.array(polar), distance)
-        changes |= {"beam.incidence_deg": float(incidence), "trace.rays": self.rays}
-        return signal_of(pipeline.simulate(load_scene(self.path, changes), maps=False).only())
-
-    def residuals(self, at: np.ndarray) -> np.ndarray:
-        """Return (measured - simulated) / standard deviation of all observed pixels, gain and background fitted."""
-        image, variance = self.simulated(at)
-        found = normalise(self.stack, image, own_variance=variance).residuals
-        return np.where(self.stack.is_observed, found, 0.0).ravel()
-
-    def fit(self, typical: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the values of all that is named, their standard deviations (0: held), and the residuals there.
-
-        Args:
-            typical: residual at the start; from `OUTLIER` times it on they count less.
-        """
-
-        def residuals(scaled: np.ndarray) -> np.ndarray:
-            at = self.start.copy()
-            at[self.free] += scaled * self.steps[self.free]
-            return self.residuals(at)
-
-        def derivatives(
-            scaled: np.ndarray,
-        ) -> np.ndarray:  # over a whole step each way: shorter ones drown in ray noise
-            return np.stack(
-                [0.5 * (residuals(scaled + way) - residuals(scaled - way)) for way in np.eye(scaled.size)], 1
-            )
-
-        found = least_squares(
-            residuals,
-            np.zeros(self.free.sum()),
-            derivatives,  # type: ignore[arg-type]  # SciPy's stubs know texts only
-            loss="cauchy",
-            f_scale=OUTLIER * typical,
-            xtol=1e-3,
-            ftol=1e-4,
-            max_nfev=20,
-        )
-        weight = 1.0 / (1.0 + (found.fun / (OUTLIER * typical)) ** 2)
-        spread = np.sum(weight * found.fun**2) / np.sum(weight)
-        covariance = spread * np.linalg.inv(found.jac.T @ found.jac)  # found.jac: weighted by the loss
-        values, std = self.start.copy(), np.zeros(len(self.names))
-        values[self.free] += found.x * self.steps[self.free]
-        std[self.free] = np.sqrt(np.diag(covariance)) * self.steps[self.free]
-        return values, std, found.fun
+def draw(seed: int, stated: Instrument) -> tuple[Instrument, dict[str, float]]:
+    """Draw an instrument, and the truth by the names of the report, degrees and um."""
+    rng, distance = np.random.default_rng(seed), stated.sample_distance
+    angle, length = rng.uniform(0.0, 2.0 * np.pi), 0.25 * distance * math.sqrt(rng.uniform())
+    low = {"plate scale": 0.95, "sample distance": 0.9, "plate rotation": -2.0, "incidence": -1.0, "tilt": -3.0}
+    scale, far = (rng.uniform(low[name], 2.0 - low[name]) for name in ("plate scale", "sample distance"))
+    rotation, incidence = (rng.uniform(low[name], -low[name]) for name in ("plate rotation", "incidence"))
+    tilt = rng.uniform(low["tilt"], -low["tilt"], 2)
+    shift = length * math.cos(angle), length * math.sin(angle)
+    true = stated.moved(
+        np.zeros((len(stated.detector), 2)), (far - 1.0) * distance, plate_shift=shift, scale=scale,
+        rotation=math.radians(rotation), incidence=math.radians(incidence),
+    )  # fmt: skip
+    ratio = rng.uniform(0.85, 1.1)
+    truth = {
+        "plate shift x": shift[0], "plate shift y": shift[1], "plate scale": scale, "plate rotation": rotation,
+        "sample distance": far * distance, "incidence": true.beam.incidence_deg, "tilt x": tilt[0], "tilt y": tilt[1],
+        "object x": rng.uniform(-150.0, 150.0), "object y": rng.uniform(-150.0, 150.0),
+        "height": rng.uniform(630.0, 740.0), "log albedo ratio": math.log(ratio),
+        # the tracer's brighter surface has the albedo 1, the fit's substrate
+        "log multiple scattering": -max(0.0, math.log(ratio)),
+    }  # fmt: skip
+    return true, truth
 
 
-def our_own(path: Path, rays: int, size: int) -> MicrographStack:
-    """Return a noisy scan of the scene by an instrument that differs from the stated one."""
-    scene = load_scene(path)
-    nominal = scene.scan.model_dump()
-    polar, distance = np.array(POLAR), scene.sample_distance + FARTHER
-    changes = {"beam.incidence_deg": INCIDENCE, "trace.rays": rays, "trace.seed": 5, "scan.nx": size}
-    changes |= {"scan.ny": size, "scan.pixel_size_um": nominal["pixel_size_um"] * nominal["nx"] / size}
-    stack = pipeline.simulate(load_scene(path, changes | changed(scene, polar, distance)), maps=False).only()
-    assert stack.n_rays is not None
-    level = 3000.0 / np.median(stack.counts, axis=(1, 2), keepdims=True)
-    counts = np.random.default_rng(7).poisson(level * stack.counts + 5000.0).astype(float)
-    return stack.replace(counts=counts, variance=np.maximum(counts, 1.0), background=None, n_rays=None, by_order=None)
+def scan(seed: int, size: int, rays: int) -> tuple[hx.MicrographStack, dict[str, float]]:
+    """Trace and read out the twin of a seed; its stack states the instrument that the fit is told."""
+    stated = hx.load_scene(str(ROOT / "scenes" / "measured_sphere_a.toml")).instrument
+    true, truth = draw(seed, stated)
+    numbers = dict.fromkeys(OBJECT, 0.0) | {"radius": RADIUS} | {k: v for k, v in truth.items() if k in OBJECT}
+    numbers |= {name: math.radians(truth[name]) for name in ("tilt x", "tilt y")}
+    axis = (np.arange(size) - 0.5 * (size - 1)) * FIELD / size
+    scene = known_scene(KnownObject.parse(KNOWN), numbers, true, axis, axis, substrate_um=SUBSTRATE)
+    beam = scene.beam.model_copy(update={"source": "uniform"})  # a spot of finite size, which the fit does not know
+    traced = hx.simulate(scene.model_copy(update={"beam": beam}), rays=rays, seed=seed + 1, maps=False).only()
+    probability = traced.counts.reshape(-1, size, size)
+    rng, (v, u) = np.random.default_rng([seed, 7]), np.meshgrid(*[np.linspace(-1.0, 1.0, size)] * 2, indexing="ij")
+    modes, images, variance = pedestal_modes(u, v, 3)[0], [], []
+    for image in probability:
+        signal = SIGNAL * 2.0 ** rng.uniform(-1.0, 1.0)
+        reading = signal * (image / np.median(image) + rng.uniform(1.0, 3.0))
+        reading += np.tensordot(rng.normal(0.0, PEDESTAL * signal, len(modes)), modes, 1)
+        reading += DRIFT * signal * np.sin(2.5 * v + rng.uniform(0.0, 2.0 * np.pi))
+        reading += rng.normal(0.0, LINES * signal, (size, 1))
+        images.append(reading + rng.normal(0.0, signal / SNR, image.shape))
+        variance.append(np.full(image.shape, (signal / SNR) ** 2))
+    counts = np.array(images)
+    stack = hx.MicrographStack(
+        counts, axis, axis, stated, variance=np.array(variance), noise="poisson", name=f"twin {seed}"
+    )
+    return stack, truth
+
+
+def evaluate(seed: int, size: int, twin_rays: int, **changes: Any) -> dict[str, Any]:
+    """Calibrate on the twin of a seed: pulls of all parameters, which are determined, chi-square."""
+    stack, truth = scan(seed, size, twin_rays)
+    begin = time.time()
+    record = as_record(calibrate_known([stack], [KNOWN], **changes))
+    pulls = {r["name"]: (r["value"] - truth.get(r["name"], 0.0)) / r["std"] for r in record["table"]}
+    determined = [r["name"] for r in record["table"] if r["is_determined"]]
+    about = {name: record[name] for name in ("chi_square", "robust_chi_square", "inflation", "is_converged", "rounds")}
+    return {"seed": seed, "pixels": size, "pulls": pulls, "determined": determined, "s": time.time() - begin, **about}
+
+
+def collect(found: list[dict[str, Any]]) -> list[rows.Row]:
+    """Tabulate the pulls of the parameters that most twins determine, and chi-square."""
+    out = []
+    for name in found[0]["pulls"]:
+        pulls = np.array([f["pulls"][name] for f in found if name in f["determined"]])
+        if 2 * len(pulls) >= len(found):
+            size = float(np.sqrt(np.mean(pulls**2)))
+            text = f"rms {size:.2f}, mean {pulls.mean():+.2f}, largest {np.abs(pulls).max():.1f}, {len(pulls)} twins"
+            out.append(rows.row("1", f"pulls of {name}", text, "0.8 to 1.25", 0.8 <= size <= 1.25))
+    chi = np.array([f["chi_square"] for f in found])
+    text = f"median {np.median(chi):.3f}, {chi.min():.3f} to {chi.max():.3f}, {len(chi)} twins"
+    out.append(rows.row("1", "chi-square per pixel", text, "0.95 to 1.1", bool(0.95 <= np.median(chi) <= 1.1)))
+    lost = [f["seed"] for f in found if not f["is_converged"]]
+    out.append(rows.row("1", "fits that have not converged", f"{len(lost)} of {len(found)} {lost}", "0", not lost))
+    seconds = float(np.median([f["s"] for f in found]))
+    out.append(rows.row("1", "time of a fit, compilation included", f"median {seconds:.0f} s", "-", None))
+    return out
 
 
 def main() -> None:
-    """Fit and print."""
+    """Make twins, calibrate, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("stack", type=Path, nargs="?")
-    parser.add_argument("scene", type=Path, nargs="?", default=ROOT / "scenes" / "measured_sphere_a.toml")
-    parser.add_argument("--hold", default="", help="e.g. incidence,distance")
-    parser.add_argument("--rays", type=int, default=64)
+    parser.add_argument("--instruments", type=int, default=20)
+    parser.add_argument("--first", type=int, default=100, help="seed of the first twin")
+    parser.add_argument("--pixels", type=int, default=41)
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
-    parser.add_argument("--tiny", action="store_true", help="a sphere of our own, few rays and pixels")
+    parser.add_argument("--collect", action="store_true", help="only tabulate what is there")
+    parser.add_argument("--tiny", action="store_true", help="one twin, few rays and pixels")
     args = parser.parse_args()
-    rays = 16 if args.tiny else args.rays
-    is_own = args.tiny or args.stack is None
-    if is_own:
-        stack = our_own(args.scene, rays, 61 if args.tiny else 121)
-    else:
-        stack = read_stack(str(args.stack))
-    known = KnownShape(stack, args.scene, rays, [name for name in args.hold.split(",") if name])
-    names = known.names[:-2]  # without the place
-    true = dict(zip(names, [INCIDENCE, *POLAR, known.scene.sample_distance + FARTHER], strict=True)) if is_own else {}
-    before = known.residuals(known.start)
-    values, std, after = known.fit(float(robust_std(before)))
-    done = []
-    for name, stated, value, error in zip(known.names, known.start, values, std, strict=True):
-        unit = "um" if name.startswith(("dist", "place")) else "deg"
-        aim = f"{true[name]:.1f} {unit}" if name in true else f"start {stated:.1f} {unit}"
-        is_reached = bool(abs(value - true[name]) <= 4.0 * max(error, 0.1)) if name in true else None
-        done.append(rows.row("shape", name, f"{value:.2f} +- {error:.2f} {unit}", aim, is_reached))
-    for when, r in (("as stated", before), ("as fitted", after)):
-        text = f"chi-square per pixel {np.mean(r**2):.2f}, robust one {robust_std(r) ** 2:.2f}"
-        done.append(rows.row("shape", f"{stack.name}, geometry {when}", text, "1", None))
-    rows.write(args.output / ("known_shape_tiny.json" if args.tiny else "known_shape.json"), done, 5)
+    args.output.mkdir(parents=True, exist_ok=True)
+    name = "known_shape_tiny" if args.tiny else "known_shape"
+    if not args.collect:
+        n, size, rays = (1, 17, 64) if args.tiny else (args.instruments, args.pixels, TWIN_RAYS)
+        changes = {"max_rounds": 2, "rays": 32, "drift_degree": 3} if args.tiny else {}
+        for seed in range(args.first, args.first + n):
+            found = evaluate(seed, size, rays, **changes)
+            (args.output / f"{name}_twin_{seed}.json").write_text(json.dumps(found))
+            print(f"twin {seed}: chi-square {found['chi_square']:.3f}, {found['rounds']} rounds, {found['s']:.0f} s")
+    files = sorted(args.output.glob(f"{name}_twin_*.json"))
+    rows.write(args.output / f"{name}.json", collect([json.loads(f.read_text()) for f in files]), args.first)
 
 
 if __name__ == "__main__":

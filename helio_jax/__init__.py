@@ -78,6 +78,7 @@ forward/              heights and optics -> expected counts, differentiable (JAX
   compiling           how large JAX functions are compiled
   optics              Optics, Raster: beam, apertures and beam positions as pytrees; moving them
   surface             Surface: heights and slopes in the beam frame, normals
+  known_shapes        ball, step and wedge in closed form: heights, normals, horizons
   form_factor         vector form factor of an elliptical aperture
   horizon             horizon search along a march over the surface
   masking             masked part of each form factor: the shadow mask of a reconstruction
@@ -130,13 +131,18 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   misfit_errors       errors of a photometric height map that its misfit shows
   instrument_report   what a fit found out about the instrument
   consistency         misfit of one surface to all images
-calibration/          background, gain, drift and noise
+calibration/          background, gain, drift and noise; instruments by known shapes
   border              first calibration of a measured scan from its border and dark spots
   noise_model         noise, spikes and scan-line offsets of measured images
   noise               the [noise] table: adds noise to expected counts
   response            detector lag and slow drift in scan time
   self_calibration    calibration of rotated scans by a constant albedo
   constant_albedo     the fit behind it
+  known_objects       objects of known shape as a user states them
+  unknowns            what is unknown in an instrument and a scan; priors
+  known_model         detection probability of a known object's scan (JAX)
+  known_shape         the fit of an instrument to known shapes
+  known_report        table, chi-square by region, verdict, instrument with covariance
 alignment/            rotated scans onto one raster; orientation of arrays
   align               entry: a set of scans -> one stack
   rigid               rigid motions
@@ -184,6 +190,7 @@ figures/              pictures
   trust               verdict, rule and limits of a height map in words
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
+  known_shape         residuals of a calibration by known shapes
   before_after        a scan before and after calibration
   notebook            thumbnail and table of a record
   micrograph_page     page of micrographs and apertures
@@ -241,6 +248,8 @@ workflows/            what joins the stages
   scene_errors        validation errors as sentences
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans
+  calibrate_known     calibration of an instrument by known shapes
+  known_scene         the scene of a known object, for the tracer
   orient              finds the orientation of a file's arrays
   compare             simulation against experiment
   show                pictures of records and files: hx.show

@@ -144,11 +144,52 @@ class Uncertainty(Settings):
     """Of the polar angle of each aperture's centre, seen from the nominal spot [deg]."""
     azimuth_deg: float = Field(default=0.0, ge=0.0, le=30.0)
     """Of the azimuth of each aperture about the nominal spot [deg]."""
+    plate_shift_um: float = Field(default=0.0, ge=0.0, le=1e5)
+    """Of the shift of the plate with all its apertures against the beam, along each of x and y; used by `helio
+    calibrate --known`, as the next three [um]."""
+    plate_scale: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Of the scale of the plate's plane, relative."""
+    plate_rotation_deg: float = Field(default=0.0, ge=0.0, le=45.0)
+    """Of the plate's rotation about its normal [deg]."""
+    incidence_deg: float = Field(default=0.0, ge=0.0, le=20.0)
+    """Of the beam's incidence [deg]."""
 
     @property
     def is_stated(self) -> bool:
         """Whether anything of the geometry is uncertain."""
         return any(self.model_dump().values())
+
+
+class Covariance(Settings):
+    """How the errors of a calibrated geometry belong together: table `[covariance]` of an instrument file.
+
+    Written by `helio calibrate --known`; its parameters move the whole plate as `Optics.moved` does.
+    """
+
+    parameters: tuple[str, ...] = Field(min_length=1, max_length=300)
+    """Names of the parameters."""
+    units: tuple[Literal["um", "deg", ""], ...]
+    """Unit of each parameter; "": a ratio."""
+    std: tuple[float, ...]
+    """Standard deviation of each parameter, in its unit."""
+    correlation: tuple[tuple[float, ...], ...]
+    """Correlation matrix."""
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> "Covariance":
+        n = len(self.parameters)
+        if len(self.units) != n or len(self.std) != n or [len(row) for row in self.correlation] != [n] * n:
+            raise ValueError(f"units, std and correlation must be of {n} parameters: one each, and a square table")
+        matrix = np.array(self.correlation)
+        if min(self.std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
+            raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
+        if np.linalg.eigvalsh(matrix).min() < -0.01:
+            raise ValueError("correlation must not have negative eigenvalues: calibrate anew")
+        return self
+
+    def matrix(self) -> np.ndarray:
+        """Compute the covariance [parameter, parameter], in the parameters' units."""
+        return np.array(self.correlation) * np.outer(self.std, self.std)
 
 
 class Instrument(Drawable, Settings):
@@ -157,6 +198,7 @@ class Instrument(Drawable, Settings):
     beam: Beam = Beam()
     plate: Plate
     uncertainty: Uncertainty = Uncertainty()
+    covariance: Covariance | None = None
     detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")
@@ -255,28 +297,44 @@ class Instrument(Drawable, Settings):
             + ("" if not self.plate.is_mesh else " and set plate.kind = 'scattering' or 'transparent'")
         )
 
-    def moved(self, aim: np.ndarray, distance: float) -> "Instrument":
-        """Return the instrument with changed aperture angles and sample distance.
+    def moved(
+        self,
+        aim: np.ndarray,
+        distance: float,
+        *,
+        plate_shift: tuple[float, float] = (0.0, 0.0),
+        scale: float = 1.0,
+        rotation: float = 0.0,
+        incidence: float = 0.0,
+    ) -> "Instrument":
+        """Return the instrument with changed aperture angles, plate, sample distance and incidence.
 
         Each aperture is shifted along its azimuth by the change of polar angle of its centre, seen from the nominal
-        spot, and rotated about the plate normal through that spot by the change of azimuth.
+        spot, and rotated about the plate normal through that spot by the change of azimuth; then the plate moves as one
+        rigid piece, as by `Optics.moved`.
 
         Args:
             aim: changes of polar angle and azimuth [detector, 2], rad.
             distance: change of the sample distance, um.
+            plate_shift: shift of the plate in its plane, against the beam (x, y), um.
+            scale: factor of all lengths in the plate's plane.
+            rotation: of the plate about its normal, counter-clockwise seen from above, rad.
+            incidence: change of the beam's incidence, rad.
         """
         detectors = []
         for d, a, (polar, azimuth) in zip(self.detector, self.apertures(), aim, strict=True):
             radius, direction = math.hypot(*a.center), math.atan2(a.center[1], a.center[0]) + azimuth
-            radius = self.working_distance * math.tan(math.atan2(radius, self.working_distance) + polar)
+            radius = scale * self.working_distance * math.tan(math.atan2(radius, self.working_distance) + polar)
+            place = np.array([math.cos(direction + rotation), math.sin(direction + rotation)]) * radius + plate_shift
             ellipse = {
-                "center_um": (radius * math.cos(direction), radius * math.sin(direction)),
-                "axes_um": (2.0 * a.semi_axes[0], 2.0 * a.semi_axes[1]),
-                "rotation_deg": math.degrees(math.remainder(a.rotation + azimuth, 2.0 * math.pi)),
+                "center_um": tuple(place.tolist()),
+                "axes_um": (2.0 * scale * a.semi_axes[0], 2.0 * scale * a.semi_axes[1]),
+                "rotation_deg": math.degrees(math.remainder(a.rotation + azimuth + rotation, 2.0 * math.pi)),
             }
             detectors.append(Detector(name=d.name, channel=d.channel, **ellipse))
         plate = self.plate.model_copy(update={"sample_distance_um": self.sample_distance + distance})
-        return Instrument(beam=self.beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
+        beam = self.beam.changed(incidence_deg=self.beam.incidence_deg + math.degrees(incidence))
+        return Instrument(beam=beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
 
     def at_distance(self, distance: float) -> "Instrument":
         """Return the instrument, its plate unchanged, at another sample distance [um]."""

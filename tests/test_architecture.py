@@ -48,8 +48,8 @@ DOORS = {
     "numba": {"kernel.py", "trace/random.py"},
 }
 FOLDERS = {
-    "jax": {"forward", "inverse", "workflows/doctor.py"},
-    "equinox": {"forward", "inverse"},
+    "jax": {"forward", "inverse", "calibration", "workflows/doctor.py"},
+    "equinox": {"forward", "inverse", "calibration"},
     "llvmlite": {"trace"},
     "typer": {"commands"},
 }

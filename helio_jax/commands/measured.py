@@ -4,7 +4,6 @@ Each parses, calls, prints; no logic of its own.
 """
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +11,6 @@ import typer
 
 from helio_jax.commands.app import (
     FIGURE,
-    HDF5,
     AsJson,
     Bar,
     H5File,
@@ -31,6 +29,7 @@ from helio_jax.commands.app import (
 )
 from helio_jax.commands.door import Reads, Writes
 from helio_jax.formats.export_formats import SUFFIXES, help_text
+from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 COMPARISON = ("comparison.json", "comparison.png", "effects.png")
 """What `compare` writes in its folder (comparison.py)."""
@@ -192,21 +191,41 @@ def pick(
 
 @app.command()
 def calibrate(
-    stack: Annotated[Path, typer.Argument(help="Measured micrographs (.h5), from helio import."), Reads()],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="File to write (.h5)."), replace(HDF5, beside=(".png",))
+    stacks: Annotated[
+        list[Path], typer.Argument(help="Measured micrographs (.h5), from helio import; several with --known."), Reads()
     ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="File to write: micrographs (.h5), or with --known an instrument (.toml)."),
+        Writes("HDF5, or TOML with --known", (*HDF5_SUFFIXES, ".toml"), beside=(".png",)),
+    ],
+    known: Annotated[
+        list[str] | None,
+        typer.Option(help='Calibrate the instrument by objects of this shape, "ball radius=1000" (one per scan)'),
+    ] = None,
     drift: Annotated[bool, typer.Option(help="Subtract slow drift, and leave its residual to the fit.")] = True,
     lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
     noise_model: Annotated[bool, typer.Option(help="Estimate the variance as a + b counts.")] = True,
     spike_limit: Annotated[float | None, typer.Option(help="Standard deviations of a spike; 0: none.")] = None,
     masked_share: Annotated[float | None, typer.Option(help="Multiple scattering in the darkest spot / flat.")] = None,
+    leave_out_ring: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="With --known: ring about a ball's foot that is left out [foot radii]"),
+    ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE: border_fraction, drift_degree, ... (repeat).")
+        list[str] | None, typer.Option("--set", help="KEY=VALUE: border_fraction, plate_shift, ... (repeat).")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate background, gain, drift and noise of a measured scan; the fit starts from these estimates."""
+    """Estimate background, gain, drift and noise of a measured scan; with --known: an instrument by known shapes."""
+    from helio_jax.errors import SceneError
+
+    if known:
+        _calibrate_known(stacks, output, known, set_options(settings, leave_out_ring=leave_out_ring), as_json)
+        return
+    if len(stacks) > 1 or leave_out_ring is not None or output.suffix.lower() == ".toml":
+        raise SceneError("several scans, --leave-out-ring and an instrument file (.toml) need --known SHAPE: add it")
+    stack = stacks[0]
     from helio_jax.workflows.pipeline import calibrate_file
 
     own = {"drift": drift, "lines": lines, "noise_model": noise_model}
@@ -234,6 +253,23 @@ def calibrate(
         )
     print(f"flat: signal above the background; prior standard deviation of the background: {priors['offset_std']:.0%}")
     print(f"{output}\n{output.with_suffix('.png')}")
+
+
+def _calibrate_known(stacks: list[Path], output: Path, known: list[str], changes: dict, as_json: bool) -> None:
+    """Calibrate an instrument by known shapes, and print what was found."""
+    from helio_jax.errors import SceneError
+    from helio_jax.workflows.calibrate_known import calibrate_known_files
+
+    if output.suffix.lower() != ".toml":
+        raise SceneError(f"--known writes an instrument file: give -o the suffix .toml, got {str(output)!r}")
+    with Bar("calibrating by known shapes") as bar:
+        found = calibrate_known_files(stacks, output, known, report=bar, **changes)
+    if as_json:
+        print(json.dumps(found))
+        return
+    from helio_jax.figures.summary import known_shape_lines
+
+    print("\n".join(known_shape_lines(found)))
 
 
 @app.command()

@@ -171,7 +171,7 @@ def resume(
         files = [str(file) for file in resume_run(path, stage=Bar, say=say)]
     print_result(as_json, {"files": files}, *files)
     if files == [str(path)] and not as_json:
-        tell_micrographs(read_micrographs(path), path, picture)
+        tell_micrographs(read_micrographs(path), path, picture, as_json)
 
 
 @app.command()

@@ -234,3 +234,27 @@ def _made_rows(provenance: Any) -> Rows:
     parts += [f"helio_jax {versions['helio-jax']}"] if "helio-jax" in versions else []
     parts += [str(provenance["time"])] if "time" in provenance else []
     return [("made", short(", ".join(parts), 300))] if parts else []
+
+
+def known_shape_lines(record: Mapping[str, Any]) -> list[str]:
+    """Format what `calibrate_known_files` returns for a terminal."""
+    rows, readout, chi = record["table"], record["readout"], record["regions"]
+    width = max(len(row["name"]) for row in rows)
+    out = [f"  {'':<{width}} {'value':>10} {'s.d.':>9} {'stated':>10} {'prior s.d.':>10} {'pull':>6}"]
+    for row in rows:
+        numbers = f"{row['value']:>10.5g} {row['std']:>9.3g} {row['stated']:>10.5g} {row['prior']:>10.3g}"
+        loose = "" if row["is_determined"] else "  not determined"
+        out.append(f"  {row['name']:<{width}} {numbers} {row['pull']:>6.1f} {row['unit']}{loose}")
+    out += ["", "  detector       substrate's signal       offset     lines     noise   (counts)"]
+    for row in readout:
+        out.append(
+            f"  {row['detector']:<14} {row['substrate_signal']:>18.4g} {row['offset']:>12.5g} {row['line_std']:>9.3g} "
+            f"{row['noise']:>9.3g}   {row['scan']}"
+        )
+    out += ["", "  chi-square per pixel, robust (mean)"]
+    for row in chi:
+        place = f"{row['region']:<10} {row['detector']:<14}"
+        out.append(f"  {place} {row['robust']:>7.2f} ({row['mean']:.2f}), {row['pixels']} pixels   {row['scan']}")
+    out += ["", f"  robust chi-square {record['robust_chi_square']:.2f} per pixel; {record['rounds']} rounds"]
+    out += [f"  {sentence}" for sentence in record["verdict"]]
+    return out + list(record["files"])

@@ -20,12 +20,17 @@ _COMMENT = """# Instrument file: the geometry that helio reconstruct fitted to {
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
-    """Format a tree of JSON-compatible values as TOML, one line per value below each top table; None is omitted."""
-    values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None}
+    """Format a tree of JSON-compatible values as TOML, one line per value below each top table; None is omitted.
+
+    A list of tables becomes one table after the other.
+    """
+    listed = {k: v for k, v in tables.items() if isinstance(v, list) and v and all(isinstance(t, Mapping) for t in v)}
+    values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None and k not in listed}
     lines = [f"{_key(k)} = {value_text(v)}" for k, v in values.items()]
-    for name, table in tables.items():
-        if isinstance(table, Mapping):
-            lines += ["", f"[{_key(name)}]"]
+    for name, found in tables.items():
+        head = f"[[{_key(name)}]]" if name in listed else f"[{_key(name)}]"
+        for table in found if name in listed else [found] if isinstance(found, Mapping) else []:
+            lines += ["", head]
             lines += [f"{_key(k)} = {value_text(v)}" for k, v in table.items() if v is not None]
     return "\n".join(lines) + "\n"
 
@@ -42,6 +47,29 @@ def value_text(value: Any) -> str:
 
 def _key(key: str) -> str:
     return key if key.isascii() and key.replace("_", "").replace("-", "").isalnum() else json.dumps(key)
+
+
+def write_calibrated(instrument: Instrument, path: str | os.PathLike, comment: str) -> None:
+    """Write a calibrated instrument with its covariance, numbers to 6 digits.
+
+    Args:
+        instrument: as calibrated; its sample distance is that of the calibrating scans' stage height.
+        path: of the file.
+        comment: lines that say where the numbers come from.
+    """
+    tables = _rounded(instrument.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+    head = "".join(f"# {' '.join(line.split())}\n" for line in comment.splitlines())
+    with atomic_path(path) as part:
+        part.write_text(head + to_toml(tables), "utf-8")
+
+
+def _rounded(value: Any) -> Any:
+    """Round all numbers of a tree to 6 significant digits."""
+    if isinstance(value, Mapping):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _not_fitted(path: str | os.PathLike) -> SceneError:

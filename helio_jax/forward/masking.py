@@ -20,6 +20,7 @@ import numpy as np
 
 from helio_jax.errors import SceneError
 from helio_jax.forward.horizon import ACROSS, BEFORE, BESIDE, OUTSIDE, find_horizons, steps_per_um
+from helio_jax.forward.known_shapes import NO_HORIZON, PlacedShape
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.surface import Surface
 
@@ -121,21 +122,44 @@ def masked_form_factor(
     if horizons is None:
         horizons = choose_horizons(surface, optics, raster, n_slices, width)
     padded = jnp.pad(height, [(n, n) for n in shape], mode="edge")
-    shift = optics.beam_shift
+
+    def horizon_of(piece: Slices, found: jax.Array) -> jax.Array:
+        return _slope_up(padded, height, piece.direction, dx, dy, found)
+
+    return _sum_slices(horizon_of, (slices, horizons), Surface(height, slope_x, slope_y), optics.beam_shift, width)
+
+
+def masked_by_shape(shape: PlacedShape, optics: Optics, raster: Raster, *, n_slices: int = N_SLICES) -> jax.Array:
+    """Compute what `masked_form_factor` does for an object of known shape, by its exact horizons [detector, 3, y, x].
+
+    Independent of the pitch: no relief within a pixel is missed. Differentiable in shape and optics.
+    """
+    shift = jnp.asarray(optics.beam_shift)
+    surface, is_object = shape.seen(raster, shift)
+
+    def horizon_of(piece: Slices) -> jax.Array:
+        return jnp.where(is_object, NO_HORIZON, shape.horizon(raster, shift, piece.direction))
+
+    return _sum_slices(horizon_of, (slice_apertures(optics, n_slices),), surface, shift, 0.0)
+
+
+def _sum_slices(horizon_of, items: tuple, surface: Surface, shift: Any, width: float) -> jax.Array:
+    """Add the masked parts of all slices [detector, 3, y, x]; `items` [detector, slice] go to `horizon_of`."""
+    height = surface.height
 
     @jax.checkpoint  # a gradient evaluates slices anew: kept, they would take twenty times the memory of the value
-    def of_slice(piece, found):
-        tangent = slope_x * piece.direction[0] + slope_y * piece.direction[1]
-        horizon = jnp.maximum(_slope_up(padded, height, piece.direction, dx, dy, found), tangent)
+    def of_slice(piece, *rest):
+        tangent = surface.slope_x * piece.direction[0] + surface.slope_y * piece.direction[1]
+        horizon = jnp.maximum(horizon_of(piece, *rest), tangent)
         return _masked_in_slice(horizon, piece.plate - height, piece, shift, width)
 
     def add_slice(total, item):
         return jax.tree.map(jnp.add, total, of_slice(*item)), None
 
     def of_aperture(items):
-        return jax.lax.scan(add_slice, (jnp.zeros(shape, dtype),) * 3, items)[0]
+        return jax.lax.scan(add_slice, (jnp.zeros(height.shape, height.dtype),) * 3, items)[0]
 
-    return jnp.stack(jax.lax.map(of_aperture, (slices, horizons)), 1)
+    return jnp.stack(jax.lax.map(of_aperture, items), 1)
 
 
 def choose_horizons(

@@ -180,8 +180,10 @@ def _sliced(optics: Optics) -> Slices:
     return slice_apertures(optics, N_SLICES)
 
 
-def radiosity(height: Any, normals: Any, optics: Optics, raster: Raster, plan: Plan) -> jax.Array:
+def radiosity(height: Any, normals: Any, optics: Optics, raster: Raster, plan: Plan, albedo: Any = None) -> jax.Array:
     """Compute the multiple scattering, orders 2 and above [detector, y, x], for a fixed plan; differentiable.
+
+    Of an atom that its own pixel has scattered: the albedo of that pixel is not included.
 
     Args:
         height: above the substrate [y, x], um.
@@ -189,13 +191,19 @@ def radiosity(height: Any, normals: Any, optics: Optics, raster: Raster, plan: P
         optics: the instrument.
         raster: beam positions.
         plan: from `plan_radiosity` on this surface, or one that differs little.
+        albedo: of the pixels, that of the substrate outside being 1 [y, x]; default: 1.
     """
     height = jnp.asarray(height)
     plan, optics, steps = (cast(part, height.dtype) for part in (plan, optics, (raster.dy, raster.dx)))
-    weight, second = transfer(height, jnp.asarray(normals), optics, steps, plan)
+    sent = jnp.ones((), height.dtype)
+    if albedo is not None:
+        pixels = jnp.ravel(albedo)
+        sent = _spread(jnp.append(pixels, plan.place.of(jnp.append(pixels, 1.0))), height.shape, 1.0)
+    weight, second = transfer(height, jnp.asarray(normals), optics, steps, plan, sent)
 
     def remainder(irradiance):
-        return irradiance - _gather(plan.strips, weight, _spread(irradiance, height.shape, 0.0), len(irradiance))
+        emitted = jnp.expand_dims(sent, -1) * _spread(irradiance, height.shape, 0.0)
+        return irradiance - _gather(plan.strips, weight, emitted, len(irradiance))
 
     total = jax.lax.custom_linear_solve(remainder, second, _neumann, _neumann)
     return total[: height.size].T.reshape(-1, *height.shape)
@@ -394,7 +402,7 @@ def _irradiance(normal: Any, x: Any, y: Any, depth: Any, xp: Any) -> Any:
     return xp.maximum(facing, 0.0) * depth / (np.pi * (x * x + y * y + depth * depth) ** 2)
 
 
-def transfer(height, normals, optics: Optics, pitches, plan: Plan):
+def transfer(height, normals, optics: Optics, pitches, plan: Plan, albedo: Any = 1.0):
     """Compute the form factors of strips [azimuth, strip] and the direct flux that they bring [receiver, detector].
 
     A strip from slope m0 to m1 in a slice of azimuth e and width dphi has the vector form factor
@@ -405,6 +413,7 @@ def transfer(height, normals, optics: Optics, pitches, plan: Plan):
         optics: the instrument.
         pitches: dy, dx of the raster, um.
         plan: the strips.
+        albedo: of the senders [sender], or a number.
     """
     shape, shift = height.shape, optics.beam_shift
     heights = jnp.append(height, 0.0)
@@ -417,7 +426,7 @@ def transfer(height, normals, optics: Optics, pitches, plan: Plan):
     circle = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)]).astype(height.dtype)
     nodes = optics.center[:, None] + jnp.einsum("kin,nj->kji", optics.axes, circle)  # [detector, node, 3]
     area = jnp.cross(optics.axes[..., 0], optics.axes[..., 1])  # its vector, along the plate's normal
-    share = plan.visible * (np.pi / N_NODES)
+    share = plan.visible * (np.pi / N_NODES) * jnp.expand_dims(albedo, -1)
     steep = 1.0 + shift[0] ** 2 + shift[1] ** 2
     across = normal[:, 2] - normal[:, :2] @ shift
 

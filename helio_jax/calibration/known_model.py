@@ -1,0 +1,227 @@
+"""Detection probability of a scan of a known object as a function of all its unknowns (JAX, differentiable).
+
+The geometry is exact: closed-form first hits and horizons (`forward.known_shapes`). Multiple scattering is expanded to
+first order about the unknowns at which it was computed (`Multiple`), for it is a tenth of the signal and costs most.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from helio_jax.calibration.unknowns import OBJECT, PLATE
+from helio_jax.forward.known_shapes import Ball, Flat, PlacedShape, Ramp, Shape
+from helio_jax.forward.masking import masked_by_shape
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.radiosity import plan_radiosity, radiosity
+from helio_jax.forward.render import Corrections, detection_probability
+from helio_jax.forward.surface import unit_normal
+
+RADIOSITY_PIXELS = 25
+"""Pixels along the longer side of the raster on which the derivative of the multiple scattering is computed, about."""
+
+
+class Multiple(eqx.Module):
+    """Multiple scattering of an atom that its own pixel has scattered [detector, y, x], about unknowns `at`.
+
+    `slope` [unknown, detector, y, x] belongs to the rows `free` of the unknowns.
+    """
+
+    value: Any
+    slope: Any
+    free: Any
+    at: Any
+
+    def of(self, unknowns: Any) -> Any:
+        """Compute it at other unknowns, to first order."""
+        return self.value + jnp.tensordot((unknowns - self.at)[self.free], self.slope, 1)
+
+    def shifted(self, value: np.ndarray, at: np.ndarray) -> "Multiple":
+        """Return that of a new value at other unknowns, with the same derivatives."""
+        return Multiple(value, self.slope, self.free, at)
+
+
+class ScanModel(eqx.Module):
+    """What is known of a scan; `unknowns` [unknown] are changes of plate, apertures, and the numbers of the object."""
+
+    optics: Optics
+    raster: Raster
+    kind: str = eqx.field(static=True)
+
+    def moved_optics(self, unknowns: Any) -> Optics:
+        """Compute the optics."""
+        n = self.optics.n_detectors
+        plate, aim = unknowns[: len(PLATE)], unknowns[len(PLATE) : len(PLATE) + 2 * n].reshape(2, n)
+        return self.optics.moved(
+            plate_shift=(plate[0], plate[1]),
+            scale=1.0 + plate[2],
+            rotation=plate[3],
+            distance=plate[4],
+            incidence=plate[5],
+            polar=aim[0],
+            azimuth=aim[1],
+        )
+
+    def object_of(self, unknowns: Any) -> dict[str, Any]:
+        """Name the unknowns of the scan."""
+        return dict(zip(OBJECT, unknowns[len(PLATE) + 2 * self.optics.n_detectors :], strict=True))
+
+    def shape_of(self, unknowns: Any) -> PlacedShape:
+        """Compute the shape in its place."""
+        o = self.object_of(unknowns)
+        azimuth, tilt = o["object azimuth"], jnp.stack([jnp.tan(o["tilt x"]), jnp.tan(o["tilt y"])])
+        place = jnp.stack([o["object x"], o["object y"]])
+        shape: Shape = Flat()
+        if self.kind == "ball":
+            shape = Ball(o["radius"], o["height"])
+        elif self.kind in ("step", "wedge"):
+            shape = Ramp(o["height"], jnp.cos(o["slope"]) / jnp.sin(o["slope"]))
+            place = o["object x"] * jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)])
+        return PlacedShape(shape, place, azimuth, tilt)
+
+    def probability(self, unknowns: Any, multiple: Multiple) -> jax.Array:
+        """Compute the detection probability per beam atom [detector, y, x]."""
+        optics, shape, o = self.moved_optics(unknowns), self.shape_of(unknowns), self.object_of(unknowns)
+        surface, is_object = shape.seen(self.raster, optics.beam_shift)
+        albedo = jnp.where(is_object, jnp.exp(o["log albedo ratio"]), 1.0)
+        more = albedo * jnp.exp(o["log multiple scattering"]) * multiple.of(unknowns)
+        corrections = Corrections(masked_by_shape(shape, optics, self.raster), more)
+        return detection_probability(surface, optics, corrections, albedo, o["exponent"])
+
+    def scattered_again(self, unknowns: Any, plan: Any) -> jax.Array:
+        """Compute the multiple scattering by radiosity [detector, y, x], without the albedo of the own pixel."""
+        optics, shape, o = self.moved_optics(unknowns), self.shape_of(unknowns), self.object_of(unknowns)
+        surface, is_object = shape.seen(self.raster, optics.beam_shift)
+        normals = jnp.moveaxis(unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift), 0, -1)
+        albedo = jnp.where(is_object, jnp.exp(o["log albedo ratio"]), 1.0)
+        return radiosity(surface.height, normals, optics, self.raster, plan, albedo)
+
+    def thinned(self, stride: int) -> "ScanModel":
+        """Keep every `stride`-th row and column."""
+        return ScanModel(self.optics, self.raster.thinned(stride), self.kind)
+
+
+class Seen(NamedTuple):
+    """Where the pixels of a scan lie, NumPy: heights [y, x], um; which lie on the object [y, x]; which apertures are
+    partly hidden [detector, y, x]; distance of the surface points from the object's axis or edge [y, x], um."""
+
+    height: np.ndarray
+    is_object: np.ndarray
+    is_masked: np.ndarray
+    distance: np.ndarray
+
+
+@eqx.filter_jit
+def _geometry(model: ScanModel, unknowns: Any) -> Any:
+    optics, shape = model.moved_optics(unknowns), model.shape_of(unknowns)
+    surface, is_object = shape.seen(model.raster, optics.beam_shift)
+    masked = masked_by_shape(shape, optics, model.raster)
+    x, y = jnp.meshgrid(model.raster.x, model.raster.y)
+    dx = x - surface.height * optics.beam_shift[0] - shape.place[0]
+    dy = y - surface.height * optics.beam_shift[1] - shape.place[1]
+    cos, sin = jnp.cos(shape.azimuth), jnp.sin(shape.azimuth)
+    distance = jnp.hypot(dx, dy) if model.kind == "ball" else dx * cos + dy * sin
+    return surface, is_object, jnp.sum(masked**2, 1) > 0.0, distance, optics
+
+
+def see(model: ScanModel, unknowns: np.ndarray) -> Seen:
+    """Compute where the pixels of a scan lie."""
+    with jax.enable_x64(True):
+        surface, *rest, _ = _geometry(model, jnp.asarray(unknowns))
+        return Seen(np.asarray(surface.height), *map(np.asarray, rest))
+
+
+@eqx.filter_jit
+def _lies_on_object(model: ScanModel, unknowns: Any) -> Any:
+    return model.shape_of(unknowns).seen(model.raster, model.moved_optics(unknowns).beam_shift)[1]
+
+
+def straddles_outline(model: ScanModel, unknowns: np.ndarray, margin: float) -> np.ndarray:
+    """Find the pixels that a shift of the object by `margin` [um] puts from object to substrate or back [y, x].
+
+    The model's derivatives do not know of such changes.
+    """
+    with jax.enable_x64(True):
+        at = jnp.asarray(unknowns)
+        moved = [
+            ScanModel(model.optics, Raster(model.raster.x + margin * a, model.raster.y + margin * b), model.kind)
+            for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+        ]
+        found = np.stack([np.asarray(_lies_on_object(m, at)) for m in moved])
+    return np.any(found != found[0], 0)
+
+
+@eqx.filter_jit
+def _value_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple) -> tuple[Any, Any]:
+    value, push = jax.linearize(lambda u: model.probability(u, multiple), unknowns)
+    ways = jnp.eye(len(unknowns), dtype=value.dtype)[multiple.free]
+    return value, jax.lax.map(push, ways)
+
+
+_value = eqx.filter_jit(lambda model, unknowns, multiple: model.probability(unknowns, multiple))
+
+
+def probability(model: ScanModel, unknowns: np.ndarray, multiple: Multiple) -> np.ndarray:
+    """Compute the detection probability [detector, y, x], NumPy, float64."""
+    with jax.enable_x64(True):
+        return np.asarray(_value(model, jnp.asarray(unknowns), multiple))
+
+
+def probability_and_derivative(
+    model: ScanModel, unknowns: np.ndarray, multiple: Multiple
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the detection probability [detector, y, x] and its derivatives [free unknown, detector, y, x], NumPy."""
+    with jax.enable_x64(True):
+        value, slopes = _value_and_derivative(model, jnp.asarray(unknowns), multiple)
+        return np.asarray(value), np.asarray(slopes)
+
+
+@eqx.filter_jit
+def _scattered_again(model: ScanModel, unknowns: Any, plan: Any) -> Any:
+    return model.scattered_again(unknowns, plan)
+
+
+@eqx.filter_jit
+def _again_derivative(model: ScanModel, unknowns: Any, plan: Any, free: Any) -> Any:
+    ways = jnp.eye(len(unknowns))[free]
+    return jax.lax.map(lambda way: jax.jvp(lambda u: model.scattered_again(u, plan), (unknowns,), (way,))[1], ways)
+
+
+def no_multiple(model: ScanModel, unknowns: np.ndarray, free: np.ndarray) -> Multiple:
+    """Make that of a scan without multiple scattering."""
+    shape = (model.optics.n_detectors, *model.raster.shape)
+    return Multiple(np.zeros(shape), np.zeros((len(free), *shape)), free, unknowns)
+
+
+def expand_multiple(
+    model: ScanModel, unknowns: np.ndarray, free: np.ndarray, substrate_um: float, traced: np.ndarray | None = None
+) -> Multiple:
+    """Compute the multiple scattering and its derivatives at unknowns, by radiosity; `traced` replaces the value.
+
+    Derivatives are those on a thinned raster, each pixel's taken for its neighbours.
+    """
+    stride = max(1, round(max(model.raster.shape) / RADIOSITY_PIXELS))
+    thin = model.thinned(stride)
+    with jax.enable_x64(True):
+        at = jnp.asarray(unknowns)
+
+        def planned(part: ScanModel) -> Any:
+            surface, _, _, _, optics = _geometry(part, at)
+            optics = jax.tree.map(np.asarray, optics)
+            normals = surface_normals(surface, optics)
+            return plan_radiosity(np.asarray(surface.height), normals, optics, part.raster, substrate_um=substrate_um)
+
+        plan = planned(thin)
+        slope = np.asarray(_again_derivative(thin, at, plan, free))
+        if traced is None:
+            traced = np.asarray(_scattered_again(model, at, plan if stride == 1 else planned(model)))
+    ny, nx = model.raster.shape
+    nearest = [np.minimum((np.arange(n) + stride // 2) // stride, len(range(0, n, stride)) - 1) for n in (ny, nx)]
+    return Multiple(traced, slope[:, :, nearest[0][:, None], nearest[1]], free, unknowns)
+
+
+def surface_normals(surface: Any, optics: Optics) -> np.ndarray:
+    """Compute the unit normals [y, x, 3] of a surface, NumPy."""
+    return jax.tree.map(np.asarray, surface).normals(np.asarray(optics.beam_shift))

@@ -1,0 +1,200 @@
+"""What a fit to known shapes tells, for people and files: table, chi-square by region, verdict. Pure NumPy."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from helio_jax.arrays import robust_std
+from helio_jax.calibration.known_shape import KnownFit
+from helio_jax.instrument import Covariance, Instrument, Uncertainty
+
+UNDETERMINED = 0.7
+"""An unknown that keeps more than this share of its prior standard deviation is not determined by the scans."""
+EXPLAINED = 1.2
+"""Robust chi-square per pixel up to which the model explains a region."""
+INFLATED = 1.2
+FAR = 3.0
+"""Prior standard deviations from the stated value beyond which the scans contradict the instrument file."""
+_MIN_PIXELS = 12
+_STEP = 1e-3
+"""Step of the derivatives of aperture angles, in standard deviations."""
+
+
+class Row(NamedTuple):
+    """One line of the table; `pull` is (value - stated) over the prior standard deviation."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    stated: float
+    prior: float
+    pull: float
+    is_determined: bool
+
+
+def table(fit: KnownFit) -> list[Row]:
+    """List the unknowns of instrument and objects."""
+    columns = zip(fit.names, fit.units, fit.values.tolist(), fit.stds.tolist(), strict=True)
+    priors = zip(fit.stated_values.tolist(), fit.priors.tolist(), strict=True)
+    return [
+        Row(name, unit, value, std, stated, prior, (value - stated) / prior, std <= UNDETERMINED * prior)
+        for (name, unit, value, std), (stated, prior) in zip(columns, priors, strict=True)
+    ]
+
+
+def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
+    """List gain, substrate's signal, offset, line noise and noise of every detector of every scan, in counts."""
+    out = []
+    for scan, linear, std, lines, seen, expected in zip(
+        fit.scans, fit.linear, fit.linear_std, fit.line_std, fit.seen, fit.expected, strict=True
+    ):
+        for k, name in enumerate(fit.instrument.detector_names):
+            background = np.tensordot(linear[k, 1:], scan.columns.modes, 1)
+            signal = float(np.median((expected[k] - background)[~seen.is_object & ~seen.is_masked.any(0)]))
+            out.append(
+                {
+                    "scan": scan.name,
+                    "detector": name,
+                    "gain": float(linear[k, 0]),
+                    "gain_std": float(std[k, 0]),
+                    "substrate_signal": signal,
+                    "offset": float(linear[k, 1]),
+                    "offset_std": float(std[k, 1]),
+                    "line_std": float(lines[k]),
+                    "noise": float(np.median(scan.sigma[k])),
+                }
+            )
+    return out
+
+
+def regions(fit: KnownFit, number: int) -> dict[str, np.ndarray]:
+    """Divide the pixels of a scan: object, mask band of each detector, substrate [detector, y, x]."""
+    seen = fit.seen[number]
+    masked = seen.is_masked & ~seen.is_object
+    on = np.broadcast_to(seen.is_object, masked.shape)
+    return {"object": on, "mask band": masked, "substrate": ~on & ~masked}
+
+
+def chi_squares(fit: KnownFit) -> list[dict[str, Any]]:
+    """Compute the mean and the robust chi-square per pixel of every scan, detector and region."""
+    out = []
+    for number, (scan, residual) in enumerate(zip(fit.scans, fit.residuals, strict=True)):
+        for region, inside in regions(fit, number).items():
+            for k, name in enumerate(fit.instrument.detector_names):
+                here = residual[k][inside[k] & np.isfinite(residual[k])]
+                if here.size >= _MIN_PIXELS:
+                    numbers = {"mean": float(np.mean(here**2)), "robust": float(robust_std(here)) ** 2}
+                    out.append(
+                        {"scan": scan.name, "detector": name, "region": region, "pixels": int(here.size)} | numbers
+                    )
+    return out
+
+
+def robust_chi_square(fit: KnownFit) -> float:
+    """Compute the robust chi-square per pixel of all scans together."""
+    return float(robust_std(np.concatenate([r.ravel() for r in fit.residuals]))) ** 2
+
+
+def verdict(fit: KnownFit) -> list[str]:
+    """State in sentences what the fit does not explain or determine; empty: nothing."""
+    out, chi = [], robust_chi_square(fit)
+    worst = sorted((row for row in chi_squares(fit) if row["robust"] > EXPLAINED), key=lambda row: -row["robust"])
+    if chi > EXPLAINED or worst:
+        places = "; ".join(
+            f"{row['region']} of {row['detector']!r} in {row['scan']} ({row['robust']:.2f})" for row in worst[:3]
+        )
+        out.append(
+            f"the model does not explain all of the scans: robust chi-square {chi:.2f} per pixel"
+            + (f", largest on the {places}" if places else "")
+        )
+    if fit.inflation > INFLATED:
+        out.append(
+            f"misfit and correlated residuals enlarge all standard deviations {fit.inflation:.2f} times: an effect "
+            "that the model lacks may stand behind a parameter"
+        )
+    if not fit.is_converged:
+        out.append(f"the fit has not converged in {fit.rounds} rounds: raise max_rounds")
+    for row in table(fit):
+        if abs(row.pull) > FAR and not row.name.startswith("object"):
+            out.append(f"{row.name} is {abs(row.pull):.1f} prior standard deviations from what is stated")
+    loose = [row.name for row in table(fit) if not row.is_determined]
+    if loose:
+        out.append(f"not determined, known by the prior alone: {', '.join(loose)}")
+    return out
+
+
+def calibrated_instrument(fit: KnownFit) -> Instrument:
+    """Return the fitted instrument with the covariance of what is unknown of it.
+
+    [uncertainty] holds the standard deviations without their correlations: of the plate's motion, of the distance, and
+    of the directions of the apertures that follow, the largest of all.
+    """
+    n = fit.n_shared
+    std = dict(zip(fit.names[:n], fit.stds[:n].tolist(), strict=True))
+    size = np.sqrt(np.diag(fit.covariance[:n, :n]))
+    correlation = fit.covariance[:n, :n] / np.outer(size, size)
+    covariance = Covariance(
+        parameters=tuple(fit.names[:n]),
+        units=tuple(fit.units[:n]),  # type: ignore[arg-type]  # checked when made
+        std=tuple(float(f"{s:.4g}") for s in fit.stds[:n]),
+        correlation=tuple(tuple(np.round(row, 4).tolist()) for row in correlation),
+    )
+    polar, azimuth = _direction_stds(fit)
+    stated = fit.stated.uncertainty
+    found = {
+        "plate_shift_um": max(std.get("plate shift x", 0.0), std.get("plate shift y", 0.0)),
+        "plate_scale": std.get("plate scale", 0.0),
+        "plate_rotation_deg": std.get("plate rotation", 0.0),
+        "sample_distance_um": std.get("sample distance", 0.0),
+        "incidence_deg": std.get("incidence", 0.0),
+        "polar_deg": min(polar, 30.0),
+        "azimuth_deg": min(azimuth, 30.0),
+        "tilt_deg": stated.tilt_deg,
+    }
+    uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
+    return fit.instrument.model_copy(update={"uncertainty": uncertainty, "covariance": covariance})
+
+
+def _direction_stds(fit: KnownFit) -> tuple[float, float]:
+    """Compute the standard deviations of polar angle and azimuth, the largest of all apertures [deg]."""
+    n = fit.n_shared
+    ways = {
+        "plate shift x": lambda v: {"plate_shift": (v, 0.0)},
+        "plate shift y": lambda v: {"plate_shift": (0.0, v)},
+        "plate scale": lambda v: {"scale": 1.0 + v},
+        "plate rotation": lambda v: {"rotation": np.radians(v)},
+    }
+    detectors = fit.instrument.detector_names
+
+    def directions(name: str, step: float) -> np.ndarray:
+        aim = np.zeros((len(detectors), 2))
+        kind, _, of = name.partition(" of ")
+        if kind in ("polar", "azimuth"):
+            aim[detectors.index(of), int(kind == "azimuth")] = np.radians(step)
+        moved = fit.instrument.moved(aim, 0.0, **ways.get(name, lambda v: {})(step))
+        return np.array([d.aim(moved.working_distance) for d in moved.detector])
+
+    slopes = [
+        (directions(name, _STEP * std) - directions(name, -_STEP * std)) / (2.0 * _STEP * std)
+        for name, std in zip(fit.names[:n], fit.stds[:n], strict=True)
+    ]
+    scaled = np.stack(slopes, -1) * fit.priors[:n]
+    variance = np.einsum("dai,ij,daj->da", scaled, fit.covariance[:n, :n], scaled)
+    polar, azimuth = np.degrees(np.sqrt(variance.max(0)))
+    return float(polar), float(azimuth)
+
+
+def as_record(fit: KnownFit) -> dict[str, Any]:
+    """Return all that is printed, JSON-compatible."""
+    return {
+        "table": [row._asdict() for row in table(fit)],
+        "readout": readout_rows(fit),
+        "chi_square": fit.chi_square,
+        "robust_chi_square": robust_chi_square(fit),
+        "regions": chi_squares(fit),
+        "inflation": fit.inflation,
+        "rounds": fit.rounds,
+        "is_converged": fit.is_converged,
+        "verdict": verdict(fit),
+    }

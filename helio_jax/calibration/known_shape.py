@@ -1,0 +1,612 @@
+"""Fit of an instrument to scans of objects of known shape: Levenberg-Marquardt with the derivatives of the model.
+
+The unknowns of `unknowns`, each with a prior, are fitted to one or several scans at once; plate, beam and apertures are
+common to all scans, each scan has its own object and read-out. Weights are robust (Cauchy); offsets of single scan
+lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering and excluded pixels
+are computed anew in every round, for the geometry of that round.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from helio_jax.arrays import pitch, robust_std
+from helio_jax.calibration.known_model import (
+    Multiple,
+    ScanModel,
+    Seen,
+    expand_multiple,
+    no_multiple,
+    probability,
+    probability_and_derivative,
+    see,
+    straddles_outline,
+)
+from helio_jax.calibration.known_objects import KnownObject
+from helio_jax.calibration.noise_model import estimate_noise, find_spikes
+from helio_jax.calibration.unknowns import (
+    Columns,
+    KnownShapeSettings,
+    Unknown,
+    instrument_unknowns,
+    object_unknowns,
+    readout_columns,
+)
+from helio_jax.errors import GuardError, SceneError
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographStack
+from helio_jax.robust import cauchy_weight
+
+OUTLINE = 0.75, 0.5, 0.25
+"""Pixels that are nearer to the object's outline than this share of the pitch are left out, in the first rounds and all
+later ones: the model's derivatives do not know that a pixel may change sides. The outline is found anew when it has
+moved by half of that."""
+TILE = 6
+"""Side of the tiles [pixels] within which residuals may be correlated."""
+CONVERGED = 0.1
+"""The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
+STALE = 8.0
+"""Change of an unknown [standard deviations] after which derivatives of the multiple scattering are computed anew."""
+SPIKE = 6.0
+"""A pixel that differs from all its neighbours by so many standard deviations is left out."""
+_STEPS = 20
+_SEARCH_PIXELS = 31
+_SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
+"""First search: pixels of the thinned raster, reach over the width of the image, points along each axis."""
+_LATER_REACH, _LATER_SIDES, _LATER_ROUNDS = 0.8, (5, 5), (1, 2, 3)
+"""Searches about the place that a round has found: reach in pitches, points, before which rounds."""
+Trace = Callable[[int, Instrument, dict[str, float]], np.ndarray]
+"""Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object
+by their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
+
+
+@dataclass(frozen=True)
+class KnownScan:
+    """One scan of a known object: data, model and unknowns of its own.
+
+    Attributes:
+        name: of the scan.
+        counts, sigma: as read, and their standard deviations [detector, y, x].
+        is_used: which are fitted [detector, y, x].
+        model: of the detection probability.
+        known: the object.
+        own: its unknowns, as `unknowns.OBJECT`.
+        columns: linear unknowns of the read-out.
+        signal: about that of the substrate, in counts [detector].
+        slow_axis: of the raster.
+    """
+
+    name: str
+    counts: np.ndarray
+    sigma: np.ndarray
+    is_used: np.ndarray
+    model: ScanModel
+    known: KnownObject
+    own: list[Unknown]
+    columns: Columns
+    signal: np.ndarray
+    slow_axis: int
+
+    @property
+    def n_linear(self) -> int:
+        """Gain and other linear unknowns of one detector."""
+        return 1 + len(self.columns.names)
+
+    def linear_priors(self, gain: np.ndarray, settings: KnownShapeSettings) -> np.ndarray:
+        """Compute the prior standard deviations of the linear unknowns [detector, column]."""
+        return np.concatenate(
+            [settings.gain * np.abs(gain)[:, None], self.signal[:, None] * self.columns.priors[None]], 1
+        )
+
+
+def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShapeSettings) -> KnownScan:
+    """Make a scan ready for the fit: noise, spikes, unknowns.
+
+    Raises:
+        SceneError: the stack is a list of positions, or in units of the beam already.
+    """
+    if stack.positions is not None:
+        raise SceneError(f"{stack.name}: a calibration needs a raster, this scan is a list of positions")
+    if stack.n_rays is not None and stack.calibration is not None:
+        raise SceneError(f"{stack.name}: this scan is calibrated already: give the imported file itself")
+    spread = estimate_noise(stack).variance(stack.counts) if stack.noise == "measured" else stack.variance
+    if spread is None:
+        raise SceneError(f"{stack.name}: the variance of the counts is unknown: import the scan anew")
+    spread = np.maximum(spread, 1e-12 * np.nanmax(np.abs(stack.counts)) ** 2)
+    used = stack.is_observed & ~find_spikes(stack, spread, SPIKE)
+    counts = np.where(stack.is_observed, stack.counts, 0.0)
+    reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
+    low, high = np.nanquantile(np.where(used, counts, np.nan).reshape(len(counts), -1), [0.01, 0.6], axis=1)
+    slow = 0 if stack.fast_axis == "x" else 1
+    return KnownScan(
+        stack.name,
+        counts,
+        np.sqrt(spread),
+        used,
+        ScanModel(Optics.of(stack.instrument), Raster.of(stack), known.kind),
+        known,
+        object_unknowns(known, reach, settings),
+        readout_columns(stack.x, stack.y, slow, settings),
+        high - low,
+        slow,
+    )
+
+
+@dataclass(frozen=True)
+class KnownFit:
+    """Result of the fit.
+
+    Attributes:
+        instrument: as fitted; `stated`: as given.
+        scans: the data.
+        names, units, stated_values, priors, values, stds: of the free unknowns, in the units shown.
+        covariance: of the free unknowns over their prior standard deviations, inflated.
+        n_shared: of them are those of the instrument, the first ones.
+        linear, linear_std: of every scan, gain and the columns [detector, column].
+        residuals: in standard deviations, NaN where not used [detector, y, x], per scan.
+        expected: readings [detector, y, x], per scan.
+        weights: robust weights of the pixels [detector, y, x], per scan.
+        seen: where the pixels lie, per scan.
+        line_std: offsets of single scan lines, counts [detector], per scan.
+        chi_square: mean square of the weighted residuals over their expected one.
+        inflation: by which the standard deviations were enlarged for misfit and correlated residuals.
+        rounds, is_converged: of the fit.
+    """
+
+    instrument: Instrument
+    stated: Instrument
+    scans: list[KnownScan]
+    names: list[str]
+    units: list[str]
+    stated_values: np.ndarray
+    priors: np.ndarray
+    values: np.ndarray
+    stds: np.ndarray
+    covariance: np.ndarray
+    n_shared: int
+    linear: list[np.ndarray]
+    linear_std: list[np.ndarray]
+    residuals: list[np.ndarray]
+    expected: list[np.ndarray]
+    weights: list[np.ndarray]
+    seen: list[Seen]
+    line_std: list[np.ndarray]
+    chi_square: float
+    inflation: float
+    rounds: int
+    is_converged: bool
+
+
+class _Layout:
+    """Where each unknown of each scan stands in the vector of free unknowns."""
+
+    def __init__(self, shared: list[Unknown], scans: list[KnownScan]) -> None:
+        n = len(shared)
+        self.all = [shared + scan.own for scan in scans]
+        free_shared = [i for i, u in enumerate(shared) if u.prior > 0.0]
+        self.n_shared = len(free_shared)
+        self.unknowns = [shared[i] for i in free_shared]
+        self.scan_of = [-1] * self.n_shared
+        self.free: list[np.ndarray] = []
+        self.place: list[np.ndarray] = []
+        for number, scan in enumerate(scans):
+            own = [i for i, u in enumerate(scan.own) if u.prior > 0.0]
+            start = len(self.unknowns)
+            self.free.append(np.array(free_shared + [n + i for i in own]))
+            self.place.append(np.array([*range(self.n_shared), *range(start, start + len(own))]))
+            self.unknowns += [scan.own[i] for i in own]
+            self.scan_of += [number] * len(own)
+        self.scale = np.array([u.prior * u.factor for u in self.unknowns])
+        self.start = [
+            np.array([0.0 if i < n else u.stated * u.factor for i, u in enumerate(unknowns)]) for unknowns in self.all
+        ]
+
+    def of_scan(self, number: int, x: np.ndarray) -> np.ndarray:
+        """Compute the unknowns of one scan, um and rad, of free ones in prior standard deviations."""
+        out = self.start[number].copy()
+        place = self.place[number]
+        out[self.free[number]] += (self.scale * x)[place]
+        return out
+
+
+def line_whitening(weighted: np.ndarray, inverse: np.ndarray, line_std: np.ndarray, slow_axis: int) -> np.ndarray:
+    """Whiten images [..., detector, y, x] that are divided by their noise, for offsets of whole scan lines.
+
+    With u = 1 / sigma of a line's pixels the covariance of the divided data is 1 + L^2 u u^T; its inverse square root
+    is 1 - c u u^T with c = (1 - (1 + L^2 |u|^2)^-1/2) / |u|^2.
+
+    Args:
+        weighted: data over their noise.
+        inverse: of the noise, 0 where there are no data [detector, y, x].
+        line_std: standard deviation L of the offsets [detector].
+        slow_axis: of the raster; a line lies along the other.
+    """
+    along = 2 - slow_axis  # of [detector, y, x]
+    size = np.sum(inverse**2, along, keepdims=True)
+    c = (1.0 - 1.0 / np.sqrt(1.0 + line_std[:, None, None] ** 2 * size)) / np.maximum(size, 1e-300)
+    return weighted - c * inverse * np.sum(weighted * inverse, along - 3, keepdims=True)
+
+
+def _linear_start(scan: KnownScan, model: np.ndarray, inverse: np.ndarray, settings: KnownShapeSettings) -> np.ndarray:
+    """Solve for gain and the other columns at a given probability [detector, y, x]: [detector, column]."""
+    out = []
+    for k, image in enumerate(model):
+        design = np.concatenate([image[None], scan.columns.modes]).reshape(scan.n_linear, -1) * inverse[k].ravel()
+        gain = scan.signal[k] / max(float(np.median(image)), 1e-12)
+        weak = np.diag(1.0 / np.concatenate([[3.0 * gain], 10.0 * scan.signal[k] * scan.columns.priors]) ** 2)
+        out.append(np.linalg.solve(design @ design.T + weak, design @ (scan.counts[k] * inverse[k]).ravel()))
+    return np.array(out)
+
+
+def _expected(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndarray:
+    return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)
+
+
+def _find_place(
+    scan: KnownScan,
+    base: np.ndarray,
+    multiple: Multiple,
+    reach: np.ndarray,
+    sides: tuple[int, ...],
+    settings: KnownShapeSettings,
+) -> tuple[np.ndarray, float]:
+    """Find where the object lies by a search about the place in `base`, read-out fitted, all else of `base` held.
+
+    Unlike a fit by derivatives it sees which pixels lie on the object.
+
+    Args:
+        scan: the data.
+        base: unknowns of the scan.
+        multiple: multiple scattering.
+        reach: of the search along x and y, um; 0: not searched.
+        sides: points along each axis in every stage, each 0.4 times as wide as the one before.
+        settings: priors of the read-out.
+
+    Returns:
+        The place (x, y) [um], and the misfit there.
+    """
+    inverse = np.where(scan.is_used, 1.0 / scan.sigma, 0.0)
+    index = len(base) - len(scan.own)
+
+    def misfit(place: np.ndarray) -> float:
+        at = base.copy()
+        at[index : index + 2] = place
+        image = probability(scan.model, at, multiple)
+        residual = (scan.counts - _expected(scan, _linear_start(scan, image, inverse, settings), image)) * inverse
+        scale = 3.0 * float(robust_std(residual[scan.is_used]))
+        return float(np.sum(np.log1p((residual / scale) ** 2)) + residual.size * 2.0 * np.log(scale))
+
+    place = base[index : index + 2].copy()
+    best = misfit(place)
+    for stage, side in enumerate(sides):
+        steps, width = np.linspace(-1.0, 1.0, side), reach * 0.4**stage
+        grid = [place + width * [a, b] for a in steps for b in (steps if width[1] else [0.0])]
+        found = [misfit(p) for p in grid]
+        i = int(np.argmin(found))
+        if found[i] < best:
+            best, place = found[i], grid[i]
+    return place, best
+
+
+def _coarse(scan: KnownScan) -> KnownScan:
+    """Thin a scan for the first search."""
+    stride = max(1, round(max(scan.model.raster.shape) / _SEARCH_PIXELS))
+    thin = (slice(None), slice(None, None, stride), slice(None, None, stride))
+    columns = scan.columns._replace(modes=scan.columns.modes[thin])
+    images = {name: getattr(scan, name)[thin] for name in ("counts", "sigma", "is_used")}
+    return replace(scan, **images, columns=columns, model=scan.model.thinned(stride))
+
+
+class _Fit:
+    """State of one fit; `fit_known_shapes` runs it."""
+
+    def __init__(
+        self, stated: Instrument, scans: list[KnownScan], settings: KnownShapeSettings, trace: Trace | None
+    ) -> None:
+        self.stated, self.scans, self.settings, self.trace = stated, scans, settings, trace
+        self.layout = _Layout(instrument_unknowns(stated, settings), scans)
+        self.x = np.zeros(len(self.layout.unknowns))
+        self.lines = [np.zeros(len(s.counts)) for s in scans]
+        self.multiple: list[Multiple] = [
+            no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
+        ]
+        self.expanded_at = [np.full(len(self.x), np.inf) for _ in scans]
+        self.outlined_at = [np.full(4, np.inf) for _ in scans]
+        self.deviation = np.ones(len(self.x))
+        self.weights = [np.ones(s.counts.shape) for s in scans]
+        self.used = [s.is_used for s in scans]
+        start = [probability(s.model, self.layout.of_scan(i, self.x), self.multiple[i]) for i, s in enumerate(scans)]
+        self.linear = [
+            _linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
+            for s, p in zip(scans, start, strict=True)
+        ]
+        self.mean = [a.copy() for a in self.linear]
+        self.prior = [s.linear_priors(a[:, 0], settings) for s, a in zip(scans, self.linear, strict=True)]
+        self.offsets = np.cumsum([len(self.x), *(a.size for a in self.linear)])
+
+    def split(self, z: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Split whitened unknowns into those of the geometry, and the linear ones of the scans [detector, column]."""
+        parts = np.split(z, self.offsets[:-1])
+        return parts[0], [m + p * v.reshape(m.shape) for m, p, v in zip(self.mean, self.prior, parts[1:], strict=True)]
+
+    def joined(self) -> np.ndarray:
+        """Join the present unknowns, whitened."""
+        linear = [((a - m) / p).ravel() for a, m, p in zip(self.linear, self.mean, self.prior, strict=True)]
+        return np.concatenate([self.x, *linear])
+
+    def inverse(self, i: int) -> np.ndarray:
+        """Compute the weights of a scan's data over their noise."""
+        return np.where(self.used[i], np.sqrt(self.weights[i]) / self.scans[i].sigma, 0.0)
+
+    def residuals(self, z: np.ndarray) -> np.ndarray:
+        """Compute all residuals, the priors last."""
+        x, linear = self.split(z)
+        out = []
+        for i, scan in enumerate(self.scans):
+            image = probability(scan.model, self.layout.of_scan(i, x), self.multiple[i])
+            inverse = self.inverse(i)
+            misfit = (_expected(scan, linear[i], image) - scan.counts) * inverse
+            out.append(line_whitening(misfit, inverse, self.lines[i], scan.slow_axis).ravel())
+        return np.concatenate([*out, z])
+
+    def derivatives(self, z: np.ndarray) -> np.ndarray:
+        """Compute the derivatives of the residuals [residual, unknown]."""
+        x, linear = self.split(z)
+        sizes = [s.counts.size for s in self.scans]
+        out = np.zeros((sum(sizes) + len(z), len(z)))
+        first = 0
+        for i, scan in enumerate(self.scans):
+            value, slopes = probability_and_derivative(scan.model, self.layout.of_scan(i, x), self.multiple[i])
+            inverse, rows = self.inverse(i), slice(first, first + sizes[i])
+            first += sizes[i]
+
+            def put(column: int, image: np.ndarray, i=i, scan=scan, inverse=inverse, rows=rows) -> None:
+                out[rows, column] = line_whitening(image * inverse, inverse, self.lines[i], scan.slow_axis).ravel()
+
+            for column, slope in zip(self.layout.place[i], slopes, strict=True):
+                put(column, linear[i][:, 0, None, None] * slope * self.layout.scale[column])
+            for k in range(len(value)):
+                for c, mode in enumerate((value[k], *scan.columns.modes)):
+                    image = np.zeros(value.shape)
+                    image[k] = self.prior[i][k, c] * mode
+                    put(int(self.offsets[i]) + k * scan.n_linear + c, image)
+        out[first:] = np.eye(len(z))
+        return out
+
+    def update(self, number: int) -> None:
+        """Compute multiple scattering, weights, lines and excluded pixels, at the present unknowns."""
+        if number in _LATER_ROUNDS:
+            self.search_places()
+        instrument = self.fitted()
+        for i, scan in enumerate(self.scans):
+            at = self.layout.of_scan(i, self.x)
+            own, seen = scan.model.object_of(at), see(scan.model, at)
+            lengths = np.array([own[name] for name in ("object x", "object y", "radius", "height")], float)
+            if scan.known.kind != "flat":
+                self.multiple[i] = self._scattered_again(i, at, seen, instrument)
+            margin = OUTLINE[min(number, len(OUTLINE) - 1)] * pitch(scan.model.raster.y)
+            if number < len(OUTLINE) or np.max(np.abs(lengths - self.outlined_at[i])) > 0.5 * margin:
+                self.outlined_at[i] = lengths
+                outline = straddles_outline(scan.model, at, margin)
+                self.used[i] = scan.is_used & ~outline & ~_ring(scan, own, seen, self.settings)
+            image = probability(scan.model, at, self.multiple[i])
+            if number == 0:
+                inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
+                self.linear[i] = _linear_start(scan, image, inverse, self.settings)
+            misfit = np.where(self.used[i], scan.counts - _expected(scan, self.linear[i], image), np.nan)
+            scale = max(1.0, float(robust_std(misfit / scan.sigma)))
+            self.weights[i] = np.nan_to_num(
+                cauchy_weight(misfit / scan.sigma, self.settings.robust_limit * scale), nan=0.0
+            )
+            if number > 0:
+                self.lines[i] = _line_std(scan, misfit, self.weights[i])
+
+    def search_places(self) -> None:
+        """Move the objects to where the outline agrees with the data, the instrument held."""
+        for i, scan in enumerate(self.scans):
+            if scan.known.kind == "flat":
+                continue
+            at = self.layout.of_scan(i, self.x)
+            reach = _LATER_REACH * pitch(scan.model.raster.y) * np.array([1.0, float(scan.known.kind == "ball")])
+            place, _ = _find_place(scan, at, self.multiple[i], reach, _LATER_SIDES, self.settings)
+            first = len(at) - len(scan.own)
+            for index, value in ((first, place[0]), (first + 1, place[1])):
+                for column in self.layout.place[i][self.layout.free[i] == index]:
+                    self.x = self.x.copy()
+                    self.x[column] += (value - at[index]) / self.layout.scale[column]
+
+    def _scattered_again(self, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
+        """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
+        scan, traced = self.scans[i], None
+        if self.trace is not None:
+            own = {name: float(v) for name, v in scan.model.object_of(at).items()}
+            bright = np.exp(np.maximum(0.0, own["log albedo ratio"]))  # the tracer's brighter surface has the albedo 1
+            albedo = np.where(seen.is_object, np.exp(own["log albedo ratio"]), 1.0) / bright
+            traced = self.trace(i, instrument, own) / albedo * bright
+        moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
+        if traced is not None and np.max(moved) < STALE:
+            return self.multiple[i].shifted(traced, at)
+        self.expanded_at[i] = self.x
+        return expand_multiple(scan.model, at, self.layout.free[i], self.settings.substrate_um, traced)
+
+    def fitted(self) -> Instrument:
+        """Move the instrument by the present unknowns."""
+        plate, aim = np.split(self.layout.of_scan(0, self.x)[: -len(self.scans[0].own)], [6])
+        return self.stated.moved(
+            aim.reshape(2, -1).T,
+            float(plate[4]),
+            plate_shift=(float(plate[0]), float(plate[1])),
+            scale=1.0 + float(plate[2]),
+            rotation=float(plate[3]),
+            incidence=float(plate[5]),
+        )
+
+
+def _ring(scan: KnownScan, own: dict[str, float], seen: Seen, settings: KnownShapeSettings) -> np.ndarray:
+    """Find the ring about the foot of a ball that is left out [y, x]."""
+    if settings.leave_out_ring is None or scan.known.kind != "ball":
+        return np.zeros(seen.height.shape, bool)
+    low, high = settings.leave_out_ring
+    foot = np.sqrt(max(own["height"] * (2.0 * own["radius"] - own["height"]), 0.0))
+    return (seen.distance > low * foot) & (seen.distance < high * foot)
+
+
+def _line_std(scan: KnownScan, misfit: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Estimate the standard deviation of the offsets of single scan lines [detector], counts."""
+    along = 2 - scan.slow_axis
+    w = np.where(np.isfinite(misfit), weights / scan.sigma**2, 0.0)
+    total = np.maximum(w.sum(along), 1e-300)
+    mean = np.sum(w * np.nan_to_num(misfit), along) / total
+    out = []
+    for value, weight in zip(mean, total, strict=True):
+        known = weight > 1e-200
+        spread = float(robust_std(value[known] - np.median(value[known]))) ** 2 if known.sum() > 3 else 0.0
+        out.append(np.sqrt(max(spread - float(np.median(1.0 / weight[known])), 0.0)) if known.any() else 0.0)
+    return np.array(out)
+
+
+def _started(
+    stated: Instrument, scan: KnownScan, settings: KnownShapeSettings, stack_reach: float
+) -> tuple[KnownScan, float]:
+    """Put the object where a search finds it; of several shapes take the best."""
+    found = []
+    for known in scan.known.starts():
+        trial = replace(scan, known=known, own=object_unknowns(known, stack_reach, settings))
+        layout, coarse = _Layout(instrument_unknowns(stated, settings), [trial]), _coarse(trial)
+        base, is_ball = layout.start[0], known.kind == "ball"
+        reach = 2.0 * _SEARCH_REACH * stack_reach * np.array([1.0, float(is_ball)])
+        nothing = no_multiple(coarse.model, base, layout.free[0])
+        place, misfit = _find_place(coarse, base, nothing, reach, _SEARCH_SIDES, settings)
+        own = [u._replace(stated=float(p)) for u, p in zip(trial.own[:2], place, strict=True)] + trial.own[2:]
+        found.append((replace(trial, own=own), misfit))
+    return min(found, key=lambda entry: entry[1])
+
+
+def fit_known_shapes(
+    stacks: list[MicrographStack],
+    known: list[KnownObject],
+    settings: KnownShapeSettings,
+    *,
+    trace: Trace | None = None,
+    report: Callable[[int, int, str], None] = lambda done, total, note: None,
+) -> KnownFit:
+    """Fit the instrument of scans of known objects.
+
+    Args:
+        stacks: measured counts, or simulated ones, of one instrument.
+        known: the object of every scan.
+        settings: priors and the fit.
+        trace: traces multiple scattering; default: by radiosity alone.
+        report: called before each round with (round, rounds, what is known).
+
+    Raises:
+        SceneError: the scans have different instruments, or a scan cannot be fitted.
+        GuardError: nothing can be determined.
+    """
+    stated = stacks[0].instrument
+    for stack in stacks[1:]:
+        if stack.instrument.detector != stated.detector or stack.instrument.plate != stated.plate:
+            raise SceneError(
+                f"{stack.name}: its instrument is not that of {stacks[0].name}: a joint calibration needs one "
+                "instrument; import all scans with the same --instrument"
+            )
+    scans = [prepare_scan(s, k, settings) for s, k in zip(stacks, known, strict=True)]
+    if all(scan.known.kind == "flat" for scan in scans):
+        raise GuardError(
+            "a flat alone determines no direction of an aperture: calibrate with a ball, step or wedge, jointly "
+            "with the flat if you wish"
+        )
+    for i, (scan, stack) in enumerate(zip(scans, stacks, strict=True)):
+        if scan.known.kind != "flat":
+            reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
+            scans[i], _ = _started(stated, scan, settings, reach)
+    fit = _Fit(stated, scans, settings, trace)
+    number, is_converged, note = 0, False, "start"
+    for number in range(settings.max_rounds):
+        report(number, settings.max_rounds, note)
+        fit.update(number)
+        solved = least_squares(
+            fit.residuals,
+            fit.joined(),
+            fit.derivatives,  # type: ignore[arg-type]  # SciPy's stubs know texts only
+            x_scale="jac",  # type: ignore[arg-type]
+            max_nfev=_STEPS,
+            xtol=1e-6,
+            ftol=1e-7,
+        )
+        before = fit.x
+        fit.x, fit.linear = fit.split(solved.x)
+        jacobian = solved.jac
+        fit.deviation = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[: len(fit.x)]
+        change = float(np.max(np.abs(fit.x - before) / fit.deviation))
+        note = f"largest change {change:.2g} standard deviations, cost {2.0 * solved.cost:.5g}"
+        if number > 1 and change < CONVERGED:
+            is_converged = True
+            break
+    return _result(fit, number + 1, is_converged)
+
+
+def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
+    """Evaluate the fit at its end: residuals, covariance, inflation."""
+    z = fit.joined()
+    jacobian, residual = fit.derivatives(z), fit.residuals(z)
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    n_data = len(residual) - len(z)
+    chi_square, correlated = _misfit(fit, jacobian[:n_data], residual[:n_data], inverse)
+    inflation = max(1.0, np.sqrt(chi_square), correlated)
+    n = len(fit.x)
+    # priors are no data: the residuals say nothing about them
+    informed = jacobian[:n_data].T @ jacobian[:n_data] / inflation**2 + np.eye(len(z))
+    covariance = np.linalg.inv(informed)
+    std, u = np.sqrt(np.diag(covariance)), fit.layout.unknowns
+    several = len(fit.scans) > 1
+    names = [
+        a.name + (f" in {fit.scans[k].name}" if several and k >= 0 else "")
+        for a, k in zip(u, fit.layout.scan_of, strict=True)
+    ]
+    prior, stated = np.array([a.prior for a in u]), np.array([a.stated for a in u])
+    parts = np.split(std, fit.offsets[:-1])[1:]
+    residuals, expected, seen = [], [], []
+    for i, scan in enumerate(fit.scans):
+        at = fit.layout.of_scan(i, fit.x)
+        expected.append(_expected(scan, fit.linear[i], probability(scan.model, at, fit.multiple[i])))
+        residuals.append(np.where(fit.used[i], (scan.counts - expected[-1]) / scan.sigma, np.nan))
+        seen.append(see(scan.model, at))
+    return KnownFit(
+        fit.fitted(), fit.stated, fit.scans, names, [a.unit for a in u], stated, prior, stated + prior * fit.x,
+        prior * std[:n], covariance[:n, :n], fit.layout.n_shared, fit.linear,
+        [p * s.reshape(p.shape) for p, s in zip(fit.prior, parts, strict=True)],
+        residuals, expected, fit.weights, seen, fit.lines, chi_square, float(inflation), rounds, is_converged,
+    )  # fmt: skip
+
+
+def _misfit(fit: _Fit, jacobian: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> tuple[float, float]:
+    """Compute chi-square per datum, and the factor by which correlated residuals enlarge the standard deviations.
+
+    Residuals may be correlated within tiles of `TILE` x `TILE` pixels, all detectors: the covariance of J^T r is then
+    the sum over tiles of (J^T r)(J^T r)^T, to be compared with J^T J. The factor is the root of the mean ratio.
+
+    Source: White, Econometrica 48 (1980) 817; clusters: Liang and Zeger, Biometrika 73 (1986) 13.
+    """
+    weight = np.concatenate([w[u] for w, u in zip(fit.weights, fit.used, strict=True)])
+    effective = max(float(weight.sum()) - np.trace(np.eye(len(inverse)) - inverse), 1.0)
+    # robust weights make even the mean square of normal noise less than 1
+    node, share = np.polynomial.hermite_e.hermegauss(40)
+    normal = cauchy_weight(node, fit.settings.robust_limit)
+    expected = float(np.sum(share * normal * node**2) / np.sum(share * normal))
+    chi_square = float(residual @ residual) / effective / expected
+    total, first = np.zeros_like(inverse), 0
+    for scan in fit.scans:
+        k, ny, nx = scan.counts.shape
+        rows = slice(first, first + scan.counts.size)
+        first = rows.stop
+        score = (jacobian[rows] * residual[rows, None]).reshape(k, ny, nx, -1).sum(0)
+        for i in range(0, ny, TILE):
+            for j in range(0, nx, TILE):
+                of_tile = score[i : i + TILE, j : j + TILE].sum((0, 1))
+                total += np.outer(of_tile, of_tile)
+    ratio = np.trace(inverse @ total) / max(np.trace(inverse @ (jacobian.T @ jacobian)), 1e-12)
+    return chi_square, float(np.sqrt(ratio))

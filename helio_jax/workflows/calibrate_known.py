@@ -1,0 +1,74 @@
+"""Calibration of an instrument by scans of objects of known shape: `helio calibrate --known`."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from helio_jax.calibration.known_objects import KnownObject
+from helio_jax.calibration.known_report import as_record, calibrated_instrument, robust_chi_square
+from helio_jax.calibration.known_shape import KnownFit, fit_known_shapes
+from helio_jax.calibration.unknowns import KnownShapeSettings
+from helio_jax.errors import SceneError
+from helio_jax.figures.known_shape import save_known_shape
+from helio_jax.formats.hdf5 import read_stack
+from helio_jax.formats.safe import check_outputs
+from helio_jax.formats.toml import write_calibrated
+from helio_jax.micrograph import MicrographStack
+from helio_jax.workflows.known_scene import multiple_tracer
+
+
+def calibrate_known(
+    stacks: Sequence[MicrographStack],
+    shapes: Sequence[str],
+    settings: KnownShapeSettings | None = None,
+    *,
+    report: Callable[[int, int, str], None] | None = None,
+    **changes: Any,
+) -> KnownFit:
+    """Fit the instrument of scans of objects of known shape.
+
+    Args:
+        stacks: as imported, all of one instrument.
+        shapes: what each scan shows ("ball radius=1000"), or one for all.
+        settings: default: the defaults of `KnownShapeSettings`.
+        report: called before each round with (round, rounds, what is known).
+        changes: settings that replace those, e.g. exponent=0.1.
+
+    Raises:
+        SceneError: an unknown shape or setting, or not as many shapes as scans.
+    """
+    if len(shapes) not in (1, len(stacks)):
+        raise SceneError(f"got {len(shapes)} known shapes for {len(stacks)} scans: give one for each, or one for all")
+    known = [KnownObject.parse(text) for text in shapes] * (len(stacks) if len(shapes) == 1 else 1)
+    chosen = (settings or KnownShapeSettings()).changed(**changes)
+    numbers = {"rays": chosen.rays, "substrate_um": chosen.substrate_um}
+    trace = multiple_tracer(list(stacks), known, **numbers) if chosen.rays else None
+    return fit_known_shapes(list(stacks), known, chosen, trace=trace, report=report or (lambda *_: None))
+
+
+def calibrate_known_files(
+    paths: Sequence[str | Path],
+    output: str | Path,
+    shapes: Sequence[str],
+    *,
+    report: Callable[[int, int, str], None] | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
+    """Calibrate an instrument by the scans of files; write the instrument file, and a picture of residuals beside it.
+
+    Returns:
+        Table, read-out, chi-square by region and verdict, JSON-compatible.
+    """
+    output = Path(output)
+    picture = output.with_suffix(".png")
+    inputs = [("path", Path(path)) for path in paths]
+    check_outputs(inputs, [("output", output), ("output: the .png beside it", picture)])
+    fit = calibrate_known([read_stack(path) for path in paths], shapes, report=report, **changes)
+    record = as_record(fit)
+    names = ", ".join(scan.name for scan in fit.scans)
+    what = f"Instrument calibrated by helio calibrate --known {' '.join(map(repr, shapes))} on {names}."
+    about = f"Robust chi-square {robust_chi_square(fit):.2f} per pixel, standard deviations x {fit.inflation:.2f}."
+    where = "sample_distance_um is that of these scans' stage height. [covariance]: how the errors belong together."
+    write_calibrated(calibrated_instrument(fit), output, "\n".join((what, about, where)))
+    save_known_shape(fit, picture)
+    return record | {"files": [str(output), str(picture)]}

@@ -1,0 +1,75 @@
+"""The scene of a scan of a known object, for the tracer: multiple scattering, and simulations of calibrations."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from helio_jax.calibration.known_objects import KnownObject
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographStack
+from helio_jax.workflows.pipeline import simulate
+from helio_jax.workflows.scene_file import SceneFile
+
+_GROUND, _OBJECT = "substrate", "object"
+
+
+def known_scene(
+    known: KnownObject,
+    numbers: Mapping[str, float],
+    instrument: Instrument,
+    x: np.ndarray,
+    y: np.ndarray,
+    *,
+    substrate_um: float,
+) -> SceneFile:
+    """Make the scene of a known object on a tilted substrate.
+
+    Args:
+        known: what kind of object.
+        numbers: place, tilt, shape and albedo by the names of `unknowns.OBJECT` [um, rad].
+        instrument: of the scan.
+        x, y: its beam positions, um.
+        substrate_um: side of the substrate.
+    """
+    o, deg = numbers, math.degrees(1.0)
+    about_y = -o["tilt x"]
+    about_x = math.atan(math.tan(o["tilt y"]) * math.cos(about_y))
+    ratio = math.exp(o["log albedo ratio"])
+    sample: dict[str, Any] = {"size_um": substrate_um, "rotate_deg": [deg * about_x, deg * about_y, 0.0]}
+    if known.kind == "ball":
+        ball = {"radius_um": o["radius"], "cap_height_um": o["height"], "center_um": [o["object x"], o["object y"]]}
+        sample |= {"kind": "spheres", "material": _GROUND, "spheres": [ball | {"material": _OBJECT}]}
+    else:
+        edge = {"position_um": o["object x"], "facing_deg": deg * math.remainder(o["object azimuth"], 2.0 * math.pi)}
+        sample |= {"kind": "step", "height_um": o["height"], "slope_deg": deg * o["slope"], **edge}
+    law = {"kind": "cosine"}
+    tables = instrument.idealised().model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
+    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)  # a list, for the pitches of x and y may differ
+    tables |= {"name": "known object", "sample": sample, "scan": {"kind": "list", "points_um": points.tolist()}}
+    if known.kind == "ball":
+        # nothing reflects more than it receives: of the two, the brighter one has the albedo 1
+        tables["material"] = {
+            _GROUND: law | {"albedo": min(1.0, 1.0 / ratio)},
+            _OBJECT: law | {"albedo": min(1.0, ratio)},
+        }
+    return SceneFile.model_validate(tables)
+
+
+def multiple_tracer(
+    stacks: list[MicrographStack], known: list[KnownObject], *, rays: int, substrate_um: float
+) -> Callable[[int, Instrument, dict[str, float]], np.ndarray]:
+    """Return what traces the multiple scattering of a scan of a known object, see `calibration.known_shape.Trace`.
+
+    The albedo of the own pixel is not divided out.
+    """
+
+    def trace(number: int, instrument: Instrument, numbers: dict[str, float]) -> np.ndarray:
+        stack = stacks[number]
+        scene = known_scene(known[number], numbers, instrument, stack.x, stack.y, substrate_um=substrate_um)
+        found = simulate(scene, rays=rays, seed=number + 1, maps=False).only()
+        assert found.by_order is not None and found.n_rays is not None  # simulated
+        return (found.by_order[1:].sum(0) / found.n_rays).reshape(stack.shape)
+
+    return trace

@@ -1,0 +1,138 @@
+"""Calibration by known shapes: what a user states, the instrument file, line noise, and a fit to a traced twin."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helio_jax.calibration.known_objects import KnownObject, Stated
+from helio_jax.calibration.known_report import calibrated_instrument, table
+from helio_jax.calibration.known_shape import fit_known_shapes, line_whitening
+from helio_jax.calibration.unknowns import OBJECT, KnownShapeSettings
+from helio_jax.errors import SceneError
+from helio_jax.formats.toml import write_calibrated
+from helio_jax.forward.optics import Optics
+from helio_jax.micrograph import MicrographStack
+from helio_jax.trace.scan import trace_scene
+from helio_jax.workflows.calibrate_known import calibrate_known
+from helio_jax.workflows.known_scene import known_scene, multiple_tracer
+from helio_jax.workflows.scene_file import load_instrument
+
+AXIS = 120.0 * (np.arange(25) - 12.0)
+BALL = "ball radius=1000"
+PLATE = {"plate shift x": 250.0, "plate shift y": -120.0, "sample distance": -150.0, "incidence": 0.5}
+
+
+def test_shapes_are_read_as_stated():
+    """Catches numbers that go to the wrong key, and a deviation that is dropped."""
+    wedge = KnownObject.parse("wedge height=200+-1.5 slope=30 facing=-90")
+    assert wedge == KnownObject("wedge", None, Stated(200.0, 1.5), Stated(30.0), -90.0)
+    assert [known.height is not None for known in KnownObject.parse(BALL).starts()] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("bal radius=3", "ball"),
+        ("ball", "radius"),
+        ("ball radius=-3", "radius"),
+        ("ball radius=1000 height=1500", "overhanging"),
+        ("ball radius=1 radius=2", "once"),
+        ("flat height=3", "no 'height'|it has no numbers"),
+        ("wedge height=3 slope=x", "slope=NUMBER"),
+        ("", "known are"),
+    ],
+)
+def test_impossible_shapes_are_refused(text, names):
+    """Each message names what is wrong or what is known."""
+    with pytest.raises(SceneError, match=names):
+        KnownObject.parse(text)
+
+
+def test_flat_alone_and_counts_of_shapes_are_refused(bshem):
+    """Catches a calibration of directions that nothing determines."""
+    counts = np.random.default_rng(1).normal(1000.0, 10.0, (3, 9, 9))
+    stack = MicrographStack(counts, AXIS[:9], AXIS[:9], bshem, variance=np.full(counts.shape, 100.0))
+    with pytest.raises(SceneError, match="2 known shapes for 1 scans"):
+        calibrate_known([stack], [BALL, BALL])
+    with pytest.raises(Exception, match="flat alone"):
+        calibrate_known([stack], ["flat"])
+
+
+@pytest.mark.parametrize("slow_axis", [0, 1])
+def test_lines_are_whitened(slow_axis):
+    """W C W^T = 1 for the covariance C of noise and line offsets. Catches lines along the wrong axis."""
+    rng, shape, lines = np.random.default_rng(2), (1, 3, 4), np.array([2.0])
+    sigma = rng.uniform(1.0, 2.0, shape)
+    unit = np.eye(12).reshape(12, *shape)
+    whitened = line_whitening(unit / sigma, 1.0 / sigma, lines, slow_axis).reshape(12, 12)
+    number = np.broadcast_to(np.arange(shape[1 + slow_axis]).reshape((-1, 1) if slow_axis == 0 else (1, -1)), shape[1:])
+    same = number.ravel()[:, None] == number.ravel()
+    covariance = np.diag(sigma.ravel() ** 2) + lines[0] ** 2 * same
+    assert whitened.T @ covariance @ whitened == pytest.approx(np.eye(12), abs=1e-12)
+
+
+def test_instrument_moves_as_optics_do(bshem):
+    """Catches another order or sign of the plate's motions in the file than in the fit."""
+    aim = np.radians([[1.0, 2.0], [-1.0, 0.5], [0.3, -0.7]])
+    moves = {"plate_shift": (300.0, -90.0), "scale": 1.03, "rotation": 0.02, "incidence": 0.01}
+    written = Optics.of(bshem.moved(aim, 70.0, **moves))
+    fitted = Optics.of(bshem).moved(distance=70.0, polar=aim[:, 0], azimuth=aim[:, 1], **moves)
+    for name in ("center", "beam_shift", "sample_distance"):
+        assert getattr(written, name) == pytest.approx(np.asarray(getattr(fitted, name)), rel=1e-6, abs=1e-6)
+    areas = [np.cross(o.axes[..., 0], o.axes[..., 1])[:, 2] for o in (written, fitted)]
+    assert areas[0] == pytest.approx(np.asarray(areas[1]), rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def fit(bshem):
+    """A calibration on a traced twin, with noise and unequal gains."""
+    shift = PLATE["plate shift x"], PLATE["plate shift y"]
+    about = {"plate_shift": shift, "incidence": math.radians(PLATE["incidence"])}
+    true = bshem.moved(np.zeros((3, 2)), PLATE["sample distance"], **about)
+    known = KnownObject.parse(BALL)
+    numbers = dict.fromkeys(OBJECT, 0.0) | {"radius": 1000.0, "height": 680.0, "object x": 40.0, "object y": -70.0}
+    scene = known_scene(known, numbers, true, AXIS, AXIS, substrate_um=8000.0)
+    traced = trace_scene(scene, scene.trace.changed(rays=256, maps=False)).only()
+    image = traced.counts.reshape(3, AXIS.size, AXIS.size)
+    signal = np.array([2000.0, 4000.0, 3000.0])[:, None, None] * image / np.median(image, axis=(1, 2), keepdims=True)
+    noise = np.random.default_rng(3).normal(0.0, 60.0, image.shape)
+    variance = np.full(image.shape, 3600.0)
+    stack = MicrographStack(signal + 5000.0 + noise, AXIS, AXIS, bshem, variance=variance, noise="poisson")
+    settings = KnownShapeSettings(max_rounds=5, drift=0.0, pedestal=0.0)
+    trace = multiple_tracer([stack], [known], rays=64, substrate_um=8000.0)
+    return fit_known_shapes([stack], [known], settings, trace=trace)
+
+
+@pytest.mark.slow
+def test_instrument_is_found(fit, bshem):
+    """On a traced twin, within 4 stated deviations and closer than the prior; chi-square per pixel is 1.
+
+    Catches a parameter of the wrong sign or unit, a wrong derivative, and error bars of the wrong size. 4 deviations in
+    10 numbers: one false alarm in 1600.
+    """
+    found = {row.name: row for row in table(fit)}
+    stated = {"sample distance": bshem.sample_distance, "incidence": bshem.beam.incidence_deg}
+    true = {name: stated.get(name, 0.0) + value for name, value in PLATE.items()}
+    true |= {"height": 680.0, "object x": 40.0, "object y": -70.0, "tilt x": 0.0, "tilt y": 0.0, "plate rotation": 0.0}
+    for name, value in true.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].std, found[name]
+    assert found["plate shift x"].std < 0.15 * found["plate shift x"].prior
+    assert 0.85 < fit.chi_square < 1.15
+
+
+@pytest.mark.slow
+def test_covariance_comes_back_from_the_file(fit, tmp_path):
+    """Catches a covariance that is lost, or of other parameters, in the instrument file."""
+    instrument = calibrated_instrument(fit)
+    write_calibrated(instrument, tmp_path / "found.toml", "a calibration\nof two lines")
+    read = load_instrument(tmp_path / "found.toml")
+    assert read.covariance is not None and instrument.covariance is not None
+    n = fit.n_shared
+    stated = fit.covariance[:n, :n] * np.outer(fit.priors[:n], fit.priors[:n])
+    assert read.covariance.matrix() == pytest.approx(stated, rel=2e-3, abs=1e-3 * np.diag(stated).max())
+    assert read.covariance.parameters == tuple(fit.names[:n])
+    assert np.array([a.center for a in read.apertures()]) == pytest.approx(
+        np.array([a.center for a in instrument.apertures()]), rel=1e-4
+    )
+    assert 0.0 < read.uncertainty.polar_deg < 5.0
