@@ -4,6 +4,7 @@ Rows of (label, text) for `helio info`, for the end of `helio simulate` and `hel
 plain text: um, deg.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
