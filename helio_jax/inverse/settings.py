@@ -74,8 +74,8 @@ class RefineSettings(Settings):
     cg_steps: int = Field(default=40, ge=1, le=10_000)
     """Conjugate-gradient steps per Gauss-Newton step; truncating them regularises."""
     objects: bool = True
-    """Whether objects on a flat substrate are looked for where the data contradict a fit; what is found is kept where
-    it explains the images better. Only with a flat border."""
+    """Whether pits in a flat substrate and objects on it are looked for where the data contradict a fit; what is found
+    is kept where it explains the images better. Only with a flat border."""
     bias_pairs: int = Field(default=4, ge=0, le=1000)
     """Pairs of fits to simulated data, of opposite noise, that estimate the bias by noise; only with a free border. A
     pair takes about as long as two outer iterations."""

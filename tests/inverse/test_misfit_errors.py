@@ -16,9 +16,11 @@ from helio_jax.inverse.misfit_errors import (
     flag_floating,
     slope_errors,
     valid_regions,
+    with_path_error,
 )
 from helio_jax.inverse.quality import MIN_REGION
 from helio_jax.inverse.samples import add_common_modes
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import Misfit
 from helio_jax.reconstruction import REASONS, Reconstruction
 from helio_jax.workflows import pipeline
@@ -117,6 +119,26 @@ def test_a_level_that_only_contradicted_pixels_tie_is_floating(bshem):
         rec = flag_floating(terrace(bshem, deviation))
         assert (rec.reason[inside] == expected).all() and rec.reason[N // 2, 7] == FLOATING
         assert not rec.reason[ring(10.0, 99.0)].any() and (rec.is_valid == (rec.reason == 0)).all()
+
+
+def test_error_bars_of_a_tested_map_hold_what_its_path_adds(bshem):
+    """Beyond a contradicted ring of 4 pixels of 10 um, slopes wrong by 0.2: 8 / sqrt(3) um, within 20 %; outside, 0.
+
+    The rest of a ring pixel's neighbourhood is explained, which takes part of the error. Rejects error bars of noise
+    alone (0), and errors of independent pixels (2.3 um).
+    """
+    rec = terrace(bshem, 0.0)
+    stack = hx.MicrographStack(
+        np.full((3, N, N), 1e4), instrument=bshem, x=rec.raster_x, y=rec.raster_y, variance=np.full((3, N, N), 1e4)
+    )
+    ringed = ring(6.0, 10.0)
+    wrong = misfit_of(bshem, 0.0, (0.0, 0.0), (0.2, 0.0))
+    misfit = Misfit(wrong.difference * ringed, wrong.std, wrong.form_factor, wrong.normals)
+    tested = rec.replace(chi_square=np.where(ring(5.0, 11.0), 1e4, 1.0))
+    found = with_path_error(tested, misfit, stack, ReconstructSettings(border="flat"))
+    assert found.height_std is not None
+    assert np.median(found.height_std[ring(0.0, 4.0)]) == pytest.approx(8.0 / np.sqrt(3.0), rel=0.2)
+    assert np.max(found.height_std[ring(12.0, 99.0)]) < 1e-3
 
 
 def test_regions_are_of_valid_pixels_only():
