@@ -2,12 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.correlated_errors import EdgeError
 from helio_jax.inverse.edges import find_edges
+from helio_jax.inverse.explanations import _Fits
 from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import EDGE_PLACE, edge_std
+from helio_jax.workflows.corrections import make_predictor
+from tests import terraces
 
 SHAPE = 40, 50
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -83,3 +89,23 @@ def test_errors_of_a_straight_rim_do_not_average():
     assert drawn[~on_rim].var() == pytest.approx(1.0, rel=0.02)
     influence = np.stack([first / 30.0, np.ones(first.size)], 1)
     assert error.covariance(influence)[0, 0] == pytest.approx(share + (1.0 - share) / 30.0, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_traced_pit_has_its_level(tmp_path):
+    """A square pit, 14 pixels wide and 10 deep, turned, seen from above: outline and level by search alone, no fit.
+
+    The level to 8 %, which is a pixel of a mask's end; measured 1 to 5 %. Rejects the flat substrate and other depths.
+    """
+    fixed = {"outline": "square", "n": 35, "pixel": 10.0, "incidence": 0.0, "width": 140.0, "height": -100.0}
+    member = terraces.draw(np.random.default_rng(4), **fixed, turn=20.0, snr=60.0)
+    stack = terraces.trace(member, tmp_path, rays=64)
+    settings = ReconstructSettings(border="flat")
+    fits = _Fits(stack, settings, lambda n: make_predictor(stack, n, settings.refine.substrate_um), None)
+    none = AlbedoPatches.none(stack.shape[1:])
+    search = PitSearch(lambda s: fits.residuals_on(s, none), (PITCH, PITCH), stack.instrument.beam_shift)
+    pits = search.find((35, 35))
+    seen = terraces.seen_level(member, *np.meshgrid(stack.x, stack.y))
+    assert pits is not None and np.mean((pits.number > 0) != (seen == -100.0)) < 0.03
+    inner = binary_erosion(seen == -100.0, iterations=2)
+    assert np.median(pits.surface.height[inner]) == pytest.approx(-100.0, rel=0.08)
