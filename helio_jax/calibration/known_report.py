@@ -10,7 +10,7 @@ from helio_jax.instrument import Covariance, Instrument, Uncertainty
 
 UNDETERMINED = 0.7
 """An unknown that keeps more than this share of its prior standard deviation is not determined by the scans."""
-EXPLAINED = 1.2
+LARGE_CHI_SQUARE = 1.2
 """Robust chi-square per pixel up to which the model explains a region."""
 INFLATED = 1.2
 FAR = 3.0
@@ -99,8 +99,10 @@ def robust_chi_square(fit: KnownFit) -> float:
 def verdict(fit: KnownFit) -> list[str]:
     """State in sentences what the fit does not explain or determine; empty: nothing."""
     out, chi = [], robust_chi_square(fit)
-    worst = sorted((row for row in chi_squares(fit) if row["robust"] > EXPLAINED), key=lambda row: -row["robust"])
-    if chi > EXPLAINED or worst:
+    worst = sorted(
+        (row for row in chi_squares(fit) if row["robust"] > LARGE_CHI_SQUARE), key=lambda row: -row["robust"]
+    )
+    if chi > LARGE_CHI_SQUARE or worst:
         places = "; ".join(
             f"{row['region']} of {row['detector']!r} in {row['scan']} ({row['robust']:.2f})" for row in worst[:3]
         )

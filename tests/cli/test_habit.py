@@ -28,7 +28,7 @@ JSON_LINES = (
     ("simulate step -o a.h5 --rays 8", "picture"),
     ("export a.h5 -o a.mat", "not_written"),
     ("import a.mat -o b.h5 --instrument bshem_wd4 --no-picture", "picture"),
-    ("reconstruct a.h5 -o height.h5 --method linear", "is_contradicted"),
+    ("reconstruct a.h5 -o height.h5 --method linear", "trust"),
     ("report height.h5 -o r.html", "panel"),
     ("show height.h5", "file"),
     ("rays step -o rays.csv --pixel 3 4 --rays 32", "fates"),

@@ -287,13 +287,14 @@ def test_results_are_as_they_were(stored, name):
 def test_one_compilation_serves_every_geometry(stored):
     """A fit of the same raster with the plate 100 um farther away compiles nothing.
 
-    Catches a geometry that is a constant of the compiled functions: every measurement waits for XLA then.
+    Catches a geometry that is a constant of the compiled functions: every measurement waits for XLA then. Without pits
+    and objects, which are looked for only where the data contradict a fit, as they do with the wrong distance.
     """
-    stack = micrographs(stored, "sphere")
+    stack, case = micrographs(stored, "sphere"), Case("sphere", refine={"objects": False})
     farther = stack.instrument.at_distance(stack.instrument.sample_distance + 100.0)
-    reconstruct(stack, CASES["refine"])
+    reconstruct(stack, case)
     with compilations.counted() as found:
-        reconstruct(stack.replace(instrument=farther), CASES["refine"])
+        reconstruct(stack.replace(instrument=farther), case)
     assert not found, dict(found)
 
 
