@@ -21,7 +21,7 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.fit import Fit, Report, fit_heights, misfit_of, short_fit
+from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
 from helio_jax.inverse.linear import signal_of, solve_known_albedo
@@ -158,8 +158,7 @@ class _Fits:
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
         """Half the chi-square of the data expected on a surface, nothing fitted."""
-        problem = self.pose(surface, patches)
-        return misfit_of(problem, FitState.at(problem, surface), self.predict_trial)
+        return 0.5 * float(np.sum(squares(self.residuals_on(surface, patches))))
 
     def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
         """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
