@@ -30,7 +30,7 @@ from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.quality import squares
+from helio_jax.inverse.quality import half_chi_square, squares
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
@@ -58,23 +58,22 @@ class Explanation(NamedTuple):
     Attributes:
         fit: without error bars.
         is_undecided: where another level explains the images as well [y, x].
-        objects: number of the object of every pixel, 0: flat substrate [y, x]; None: no such objects are assumed.
-        pits: likewise, of pits.
+        number: of the object or pit of every pixel, 0: flat substrate [y, x]; None: no flat substrate is assumed.
+        kind: "objects on" or "pits in" the substrate.
         n_steps: number of regions that are held at the levels of measured steps.
     """
 
     fit: Fit
     is_undecided: np.ndarray
-    objects: np.ndarray | None = None
-    pits: np.ndarray | None = None
+    number: np.ndarray | None = None
+    kind: str = ""
     n_steps: int = 0
 
     @property
     def assumed(self) -> str:
         """What the fit takes for granted beyond the settings, in words; "": nothing."""
-        for kind, number in (("objects on", self.objects), ("pits in", self.pits)):
-            if number is not None:
-                return f"{len(np.unique(number)) - 1} {kind} a flat substrate"
+        if self.number is not None:
+            return f"{len(np.unique(self.number)) - 1} {self.kind} a flat substrate"
         return f"{self.n_steps} levels from mask bands" if self.n_steps else ""
 
 
@@ -158,7 +157,7 @@ class _Fits:
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
         """Half the chi-square of the data expected on a surface, nothing fitted."""
-        return 0.5 * float(np.sum(squares(self.residuals_on(surface, patches))))
+        return half_chi_square(self.residuals_on(surface, patches))
 
     def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
         """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
@@ -266,7 +265,7 @@ class _Fits:
             return None
         start = self.short_fit(objects.surface(relief), none)[1]
         fit = self.fitted(start, smoothed, none, objects.number)
-        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number)
+        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
 
     def from_pits(self, best: Explanation, _: np.ndarray) -> Explanation | None:
         """Fit from pits with flat floors in a flat substrate; None where there are none."""
@@ -284,7 +283,7 @@ class _Fits:
             return None
         start = self.short_fit(pits.surface, none)[1]
         fit = self.fitted(start, self.plain_start[1], none, pits.number)
-        return Explanation(fit, np.zeros(shape, bool), pits=pits.number)
+        return Explanation(fit, np.zeros(shape, bool), pits.number, "pits in")
 
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""
@@ -294,16 +293,15 @@ class _Fits:
         patches = found.keeping(found.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
-        known = best.pits if best.objects is None else best.objects
-        if known is None:
+        if best.number is None:
             return self.from_steps(patches)
         surface = best.fit.state.surface
-        return best._replace(fit=self.fitted(surface, surface, patches, known))
+        return best._replace(fit=self.fitted(surface, surface, patches, best.number))
 
 
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:
     """Compute by how much other residuals [detector, y, x] are smaller, in half chi-square."""
-    return 0.5 * float(np.sum(squares(residuals) - squares(others)))
+    return half_chi_square(residuals) - half_chi_square(others)
 
 
 def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:

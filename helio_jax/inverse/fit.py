@@ -20,7 +20,7 @@ from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import MAX_PIXELS, Posterior, linearise, sample_posterior
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.quality import squares
+from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
@@ -114,7 +114,7 @@ def misfit_of(problem: FitProblem, state: FitState, predict: Predict) -> float:
     Raises:
         PredictionError: nothing can be predicted of the surface.
     """
-    return 0.5 * float(np.sum(squares(residuals_of_state(problem, state, predict))))
+    return half_chi_square(residuals_of_state(problem, state, predict))
 
 
 def short_fit(problem: FitProblem, surface: Surface, predict: Predict) -> tuple[float, Surface]:

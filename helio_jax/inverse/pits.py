@@ -17,7 +17,7 @@ from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.levels import GAIN, at_level
 from helio_jax.inverse.objects import LEAST_PIXELS, numbered
-from helio_jax.inverse.quality import squares
+from helio_jax.inverse.quality import half_chi_square, squares
 
 LIMIT = 3.0
 """Mean square residual, over detectors, above which a flat floor does not explain a pixel."""
@@ -81,7 +81,7 @@ class PitSearch:
     def misfit(self, surface: Surface) -> float:
         """Half the chi-square of the data expected on a surface; infinite where nothing can be predicted."""
         try:
-            return 0.5 * float(np.sum(squares(self.residuals(surface))))
+            return half_chi_square(self.residuals(surface))
         except PredictionError:
             return np.inf
 

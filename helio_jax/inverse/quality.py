@@ -108,6 +108,11 @@ def squares(residuals: np.ndarray) -> np.ndarray:
     return np.minimum(np.nan_to_num(residuals) ** 2, _LARGEST)
 
 
+def half_chi_square(residuals: np.ndarray) -> float:
+    """Compute half the sum of the limited squares of residuals: the misfit by which surfaces are compared."""
+    return 0.5 * float(np.sum(squares(residuals)))
+
+
 def ill_explained(residuals: np.ndarray, is_observed: np.ndarray) -> np.ndarray:
     """Return True where the fit contradicts the images of a pixel and its neighbours together [y, x].
 

@@ -129,25 +129,32 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPa
     return Misfit(model - signal, data_std(variance, model, c, albedo), albedo * phi, normals)
 
 
-def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> Misfit:
-    """Trace a fit's surface and compare it, with the fit's albedo and read-out, with the data.
-
-    Raises:
-        PredictionError: the surface is too rough or steep to be traced.
-    """
-    from helio_jax.inverse.state import moved_optics, predict_corrections
+def _traced_state(problem: "FitProblem", state: "FitState", trace: Trace) -> tuple["FitState", np.ndarray, np.ndarray]:
+    """Trace a fit's surface; return the state with what was traced, model minus data, NaN where not observed, and the
+    standard deviation of the data [detector, y, x]."""
+    from helio_jax.inverse.state import predict_corrections
     from helio_jax.inverse.steps import expected
 
     state = predict_corrections(problem, state, trace)
     albedo = problem.patches_at(state.parameters).albedo
     model = expected(problem, state, is_noisy=True)
     std = data_std(problem.variance, model, state.held.corrections, albedo)
+    return state, np.where(problem.is_observed, model - problem.signal, np.nan), std
+
+
+def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> Misfit:
+    """Trace a fit's surface and compare it, with the fit's albedo and read-out, with the data.
+
+    Raises:
+        PredictionError: the surface is too rough or steep to be traced.
+    """
+    from helio_jax.inverse.state import moved_optics
+
+    state, difference, std = _traced_state(problem, state, trace)
     optics = moved_optics(problem.optics, problem.moves(state.parameters))
     gain = np.exp(problem.priors.gain * state.parameters.log_gain)[:, None, None, None]
-    phi = gain * albedo * form_factor(optics, state.surface.height)
-    return Misfit(
-        np.where(problem.is_observed, model - problem.signal, np.nan), std, phi, state.surface.normals(problem.shift)
-    )
+    phi = gain * problem.patches_at(state.parameters).albedo * form_factor(optics, state.surface.height)
+    return Misfit(difference, std, phi, state.surface.normals(problem.shift))
 
 
 def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:
@@ -157,8 +164,8 @@ def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -
     would decide, of which no map on this raster knows more. Data that were not observed have none: 0. Raises as
     `misfit_of_state`.
     """
-    found = misfit_of_state(problem, state, trace)
-    return np.nan_to_num(found.difference / np.hypot(found.std, edge_std(problem.signal, problem.variance)))
+    _, difference, std = _traced_state(problem, state, trace)
+    return np.nan_to_num(difference / np.hypot(std, edge_std(problem.signal, problem.variance)))
 
 
 def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:
