@@ -145,6 +145,7 @@ calibration/          background, gain, drift and noise; instruments by known sh
   known_report        table, chi-square by region, verdict, instrument with covariance
 alignment/            rotated scans onto one raster; orientation of arrays
   align               entry: a set of scans -> one stack
+  correction          correction of a motion where heights move pixels
   rigid               rigid motions
   control_points      motions from control points
   automatic           motions by prediction and correlation
@@ -238,7 +239,9 @@ formats/              the only door to files
   toml                writes instrument files
   fetch               downloads public data
 workflows/            what joins the stages
-  pipeline            simulate, calibrate, align, reconstruct, evaluate, run
+  pipeline            simulate, align, evaluate, report, run
+  heights             calibrate, reconstruct; one scan or several
+  several_scans       scans of oblique beams joined on one surface
   scene_file          scene files: TOML -> Scene
   shipped             scenes and instruments that come with the program, by name
   copy_scene          copies of those
@@ -311,7 +314,8 @@ _HOME = {
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",
-    "reconstruct": "workflows.pipeline",
+    "reconstruct": "workflows.heights",
+    "reconstruct_scans": "workflows.heights",
     "true_height": "workflows.truth",
     "show": "workflows.show",
     "evaluate": "workflows.pipeline",

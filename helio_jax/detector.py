@@ -5,11 +5,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from helio_jax.settings import Settings
+
+BeamAngle = Annotated[float, Field(ge=-360.0, le=360.0)]
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,9 @@ class Detector(Settings):
     group or object, or of a GLB geometry."""
     channel: int | None = Field(default=None, ge=1, le=1000)
     """Channel of this aperture in a measured file (1-based); only used on import."""
+    beam_deg: tuple[BeamAngle, BeamAngle] | None = None
+    """Incidence and azimuth of the beam of this detector's scan, where a stack joins scans of several beams (default:
+    those of [beam]); such an instrument cannot be simulated, its scans can [deg]."""
 
     @model_validator(mode="after")
     def _is_of_one_kind(self) -> "Detector":

@@ -21,6 +21,11 @@ POLAR_STD_DEG = 5.0
 states none: they see the sample from somewhere between its base and its top [deg]."""
 
 
+def _beam_shift(incidence_deg: float, azimuth_deg: float) -> tuple[float, float]:
+    t, phi = math.radians(incidence_deg), math.radians(azimuth_deg)
+    return math.tan(t) * math.cos(phi), math.tan(t) * math.sin(phi)
+
+
 class Effusive(Settings):
     """Effusive beam: atoms that leave the pinhole with a cos^n distribution about the plate normal."""
 
@@ -259,8 +264,32 @@ class Instrument(Drawable, Settings):
     @property
     def beam_shift(self) -> tuple[float, float]:
         """Lateral displacement (x, y) of the beam axis per um of depth: tan t (cos phi, sin phi)."""
-        t, phi = math.radians(self.beam.incidence_deg), math.radians(self.beam.azimuth_deg)
-        return math.tan(t) * math.cos(phi), math.tan(t) * math.sin(phi)
+        return _beam_shift(self.beam.incidence_deg, self.beam.azimuth_deg)
+
+    @property
+    def beam_shifts(self) -> np.ndarray:
+        """`beam_shift` of the scan of every detector [detector, 2]; they differ where a stack joins several beams."""
+        return np.array([_beam_shift(*d.beam_deg) if d.beam_deg else self.beam_shift for d in self.detector])
+
+    @property
+    def has_several_beams(self) -> bool:
+        """Whether a detector's scan was taken by another beam than [beam], along which the raster sees the sample."""
+        return any(d.beam_deg is not None for d in self.detector)
+
+    def by_beam(self) -> tuple[tuple["Instrument", tuple[int, ...]], ...]:
+        """Split into instruments of one beam each, with the indices of their detectors."""
+        if not self.has_several_beams:
+            return ((self, tuple(range(len(self.detector)))),)
+        default = self.beam.incidence_deg, self.beam.azimuth_deg
+        members: dict[tuple[float, float], list[int]] = {}
+        for k, d in enumerate(self.detector):
+            members.setdefault(d.beam_deg or default, []).append(k)
+        out = []
+        for (incidence, azimuth), of_beam in members.items():
+            beam = self.beam.changed(incidence_deg=incidence, azimuth_deg=azimuth)
+            detectors = tuple(self.detector[k].model_copy(update={"beam_deg": None}) for k in of_beam)
+            out.append((self.model_copy(update={"beam": beam, "detector": detectors}), tuple(of_beam)))
+        return tuple(out)
 
     @property
     def beam_direction(self) -> np.ndarray:
@@ -331,8 +360,10 @@ class Instrument(Drawable, Settings):
                 "axes_um": (2.0 * scale * a.semi_axes[0], 2.0 * scale * a.semi_axes[1]),
                 "rotation_deg": math.degrees(math.remainder(a.rotation + azimuth + rotation, 2.0 * math.pi)),
             }
-            detectors.append(Detector(name=d.name, channel=d.channel, **ellipse))
+            detectors.append(Detector(name=d.name, channel=d.channel, beam_deg=d.beam_deg, **ellipse))
         plate = self.plate.model_copy(update={"sample_distance_um": self.sample_distance + distance})
+        if incidence and self.has_several_beams:
+            raise SceneError("the incidence of an instrument of several beams cannot be moved: move that of its scans")
         beam = self.beam.changed(incidence_deg=self.beam.incidence_deg + math.degrees(incidence))
         return Instrument(beam=beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
 
@@ -351,8 +382,8 @@ class Instrument(Drawable, Settings):
 
     def directions(self) -> np.ndarray:
         """Compute x / z, y / z of each aperture's centre, seen from the beam's spot on the substrate [detector, 2]."""
-        spot = np.array(self.spot_position(0.0)[:2])
-        return (np.array([a.center for a in self.apertures()]) - spot) / self.sample_distance
+        spots = (self.sample_distance - self.working_distance) * self.beam_shifts
+        return (np.array([a.center for a in self.apertures()]) - spots) / self.sample_distance
 
     def surface_position(self, x: Any, y: Any, height: Any) -> tuple[Any, Any]:
         """Compute the sample-frame x, y of the surface point of `height` at beam position (x, y) [um]."""

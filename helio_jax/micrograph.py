@@ -76,6 +76,8 @@ class MicrographStack(OnRaster):
         plate: part of `counts` that scattered on the plate at least once [detector, y, x].
         masked: fraction of the aperture's solid angle masked by the sample, local horizon included [detector, y, x].
         shadowed: 1 where the beam does not reach the topmost surface point above the raster position [y, x].
+        parallax, parallax_height: of joined scans of oblique beams, whose images are read where their own beam meets
+            the surface of these heights [y, x], um: change of the counts per um by which it is higher [detector, y, x].
         n_rays: beam atoms per pixel that the counts correspond to (simulated), or None.
         dwell: dwell time per pixel [s] (measured), or None.
         fast_axis: axis along which the scan moves fastest.
@@ -102,6 +104,8 @@ class MicrographStack(OnRaster):
     plate: np.ndarray | None = None
     masked: np.ndarray | None = None
     shadowed: np.ndarray | None = None
+    parallax: np.ndarray | None = None
+    parallax_height: np.ndarray | None = None
     n_rays: float | None = None
     dwell: float | None = None
     fast_axis: Literal["x", "y"] = "x"
@@ -120,10 +124,15 @@ class MicrographStack(OnRaster):
         check_axis("x", self.x, error)
         check_axis("y", self.y, error)
         shape = (len(self.instrument.detector), self.y.size, self.x.size)
-        others = {"shadowed": shape[1:], "positions": (self.x.size, 2), "by_order": (None, *shape)}
+        others = {
+            "shadowed": shape[1:],
+            "parallax_height": shape[1:],
+            "positions": (self.x.size, 2),
+            "by_order": (None, *shape),
+        }
         is_background_image = self.background is not None and np.ndim(self.background) == 3
         others["background"] = shape if is_background_image else shape[:1]
-        images = dict.fromkeys(("counts", "variance", "effuse", "plate", "masked"), shape)
+        images = dict.fromkeys(("counts", "variance", "effuse", "plate", "masked", "parallax"), shape)
         set_float_arrays(self, images | others, error)
         if self.positions is not None and (self.y.size != 1 or not np.all(np.isfinite(self.positions))):
             raise error(f"positions must be finite and belong to images of one row, got {self.y.size} rows")

@@ -21,7 +21,7 @@ from helio_jax.micrograph import MicrographStack
 
 MAX_PERMUTED = 4
 """Up to so many detectors all orders of the images are tried; with more only shifts and reversals along the ring."""
-_PER_DETECTOR = ("counts", "variance", "is_observed", "effuse", "plate", "masked")
+_PER_DETECTOR = ("parallax", "counts", "variance", "is_observed", "effuse", "plate", "masked")
 """Fields [detector, y, x] of a stack."""
 _SAME = 1e-3
 """Two apertures are the same where they differ by less than this share of the working distance."""
@@ -98,8 +98,9 @@ def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> Mi
         )
     if stack.by_order is not None:
         fields["by_order"] = turn.image(stack.by_order[:, pick])
-    if stack.shadowed is not None:
-        fields["shadowed"] = turn.image(stack.shadowed)
+    for name in ("shadowed", "parallax_height"):
+        if getattr(stack, name) is not None:
+            fields[name] = turn.image(getattr(stack, name))
     x, y = turn.axes(stack.x, stack.y)
     is_odd = turn.turn_deg % 180 == 90
     fast = {"x": "y", "y": "x"}[stack.fast_axis] if is_odd else stack.fast_axis
@@ -126,7 +127,7 @@ def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
     background = stack.background
     if background is not None and background.ndim == 3:
         background = of(background)
-    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed"))
+    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "parallax", "parallax_height"))
     return stack.replace(
         counts=of(stack.counts),
         x=stack.x[: columns * n].reshape(columns, n).mean(1),

@@ -19,6 +19,8 @@ from helio_jax.micrograph import MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
+_MARCH = 0.5
+"""Step of the search for what shadows a point [pixels]."""
 
 
 def smooth(image: np.ndarray, is_known: np.ndarray, sigma: float) -> np.ndarray:
@@ -95,11 +97,19 @@ def common_raster(
     return axes[0], axes[1]
 
 
-def rotated_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> Instrument:
-    """Combine the apertures of all scans in one instrument, each rotated back by its sample's rotation."""
+def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> Instrument:
+    """Combine the apertures of all scans in one instrument, each rotated back by its sample's rotation.
+
+    Where a scan's beam is oblique, each detector keeps the beam of its scan, and the raster sees the sample straight
+    down (`Instrument.has_several_beams`).
+    """
     detectors = []
+    beams = [s.instrument.beam for s in stacks]
+    is_oblique = any(b.incidence_deg for b in beams)
     for stack, motion in zip(stacks, motions, strict=True):
         back = Rigid(-motion.rotation, (0.0, 0.0))
+        beam, turn = stack.instrument.beam, math.degrees(motion.rotation)
+        of_scan = (beam.incidence_deg, math.remainder(beam.azimuth_deg - turn, 360.0)) if is_oblique else None
         for detector, aperture in zip(stack.instrument.detector, stack.instrument.apertures(), strict=True):
             center = back.apply(np.asarray(aperture.center))
             rotation = math.degrees(aperture.rotation - motion.rotation)
@@ -110,9 +120,32 @@ def rotated_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid
                     axes_um=(2 * aperture.semi_axes[0], 2 * aperture.semi_axes[1]),
                     rotation_deg=math.remainder(rotation, 360.0),
                     channel=detector.channel,
+                    beam_deg=of_scan,
                 )
             )
-    return stacks[0].instrument.model_copy(update={"detector": tuple(detectors)})
+    beam = beams[0].changed(incidence_deg=0.0, azimuth_deg=0.0) if is_oblique else beams[0]
+    return stacks[0].instrument.model_copy(update={"beam": beam, "detector": tuple(detectors)})
+
+
+def is_lit(height: np.ndarray, x: np.ndarray, y: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Find the points of a surface that a beam reaches [y, x]; pixels beside a shadow count as shadowed.
+
+    Args:
+        height: above the substrate [y, x], um; beyond the image there is nothing in the way.
+        x, y: axes of the sample frame [um].
+        shift: the beam's displacement (x, y) per um of depth.
+    """
+    tan, steps = float(np.hypot(*shift)), np.array([pitch(y), pitch(x)])
+    rows, columns = np.mgrid[: height.shape[0], : height.shape[1]].astype(float)
+    is_shadowed = np.zeros(height.shape, bool)
+    if tan:
+        step = _MARCH * float(steps.min())
+        back = -np.array([shift[1], shift[0]]) / tan * step / steps  # pixels, towards where the beam comes from
+        for n in range(1, math.ceil(tan * float(np.ptp(height)) / step) + 1):
+            at = np.stack([rows + n * back[0], columns + n * back[1]])
+            there = ndimage.map_coordinates(height, at, order=1, mode="constant", cval=-np.inf)
+            is_shadowed |= there > height + n * step / tan
+    return ~np.asarray(ndimage.binary_dilation(is_shadowed, np.ones((3, 3))), bool)
 
 
 def scan_times(
@@ -136,31 +169,46 @@ def resample(
     motions: tuple[Rigid, ...],
     field: str = "union",
     position_std: tuple[float, ...] | None = None,
+    height: np.ndarray | None = None,
 ) -> MicrographStack:
     """Resample all scans onto one raster of the common frame.
 
+    The point of height z is in a scan where its beam meets that point: moved by z tan(incidence) along its azimuth.
+
     Args:
-        scans: normal incidence.
+        scans: of one plate at one distance.
         motions: of each scan.
         field: see `common_raster`.
         position_std: error of each motion, standard deviation of a pixel's place per axis [um]; default 0.
+        height: of the surface on that raster [y, x], um; needed where a beam is oblique.
 
     Returns:
-        One stack; a detector per scan and aperture. Pixels outside a scan are not observed there.
+        One stack; a detector per scan and aperture. Points outside a scan or in its shadow are not observed there.
     """
     x, y = common_raster(scans.stacks, motions, field)
     points = np.stack(np.meshgrid(x, y), -1)
     area = pitch(x) * pitch(y)
-    counts, variance, observed, background = [], [], [], []
+    counts, variance, observed, background, parallax = [], [], [], [], []
     has_variance = all(s.variance is not None for s in scans.stacks)
     has_background = all(s.background is not None for s in scans.stacks)
     for stack, motion, std in zip(scans.stacks, motions, position_std or (0.0,) * len(motions), strict=True):
         places = motion.apply(points)
+        shift, is_reached = np.asarray(stack.instrument.beam_shift), True
+        if height is not None:
+            places = places + height[..., None] * shift
+            is_reached = is_lit(height, x, y, shift @ motion.matrix)
         ratio = pitch(stack.x) * pitch(stack.y) / area
         blur = 0.5 * math.sqrt(max(1.0 / ratio - 1.0, 0.0))  # finer scans are averaged over a pixel, about
         for k, (image, known) in enumerate(zip(stack.counts, stack.is_observed, strict=True)):
             finer = smooth(image, known, blur) if blur > 0.1 else image
-            value, is_seen = SplineImage.of(finer, known, stack.x, stack.y).at(places)
+            splines = SplineImage.of(finer, known, stack.x, stack.y)
+            value, is_seen = splines.at(places)
+            is_seen &= is_reached
+            step = (
+                0.5 * pitch(stack.x) / max(float(np.hypot(*shift)), 1e-9)
+            )  # um of height that move a place half a pixel
+            ahead, behind = (splines.at(places + sign * step * shift)[0] for sign in (1.0, -1.0))
+            parallax.append(np.where(is_seen, (ahead - behind) / (2.0 * step), 0.0))
             counts.append(np.where(is_seen, value, np.nan))
             observed.append(is_seen)
             if has_variance:
@@ -177,10 +225,12 @@ def resample(
         counts=np.stack(counts),
         x=x,
         y=y,
-        instrument=rotated_instrument(scans.stacks, motions),
+        instrument=joined_instrument(scans.stacks, motions),
         variance=np.stack(variance) if has_variance else None,
         is_observed=np.stack(observed),
         background=np.stack(background) if has_background else None,
+        parallax=None if height is None else np.stack(parallax),
+        parallax_height=height,
         n_rays=first.n_rays if len({s.n_rays for s in scans.stacks}) == 1 else None,
         dwell=first.dwell if len({s.dwell for s in scans.stacks}) == 1 else None,
         name=f"{first.name} and {len(scans.stacks) - 1} more",

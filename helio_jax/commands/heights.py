@@ -2,13 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from helio_jax.commands.app import (
     CSV,
     FIGURE,
+    HDF5,
     HTML,
     TOML,
     AsJson,
@@ -27,13 +28,22 @@ from helio_jax.commands.app import (
 from helio_jax.commands.door import Reads
 
 
-@app.command()
-def reconstruct(
-    stack: Annotated[Path, typer.Argument(help="Micrographs (.h5)."), Reads()],
+@app.command("reconstruct")
+def reconstruct_files(
+    stack: Annotated[
+        list[Path], typer.Argument(help="Micrographs (.h5); several scans of one sample: one surface."), Reads()
+    ],
     output: H5File,
     method: Method = None,
     settings: Annotated[
         Path | None, typer.Option(help="Scene file whose table [reconstruct] is used."), Reads(names_files=True)
+    ] = None,
+    motions: Annotated[
+        Literal["stage", "fitted"],
+        typer.Option(help="Of the sample between several scans: stage (as stated) or fitted (by the images)."),
+    ] = "stage",
+    write_joined: Annotated[
+        Path | None, typer.Option(help="Also several scans as joined on the surface, for reports (.h5)."), HDF5
     ] = None,
     border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
     write_instrument: Annotated[
@@ -42,22 +52,31 @@ def reconstruct(
     strict: Strict = False,
     as_json: AsJson = False,
 ) -> None:
-    """Reconstruct a height map from three or more micrographs."""
-    from helio_jax import write
+    """Reconstruct a height map from three or more micrographs, of one scan or of several of one sample."""
+    from helio_jax import MicrographSet, write
     from helio_jax.figures.trust import trust_lines
-    from helio_jax.formats.hdf5 import read_stack
-    from helio_jax.workflows import pipeline
+    from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.inverse.settings import ReconstructSettings
+    from helio_jax.workflows.heights import reconstruct, reconstruct_scans
     from helio_jax.workflows.scene_file import load_scene
 
-    given = load_scene(settings).reconstruct if settings else None
-    images = read_stack(stack)
+    given = load_scene(settings).reconstruct if settings else ReconstructSettings()
+    scans = [scan for path in stack for scan in read_micrographs(path).stacks]
     if write_instrument:
         from helio_jax.formats import toml
 
-        toml.check_uncertain(images.instrument, write_instrument)
+        toml.check_uncertain(scans[0].instrument, write_instrument)
+    joined = None
     with Bar("reconstructing") as bar:
-        result = pipeline.reconstruct(images, method, settings=given, report=bar, **given_options(border=border))
+        if len(scans) == 1:
+            result = reconstruct(scans[0], method, settings=given, report=bar, **given_options(border=border))
+        else:
+            chosen = given.changed(**given_options(method=method, border=border))
+            several = MicrographSet(tuple(scans))
+            result, joined = reconstruct_scans(several, settings=chosen, motions=motions, report=bar)
     write(result, output)
+    if write_joined:
+        write(scans[0] if joined is None else joined.stack, write_joined)
     if write_instrument:
         toml.write_instrument(result, write_instrument)
     if as_json:

@@ -56,6 +56,8 @@ STACK_FIELDS = (
     Field("plate", "plate", "counts", "counts from plate bounces"),
     Field("masked", "masked", "", "fraction of the aperture masked by the sample"),
     Field("shadowed", "shadowed", "", "1 where the topmost surface is shadowed"),
+    Field("parallax", "parallax", "counts/um", "change of the counts per um of height, where several beams are joined"),
+    Field("parallax_height", "parallax_height", "um", "heights at which the images of several beams were read"),
     Field("n_rays", "n_rays", "", "simulated beam atoms per pixel"),
     Field("dwell", "dwell_time", "s", "dwell time per pixel"),
     Field("sample_rotation", "sample_rotation", "rad", "rotation of the sample about the plate normal"),

@@ -57,6 +57,7 @@ def slice_apertures(optics: Optics, n_slices: int) -> Slices:
     nodes are Gauss-Chebyshev's of the second kind in p: an aperture that is masked as a whole converges geometrically,
     one that is cut as n_slices^-2. An aperture around the beam is sliced all round.
     """
+    optics = optics.of_raster()
     shift = jnp.asarray(optics.beam_shift)
 
     def of_aperture(center, axes):

@@ -7,7 +7,7 @@ their own (`in_own_precision`). Knows no surface, count or file.
 """
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -110,6 +110,8 @@ class Optics(eqx.Module):
             (x, y) per um of depth.
         working_distance: design working distance W: height of the plate above the lab frame's origin.
         sample_distance: distance D from the plate to the substrate.
+        beam_shifts: the same of the beam of every image, where a stack joins scans of several beams; then `beam_shift`
+            is that along which the raster sees the sample (0: straight down). None: one beam.
     """
 
     center: Float[Any, "detector 3"]
@@ -117,6 +119,7 @@ class Optics(eqx.Module):
     beam_shift: Float[Any, "2"]
     working_distance: Float[Any, ""]
     sample_distance: Float[Any, ""]
+    beam_shifts: Float[Any, "detector 2"] | None = None
 
     @classmethod
     def of(cls, instrument: Instrument) -> "Optics":
@@ -128,7 +131,9 @@ class Optics(eqx.Module):
         apertures, w = instrument.apertures(), instrument.working_distance
         center = np.array([[*a.center, w] for a in apertures])
         axes = np.array([[*ellipse_axes(a.semi_axes, a.rotation), [0.0, 0.0]] for a in apertures])
-        return cls(center, axes, np.array(instrument.beam_shift), np.array(w), np.array(instrument.sample_distance))
+        shifts = instrument.beam_shifts if instrument.has_several_beams else None
+        distance = np.array(instrument.sample_distance)
+        return cls(center, axes, np.array(instrument.beam_shift), np.array(w), distance, shifts)
 
     @property
     def n_detectors(self) -> int:
@@ -141,9 +146,26 @@ class Optics(eqx.Module):
         return self.sample_distance - self.working_distance
 
     def spot(self, height: Any) -> tuple[Any, Any, Any]:
-        """Compute the lab position (x, y, z) of the illuminated point of a given height above the substrate [um]."""
+        """Compute the lab position (x, y, z) of the illuminated point of a given height above the substrate [um].
+
+        With several beams x and y are those in the scan of every image [detector, ...].
+        """
         z = height - self.drop
-        return -z * self.beam_shift[0], -z * self.beam_shift[1], z
+        if self.beam_shifts is None:
+            return -z * self.beam_shift[0], -z * self.beam_shift[1], z
+        x, y = (self.beam_shifts[:, i].reshape(-1, *(1,) * z.ndim) for i in (0, 1))
+        return -z * x, -z * y, z
+
+    def of_raster(self) -> "Optics":
+        """Return optics of one beam, that of the raster: each aperture as seen from the substrate by its own beam.
+
+        From other heights h the apertures of other beams are seen up to h |difference of the beam shifts| / D off.
+        """
+        if self.beam_shifts is None:
+            return self
+        aside = self.drop * (self.beam_shift - self.beam_shifts)
+        center = jnp.asarray(self.center).at[:, :2].add(aside)
+        return Optics(center, self.axes, self.beam_shift, self.working_distance, self.sample_distance)
 
     def rims(self, n_points: int) -> tuple[Any, Any]:
         """Compute rim points and tangents (derivatives by the parameter s) [n_points, 3, detector]."""
@@ -200,12 +222,15 @@ class Optics(eqx.Module):
         pivot = jnp.array([0.0, 0.0, 1.0], center.dtype) * self.working_distance
         center, axes = (center - pivot) @ rigid.T + pivot, jnp.einsum("ij,kjn->kin", rigid, axes)
         center = center.at[:, :2].add(jnp.stack([jnp.asarray(v) for v in plate_shift]))
+        turned = partial(_turned_beam, incidence=incidence, azimuth=beam_azimuth)
+        shift, shifts = jnp.asarray(self.beam_shift), self.beam_shifts
         return Optics(
             center,
             axes,
-            _turned_beam(jnp.asarray(self.beam_shift), incidence, beam_azimuth),
+            turned(shift) if shifts is None else shift,
             jnp.asarray(self.working_distance),
             self.sample_distance + jnp.asarray(distance),
+            None if shifts is None else jax.vmap(turned)(jnp.asarray(shifts)),
         )
 
 

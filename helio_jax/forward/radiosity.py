@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.errors import SceneError
 from helio_jax.forward.masking import Slices, slice_apertures
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.surface import normal_of_slopes
@@ -150,7 +151,12 @@ def plan_radiosity(
         raster: at least 2 x 2 beam positions.
         substrate_um: side of the substrate about the z axis; default: half an image beyond each border.
         n_azimuths: directions in which a receiver looks; a multiple of 4.
+
+    Raises:
+        SceneError: the images were taken with several beams.
     """
+    if optics.beam_shifts is not None:
+        raise SceneError("radiosity knows one beam, these images were taken with several: have them traced instead")
     height, normals = np.asarray(height, np.float64), np.asarray(normals, np.float64)
     optics, raster = (jax.tree.map(lambda a: np.asarray(a, np.float64), tree) for tree in (optics, raster))
     pitches, shift = (raster.dy, raster.dx), optics.beam_shift

@@ -17,14 +17,14 @@ from helio_jax.errors import PredictionError, SceneError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder
-from helio_jax.forward.surface import Surface
+from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
-from helio_jax.inverse.linear import signal_of, solve_known_albedo
+from helio_jax.inverse.linear import parallax_of, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
@@ -78,7 +78,11 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    stack: MicrographStack, settings: ReconstructSettings, make_predict: Callable[[int], Predict], report: Report | None
+    stack: MicrographStack,
+    settings: ReconstructSettings,
+    make_predict: Callable[[int], Predict],
+    report: Report | None,
+    start: np.ndarray | None = None,
 ) -> Explanation:
     """Fit the heights, and other explanations where the data contradict the fit; arguments as `reconstruct_stack`.
 
@@ -86,8 +90,12 @@ def explain(
     contradict it in fewer pixels (`LESS_CONTRADICTED`).
     """
     fits = _Fits(stack, settings, make_predict, report)
-    best = fits.from_steps(AlbedoPatches.none(stack.shape[1:]))
-    for other in (fits.from_pits, fits.from_objects, fits.from_albedo_patches):
+    none = AlbedoPatches.none(stack.shape[1:])
+    if start is None:
+        best, others = fits.from_steps(none), (fits.from_pits, fits.from_objects, fits.from_albedo_patches)
+    else:
+        best, others = fits.from_heights(start, none), (fits.from_albedo_patches,)
+    for other in others:
         if best.fit.is_interrupted:
             return best
         try:
@@ -97,9 +105,9 @@ def explain(
             found = other(best, residuals)
             if found is None:
                 continue
-            others = fits.residuals(found.fit)
-            is_less = fits.contradicted(others) < LESS_CONTRADICTED * fits.contradicted(residuals)
-            if is_less and improvement(residuals, others) > GAIN:
+            rest = fits.residuals(found.fit)
+            is_less = fits.contradicted(rest) < LESS_CONTRADICTED * fits.contradicted(residuals)
+            if is_less and improvement(residuals, rest) > GAIN:
                 best = found
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
@@ -153,6 +161,7 @@ class _Fits:
             scan_order(self.stack),
             patches=patches,
             anchors=anchors,
+            parallax=parallax_of(self.stack),
         )
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
@@ -247,6 +256,12 @@ class _Fits:
                 self.say(f"levels of measured steps are given up: {e}")
         fit = self.fitted(start, smoothed, patches, labels, anchors)
         return Explanation(fit, is_undecided, n_steps=0 if anchors is None else len(anchors.value))
+
+    def from_heights(self, height: np.ndarray, patches: AlbedoPatches) -> Explanation:
+        """Fit from given heights, whose levels are taken to be right [y, x], um."""
+        start = surface_of_heights(height, Raster.of(self.stack))
+        smoothed = Surface(*np.zeros((3, *height.shape)))
+        return Explanation(self.fitted(start, smoothed, patches), np.zeros(height.shape, bool))
 
     def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""

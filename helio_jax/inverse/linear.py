@@ -63,6 +63,18 @@ def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
     return counts / unit, variance / unit**2
 
 
+def parallax_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return how the signal changes per um of height above given heights, in units of the beam; None: one beam.
+
+    Returns:
+        The change [detector, y, x], 1/um, and the heights [y, x], um.
+    """
+    if stack.parallax is None or stack.parallax_height is None:
+        return None
+    unit = stack.n_rays or float(np.mean(np.abs(stack.signal[stack.is_observed])))
+    return np.where(stack.is_observed, stack.parallax, 0.0) / unit, stack.parallax_height
+
+
 def _weighted_solve(phi: np.ndarray, signal: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Solve the 3 x 3 normal equations of every pixel; returns rho n [y, x, 3]."""
     normal_matrix = np.einsum("kyx,kiyx,kjyx->yxij", weight, phi, phi)

@@ -58,6 +58,7 @@ def reconstruct_stack(
     make_predict: "Callable[[int], Predict] | None" = None,
     report: "Report | None" = None,
     trace: Trace | None = None,
+    start: np.ndarray | None = None,
 ) -> Reconstruction:
     """Reconstruct heights from three or more micrographs, and test them against these.
 
@@ -68,6 +69,7 @@ def reconstruct_stack(
             it, the other methods correct with it.
         report: called before each iteration of `refine`.
         trace: traces the finished map, for the verdict of the data (`verdict`); None: no verdict.
+        start: heights that `refine` starts from [y, x], um; default: the photometric solution.
 
     Raises:
         GuardError: fewer than 3 images, no pixel recorded in 3 of them, or a height that is not finite.
@@ -79,7 +81,7 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result, misfit_of = _refined(stack, settings, make_predict, report)
+        result, misfit_of = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)
         if not trace:
             return result
@@ -150,7 +152,7 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
+def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
     """Reconstruct by the fit; return what computes its misfit from a trace, too."""
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.fit import with_posterior
@@ -160,7 +162,7 @@ def _refined(stack, settings, make_predict, report) -> tuple[Reconstruction, Cal
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
-    found = explain(stack, settings, make_predict, report)
+    found = explain(stack, settings, make_predict, report, start)
     fit, is_floating = with_posterior(found.fit), found.is_undecided
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:

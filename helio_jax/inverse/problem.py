@@ -47,6 +47,9 @@ class FitProblem:
         median_signal: of every detector, 1 without data [detector].
         slope_noise: typical standard deviation of the slopes of one pixel.
         patches: parts of the surface of other albedo, which is unknown.
+        parallax: how the signal changes per um that the surface is higher than `parallax_height` [detector, y, x], 0
+            for one beam.
+        parallax_height: at which the images of several beams were read [y, x], um.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
@@ -67,6 +70,8 @@ class FitProblem:
     median_signal: np.ndarray
     slope_noise: float
     patches: AlbedoPatches
+    parallax: np.ndarray
+    parallax_height: np.ndarray
     instrument: Instrument | None = None
     stride: int = 1
 
@@ -84,10 +89,12 @@ class FitProblem:
         uncertainty: Uncertainty | None = None,
         patches: AlbedoPatches | None = None,
         anchors: Anchors | None = None,
+        parallax: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
-        `uncertainty` replaces the instrument's; optics alone are known exactly by default. Default of `patches`: none.
+        `uncertainty` replaces the instrument's; optics alone are known exactly by default. Default of `patches`: none;
+        of `parallax` (`parallax_of`): one beam.
         """
         given, optics = (None, instrument) if isinstance(instrument, Optics) else (instrument, Optics.of(instrument))
         stated = uncertainty or (Uncertainty() if given is None else given.uncertainty)
@@ -102,7 +109,7 @@ class FitProblem:
             signal, variance, optics, stated, raster, settings, order, is_held,
             is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
-            patches or AlbedoPatches.none(shape), given,
+            patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))), given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -237,6 +244,8 @@ class FitProblem:
             region=self.region[thin],
             patches=self.patches.thinned(thin),
             drift_modes=self.drift_modes[:, :, *thin],
+            parallax=self.parallax[:, *thin],
+            parallax_height=self.parallax_height[thin],
             stride=stride,
         )
 

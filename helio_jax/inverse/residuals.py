@@ -194,6 +194,7 @@ class FixedTerms(eqx.Module):
         noise_bias: from `second_order_noise_bias` [detector, y, x].
         modes: how corrections follow common changes of the heights.
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
+        parallax, parallax_height: as in `FitProblem`.
         position: (x, y) by which a tilt raises the border [2, y, x], um.
         edges: between pixels.
         border: prior weight of each height above the substrate [y, x], 1/um.
@@ -218,6 +219,8 @@ class FixedTerms(eqx.Module):
     noise_bias: Any
     modes: CommonModes
     drift_modes: Any
+    parallax: Any
+    parallax_height: Any
     position: Any
     edges: Edges
     border: Any
@@ -302,7 +305,9 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
     if parameters.patch.size:  # the first scattering of every order is by the own pixel
         signal = albedo_of_patches(parameters.patch, p.patch, fixed.patches) * signal
-    return readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)
+    read = readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)
+    # a higher point's data stand elsewhere in an oblique beam's image: linear within about a pixel
+    return read - fixed.parallax * jnp.clip(surface.height - fixed.parallax_height, -fixed.dx, fixed.dx)
 
 
 def second_order_noise_bias(

@@ -208,6 +208,8 @@ def freeze(
         noise_bias=pixels.noise_bias,
         modes=_common_modes(held, np.exp(priors.gain * state.parameters.log_gain)),
         drift_modes=problem.drift_modes,
+        parallax=problem.parallax,
+        parallax_height=problem.parallax_height,
         position=problem.position,
         edges=edges,
         border=problem.border,

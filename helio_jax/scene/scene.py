@@ -67,6 +67,8 @@ class Scene(Instrument):
         if top is not None and top >= self.sample_distance:
             problems.append(f"sample: {_too_high(top, self.sample_distance)}")
         problems += self.scan.view_problems(self.beam)
+        if self.instrument.has_several_beams:
+            problems.append("detector.beam_deg: an instrument of several scans cannot be simulated: simulate its scans")
         if self.plate.is_mesh and self.scan.rotations_deg and self.scan.rotate == "detectors":
             problems.append(
                 "scan.rotate = 'detectors': the detectors of a plate of kind 'mesh' do not rotate without it: rotate "

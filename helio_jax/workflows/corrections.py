@@ -80,9 +80,13 @@ def make_predictor(
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
     what is traced, by the cosine law.
 
+    Images of several beams are predicted beam by beam on the same surface, with masks by rays.
+
     Raises:
-        SceneError: radiosity is asked for below a scattering plate, which it does not know.
+        SceneError: radiosity is asked for below a scattering plate or for several beams, which it does not know.
     """
+    if stack.instrument.has_several_beams:
+        masks_by = "rays"
     if multiple == "radiosity" and stack.instrument.plate.is_scattering:
         raise SceneError(
             "reconstruct.refine.multiple = 'radiosity': it knows nothing of what a scattering plate sends back: "
@@ -92,12 +96,12 @@ def make_predictor(
     half = max(np.abs(stack.x).max(), np.abs(stack.y).max())
 
     @lru_cache(maxsize=1)
-    def prepared(given: str) -> tuple[Optics, _Raster]:
+    def prepared(given: str) -> tuple[Optics, list[tuple[_Raster, list[int]]]]:
         instrument = Instrument.model_validate_json(given).idealised()
         reach = half + _surroundings(instrument) if substrate_um is None else max(0.5 * substrate_um, 1.001 * half)
-        lift = LIFT_PIXELS * min(dx, dy)
-        raster = _Raster(instrument, *np.meshgrid(stack.x, stack.y), lift, reach, border == "flat")
-        return Optics.of(instrument), raster
+        about = *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat"
+        rasters = [(_Raster(i, instrument.beam_shift, *about), list(of_beam)) for i, of_beam in instrument.by_beam()]
+        return Optics.of(instrument), rasters
 
     def predict(
         height: np.ndarray,
@@ -106,15 +110,29 @@ def make_predictor(
         *,
         albedo: np.ndarray | None = None,
     ) -> Corrections:
-        optics, raster = prepared(instrument.model_dump_json())
+        optics, rasters = prepared(instrument.model_dump_json())
         surface = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2])
         if multiple == "radiosity":
-            plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * raster.reach)
+            plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * rasters[0][0].reach)
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
-        smooth, smooth_normals = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
+        smooth = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
+        found = [by_beam(raster, smooth, surface, normals, optics, albedo, len(rasters)) for raster, _ in rasters]
+        return found[0] if len(found) == 1 else _joined(found, [of_beam for _, of_beam in rasters])
+
+    def by_beam(
+        raster: _Raster,
+        denoised: tuple[np.ndarray, np.ndarray],
+        surface: Surface,
+        normals: np.ndarray,
+        optics: Optics,
+        albedo: np.ndarray | None,
+        n_beams: int,
+    ) -> Corrections:
+        """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
+        (smooth, smooth_normals), height = denoised, surface.height
         either_way = [raster.sides(smooth, smooth_normals, way) for way in raster.continuations]
-        sides, n_traced = either_way[0], len(either_way) * len(either_way[0])
+        sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
@@ -143,6 +161,15 @@ def make_predictor(
         return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals, surroundings)
 
     return predict
+
+
+def _joined(parts: list[Corrections], detectors: list[list[int]]) -> Corrections:
+    """Join the corrections of several beams, whose detectors these are; seen straight down nothing is occluded."""
+    order = np.argsort(np.concatenate(detectors))
+    masked, multiple = (np.concatenate([getattr(p, name) for p in parts])[order] for name in ("masked", "multiple"))
+    surroundings = [p.surroundings for p in parts if p.surroundings is not None]
+    around = np.concatenate(surroundings)[order] if surroundings else None
+    return Corrections(masked, multiple, None, parts[0].normals, around)
 
 
 def _mean(albedo: np.ndarray) -> float:
@@ -176,9 +203,14 @@ def _denoise_within_facets(height: np.ndarray, normals: np.ndarray, largest: flo
 
 @dataclass(frozen=True)
 class SurfaceHypothesis:
-    """A surface whose occluded side stands at one place: a point for every pixel, and the mesh through them."""
+    """A surface whose occluded side stands at one place: a point for every pixel, and the mesh through them.
+
+    `beam_x`, `beam_y` are the beam positions at which the points are illuminated [y, x], um.
+    """
 
     raster: "_Raster"
+    beam_x: np.ndarray
+    beam_y: np.ndarray
     points: Hits
     body: Body
     grid_shape: tuple[int, ...]
@@ -192,7 +224,7 @@ class SurfaceHypothesis:
         else:
             intersector, laws, own = self._with_albedo(albedo)
         experiment = make_experiment(intersector, r.instrument, settings, laws)
-        x, y = r.x.ravel(), r.y.ravel()
+        x, y = self.beam_x.ravel(), self.beam_y.ravel()
         try:
             tally = trace_pixels(experiment, x, y, settings.workers, first=self.points, max_lost=max_buried)
         except GuardError as e:
@@ -226,7 +258,7 @@ class SurfaceHypothesis:
     def masked(self, is_wanted: np.ndarray) -> np.ndarray:
         """Compute the masked vector form factor [detector, 3, y, x] where it is wanted [y, x], elsewhere 0."""
         r, p = self.raster, self.points.take(is_wanted.ravel())
-        offset = np.stack(r.instrument.sample_origin(r.x[is_wanted], r.y[is_wanted])[:2], -1)
+        offset = np.stack(r.instrument.sample_origin(self.beam_x[is_wanted], self.beam_y[is_wanted])[:2], -1)
         found, _ = masks.masked_form_factor(self.intersector, r.instrument, p.point, p.normal, p.surface, offset)
         out = np.zeros((len(found), 3, *is_wanted.shape))
         out[:, :, is_wanted] = np.moveaxis(found, -1, 1)
@@ -238,14 +270,17 @@ class _Raster:
     """Beam positions and surroundings of a scan.
 
     Attributes:
-        instrument: of the scan.
-        x, y: beam positions [y, x], um.
+        instrument: of the scan, of one beam.
+        view_shift: beam shift along which the raster sees the surface, of the scan's own beam or, where several scans
+            are joined, of another one.
+        x, y: positions on the raster [y, x], um.
         lift: how far off the surface the points are put, um.
         reach: half the side of the square that the surroundings fill, um.
         has_flat_surroundings: whether they are the flat z = 0; else the substrate, to which the border is continued.
     """
 
     instrument: Instrument
+    view_shift: tuple[float, float]
     x: np.ndarray
     y: np.ndarray
     lift: float
@@ -259,8 +294,8 @@ class _Raster:
 
     def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
         """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`."""
-        shift, normal = self.instrument.beam_shift, normals.reshape(-1, 3)
-        seen = at = *self.instrument.surface_position(self.x, self.y, height), height
+        shift, normal = self.view_shift, normals.reshape(-1, 3)
+        seen = at = self.surface(self.x, self.y, height)
         behind = occluded_vertices(*at, normals, shift, share)
         if self.has_flat_surroundings:
             body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
@@ -272,7 +307,17 @@ class _Raster:
             extended, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
             body = with_cavities(surface_body(*extended), extended, behind)
         point = np.stack(seen, -1).reshape(-1, 3) + self.lift * normal
-        return SurfaceHypothesis(self, Hits.on_mesh(point, normal), body, behind[0].shape, Intersector(body))
+        beam_x, beam_y = (
+            at + (own - view) * height
+            for at, own, view in zip((self.x, self.y), self.instrument.beam_shift, shift, strict=True)
+        )
+        return SurfaceHypothesis(
+            self, beam_x, beam_y, Hits.on_mesh(point, normal), body, behind[0].shape, Intersector(body)
+        )
+
+    def surface(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Grid:
+        """Compute the surface points of heights [y, x] that are seen at positions x, y of the raster [um]."""
+        return x - height * self.view_shift[0], y - height * self.view_shift[1], height
 
     def mirrored(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
         """Mirror a grid at the image's border; the occluded side of what is added stays on the sheet along the beam."""
@@ -282,7 +327,7 @@ class _Raster:
             *(p[0] + step * np.arange(-n, p.size + n) for p, step in ((self.x[0], dx), (self.y[:, 0], dy)))
         )
         z = mirror_border(at[2], (dy, dx), level, n)
-        wide = *self.instrument.surface_position(x, y, z), z
+        wide = self.surface(x, y, z)
         moved = wide[0].copy(), wide[1].copy(), z.copy()
         for field, inner in zip(moved, behind, strict=True):
             field[n:-n, n:-n] = inner
@@ -290,6 +335,6 @@ class _Raster:
 
     def sides(self, height: np.ndarray, normals: np.ndarray, way: str = "level") -> list[SurfaceHypothesis]:
         """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
-        at = *self.instrument.surface_position(self.x, self.y, height), height
-        is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.instrument.beam_shift, 1.0), at)
+        at = self.surface(self.x, self.y, height)
+        is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.view_shift, 1.0), at)
         return [self.side(height, normals, share, way) for share in ((0.0,) if is_fully_seen else OCCLUDED_NODES)]

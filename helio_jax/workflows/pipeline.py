@@ -1,4 +1,4 @@
-"""The main job: the only module that joins the stages. Everything here is also public as `helio_jax.NAME`."""
+"""The main job: simulate, calibrate, align, reconstruct, score, report."""
 
 import json
 from collections.abc import Callable
@@ -7,12 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from helio_jax.alignment.align import AlignSettings, align_scans
-from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.calibration.noise import add_noise
-from helio_jax.errors import GuardError, InputFileError, ResumeError, SceneError
+from helio_jax.errors import GuardError, ResumeError, SceneError
 from helio_jax.figures.before_after import save_before_after
 from helio_jax.figures.canvas import save_figure
 from helio_jax.figures.panel import panel
@@ -21,29 +18,21 @@ from helio_jax.formats.hdf5 import read_stack, write
 from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import read_points
 from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
-from helio_jax.forward.form_factor import substrate_signal
-from helio_jax.forward.optics import Optics
-from helio_jax.forward.render import Corrections
 from helio_jax.inverse.mask_steps import find_steps
-from helio_jax.inverse.methods import reconstruct_stack
-from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.measure.facets import Facets, find_facets
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scores.metrics import Scores, Truth, evaluate_height
 from helio_jax.trace.scan import Executor, trace_scene
-from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
-from helio_jax.workflows.corrections import make_predictor
-from helio_jax.workflows.provenance import this_run, with_provenance
+from helio_jax.workflows.heights import calibrate, reconstruct, reconstruct_scans
+from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.truth import true_height
 
 DEFAULT_EXECUTOR = Executor()
 """Threads of this process, one per CPU."""
-VERDICT_PATHS = 400_000
-"""Paths of the multiple scattering by which a finished height map is tested against its data."""
 MAX_FACET_PIXELS = 60_000
 """Pixels of a height map whose facets a report measures unasked: 2 s."""
 Stage = Callable[[str], Any]
@@ -194,28 +183,6 @@ def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
     return add_noise(stack, scene.noise) if scene.noise.enabled and stack.noise == "expected" else stack
 
 
-def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
-    """Bring a measured stack into units of the beam by its flat border.
-
-    Args:
-        stack: measured counts.
-        settings: default: the defaults of `CalibrateSettings`.
-        changes: settings that replace those, e.g. drift=False.
-
-    Raises:
-        SceneError: the stack is calibrated already, or its beam is known (simulated).
-        GuardError: a detector has no signal.
-    """
-    if stack.n_rays is not None:
-        raise SceneError(
-            f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
-            "calibrated already; calibrate the imported file itself"
-        )
-    return calibrate_on_border(
-        stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)
-    )
-
-
 def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> MicrographStack:
     """Calibrate the stack of a file into another one, and save a picture of before and after beside it (.png)."""
     picture = Path(output).with_suffix(".png")
@@ -225,23 +192,6 @@ def calibrate_file(path: str | Path, output: str | Path, **changes: Any) -> Micr
     write(after, output)
     save_before_after(before, after, picture)
     return after
-
-
-_LIMITS = "robust_limits", "jump_limits"
-"""Two settings of one schedule, of the same length: a user who sets one of them sets both."""
-
-
-def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
-    """Add the priors of the stack's calibration to changes of the settings, except where the user has set them."""
-    given = dict(changes.get("refine", {}))
-    priors = {} if stack.calibration is None else stack.calibration.priors
-    taken = settings.refine.model_fields_set | given.keys()
-    if taken & set(_LIMITS):
-        taken |= set(_LIMITS)
-    added = {key: value for key, value in priors.items() if key not in taken}
-    if not added and not given:
-        return changes
-    return changes | {"refine": settings.refine.model_dump() | added | given}
 
 
 def align(
@@ -255,57 +205,6 @@ def align(
     picks = read_points(points) if points is not None else None
     stack, found = align_scans(scans, picks, AlignSettings().changed(**changes), str(points or ""))
     return stack, {} if found.points is None else found.points.places
-
-
-def reconstruct(
-    stack: MicrographStack | MicrographSet,
-    method: str | None = None,
-    *,
-    settings: ReconstructSettings | None = None,
-    report: Callable[[int, int, str], None] | None = None,
-    workers: int | None = None,
-    **changes: Any,
-) -> Reconstruction:
-    """Turn micrographs into heights.
-
-    Args:
-        stack: three or more images on one raster.
-        method: "linear", "nearfield" or "refine"; default: the settings' own.
-        settings: table [reconstruct]; default: its defaults.
-        report: called before each round of the refinement with (round, rounds, what is known).
-        workers: threads that trace; default: one per CPU that this process may use.
-        changes: settings that replace those, e.g. integrator="dct_poisson".
-
-    Raises:
-        GuardError: too few images.
-        InputFileError: a set of several scans, which must be aligned first.
-    """
-    one = stack.only()
-    if one.positions is not None:
-        raise InputFileError(
-            f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
-        )
-    wanted = changes | ({"method": method} if method else {})
-    settings = settings or ReconstructSettings()
-    if one.noise == "measured" and one.n_rays is None:
-        is_fit = wanted.get("method", settings.method) == "refine"
-        one = calibrate(one) if one.alignment is None else calibrate_rotated(one, keeps_multiple=is_fit)
-    chosen = settings.changed(**_with_priors(settings, one, wanted))
-    refine = chosen.refine
-
-    def make_predict(n_rays: int) -> Callable[[np.ndarray, np.ndarray], Corrections]:
-        about = {"multiple": refine.multiple, "border": chosen.border, "workers": workers}
-        return make_predictor(one, n_rays, refine.substrate_um, **about)
-
-    known = {"border": chosen.border, "workers": workers, "masks_by": "rays"}
-    trace = make_predictor(one, VERDICT_PATHS, refine.substrate_um, **known)
-    rec = reconstruct_stack(one, chosen, make_predict, report, trace)
-    rec = replace(rec, provenance={**rec.provenance, **this_run()})
-    others = [f"{name} ({kind})" for name, kind in one.materials.items() if kind != "cosine"]
-    if not others:
-        return rec
-    law = f"NOT the cosine law, which heights assume, holds for {', '.join(others)}"
-    return replace(rec, warnings=(*rec.warnings, law))
 
 
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
@@ -389,6 +288,21 @@ class RunResult:
         }
 
 
+def _check_heights(scene: SceneFile, path: str | Path) -> None:
+    """Refuse a scan from which no heights can be made."""
+    scan = scene.scan
+    if scan.kind != "raster" or len(scan.sample_distances_um) > 1:
+        raise SceneError(
+            f"{path}: heights come from rasters at one distance, scan.kind is {scan.kind!r} with "
+            f"{max(1, len(scan.sample_distances_um))} distance(s): use helio simulate, which writes any scan"
+        )
+    if len(scan.rotations_deg) > 1 and (scan.rotate != "sample" or scan.about != "normal" or any(scan.axis_um)):
+        raise SceneError(
+            f"{path}: heights of several views need a sample that rotates about the plate normal at the raster's "
+            'origin: set scan.rotate = "sample", scan.about = "normal", scan.axis_um = [0, 0], or use helio simulate'
+        )
+
+
 def run(
     scene_path: str | Path,
     folder: str | Path | None = None,
@@ -419,11 +333,7 @@ def run(
         InterruptedRun, StoppedRun: stopped while tracing; what was finished is kept.
     """
     scene = load_scene(scene_path, overrides)
-    if scene.scan.kind != "raster" or scene.scan.n_views > 1:
-        raise SceneError(
-            f"{scene_path}: heights come from one raster, scan.kind is {scene.scan.kind!r} with {scene.scan.n_views} "
-            "view(s): use helio simulate, which writes any scan"
-        )
+    _check_heights(scene, scene_path)
     scene.apertures()  # heights need them: an error before anything is traced
     out = Path(folder) if folder else default_folder(scene)
     names = {label: name for label, name in RUN_FILES.items() if report or label not in ("report", "panel")}
@@ -433,9 +343,14 @@ def run(
     with stage("simulating micrographs") as progress:
         options = SimulateOptions(noise=True, executor=executor, restart=restart, progress=progress, say=say)
         stack = simulate_file(scene_path, files["micrographs"], overrides=overrides, options=options, verb="run")
-    assert isinstance(stack, MicrographStack)  # no shards here, and one view
+    assert stack is not None  # no shards here
     with stage("reconstructing heights") as progress:
-        rec = reconstruct(stack, settings=scene.reconstruct, report=progress, workers=executor.workers)
+        how: dict[str, Any] = {"settings": scene.reconstruct, "report": progress, "workers": executor.workers}
+        if isinstance(stack, MicrographSet):
+            rec, joined = reconstruct_scans(stack, **how)
+            stack = joined.stack
+        else:
+            rec = reconstruct(stack, **how)
     write(rec, files["height map"])
     with stage("scoring and reporting"):
         truth = true_height(scene, rec)

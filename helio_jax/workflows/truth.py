@@ -7,6 +7,7 @@ import numpy as np
 from helio_jax.errors import SceneError
 from helio_jax.formats.hdf5 import read_height
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
+from helio_jax.instrument import Beam
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres
@@ -21,18 +22,24 @@ SUBSTRATE_RATIO = 1.35
 
 
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
-    """Compute the true first hit of the beam axis for every pixel of a reconstruction's raster (see `true_surface`)."""
-    return true_surface(scene, rec.raster_x, rec.raster_y)
+    """Compute the true first hit for every pixel of a reconstruction's raster (see `true_surface`).
+
+    Along the beam, or along the direction from which the raster of several scans sees the sample.
+    """
+    seen = rec.instrument.beam
+    beam = scene.beam.changed(incidence_deg=seen.incidence_deg, azimuth_deg=seen.azimuth_deg)
+    return true_surface(scene, rec.raster_x, rec.raster_y, beam if rec.instrument.has_several_beams else None)
 
 
-def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray) -> Truth:
-    """Compute the true first hit of the beam axis for the beam positions x [x] and y [y], um.
+def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray, beam: Beam | None = None) -> Truth:
+    """Compute the true first hit of the axis of a beam (default: the scene's) for positions x [x] and y [y], um.
 
     Raises:
         SceneError: the beam misses the sample in some pixel.
     """
     grid_x, grid_y = np.meshgrid(x, y)
-    hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
+    instrument = scene.instrument.model_copy(update={"beam": beam}) if beam else scene.instrument
+    hits = first_hits(Intersector(scene.build_body()), instrument, grid_x.ravel(), grid_y.ravel())
     n_missed = int(np.sum(hits.surface == MISS))
     if n_missed:
         raise SceneError(f"the beam misses the sample in {n_missed} pixels: enlarge sample.size_um or reduce the scan")

@@ -49,7 +49,7 @@ from helio_jax.inverse import methods, responses  # noqa: E402
 from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
 from helio_jax.reconstruction import Reconstruction  # noqa: E402
 from helio_jax.workflows import calibrate_rotated as turned  # noqa: E402
-from helio_jax.workflows import pipeline  # noqa: E402
+from helio_jax.workflows import heights, pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import load_instrument, load_scene  # noqa: E402
 from tests import compilations  # noqa: E402
 
@@ -139,7 +139,7 @@ def reconstruct(stack: MicrographStack, case: Case) -> Reconstruction:
         # what made-up multiple scattering would fail: tests/inverse/test_verdict.py
         more.enter_context(mock.patch.object(methods, "judged", lambda rec, stack, residuals: rec))
         if case.is_made_up:
-            more.enter_context(mock.patch.object(pipeline, "make_predictor", predictor_of))
+            more.enter_context(mock.patch.object(heights, "make_predictor", predictor_of))
             more.enter_context(mock.patch.object(responses, "_multiple_change", no_change))
         return pipeline.reconstruct(stack, case.method, border=case.border, refine=FIT | case.refine)
 

@@ -1,0 +1,197 @@
+"""From micrographs to heights: calibration where it is missing, prediction, test of the result; one scan or several."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
+from helio_jax.errors import GuardError, InputFileError, SceneError
+from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.optics import Optics
+from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import Predict
+from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.reconstruction import Reconstruction
+from helio_jax.workflows.calibrate_rotated import calibrate_rotated
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.provenance import this_run
+from helio_jax.workflows.several_scans import JoinedScans, Motions, join_scans
+
+VERDICT_PATHS = 400_000
+"""Paths of the multiple scattering by which a finished height map is tested against its data."""
+MAX_FITS = 6
+"""Largest number of fits between which the images of several beams are read anew on the fitted surface."""
+FITTED = 0.1
+"""They end where the places change by less than this, root mean square [pixels]."""
+Report = Callable[[int, int, str], None]
+
+
+def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
+    """Bring a measured stack into units of the beam by its flat border.
+
+    Args:
+        stack: measured counts.
+        settings: default: the defaults of `CalibrateSettings`.
+        changes: settings that replace those, e.g. drift=False.
+
+    Raises:
+        SceneError: the stack is calibrated already, or its beam is known (simulated).
+        GuardError: a detector has no signal.
+    """
+    if stack.n_rays is not None:
+        raise SceneError(
+            f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
+            "calibrated already; calibrate the imported file itself"
+        )
+    return calibrate_on_border(
+        stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)
+    )
+
+
+_LIMITS = "robust_limits", "jump_limits"
+"""Two settings of one schedule, of the same length: a user who sets one of them sets both."""
+
+
+def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes: dict[str, Any]) -> dict[str, Any]:
+    """Add the priors of the stack's calibration to changes of the settings, except where the user has set them."""
+    given = dict(changes.get("refine", {}))
+    priors = {} if stack.calibration is None else stack.calibration.priors
+    taken = settings.refine.model_fields_set | given.keys()
+    if taken & set(_LIMITS):
+        taken |= set(_LIMITS)
+    added = {key: value for key, value in priors.items() if key not in taken}
+    if not added and not given:
+        return changes
+    return changes | {"refine": settings.refine.model_dump() | added | given}
+
+
+def reconstruct(
+    stack: MicrographStack | MicrographSet,
+    method: str | None = None,
+    *,
+    settings: ReconstructSettings | None = None,
+    motions: Motions = "stage",
+    report: Report | None = None,
+    workers: int | None = None,
+    **changes: Any,
+) -> Reconstruction:
+    """Turn micrographs into heights.
+
+    Args:
+        stack: three or more images on one raster; or a set of scans of one sample, with three or more images in all,
+            from which one surface is made (`reconstruct_scans`).
+        method: "linear", "nearfield" or "refine"; default: the settings' own.
+        settings: table [reconstruct]; default: its defaults.
+        motions: of the sample between the scans of a set: as the "stage" states them, or "fitted" from there on.
+        report: called before each round of the refinement with (round, rounds, what is known).
+        workers: threads that trace; default: one per CPU that this process may use.
+        changes: settings that replace those, e.g. integrator="dct_poisson".
+
+    Raises:
+        GuardError: too few images; the linear method, where the beams of several scans are oblique.
+        InputFileError: a list of positions; scans that must be aligned or calibrated first.
+    """
+    wanted = changes | ({"method": method} if method else {})
+    settings = settings or ReconstructSettings()
+    if len(stack.stacks) > 1:
+        chosen = settings.changed(**_with_priors(settings, stack.stacks[0], wanted))
+        scans = MicrographSet(stack.stacks)
+        return reconstruct_scans(scans, settings=chosen, motions=motions, report=report, workers=workers)[0]
+    one = stack.only()
+    if one.positions is not None:
+        raise InputFileError(
+            f"{one.name}: heights need a raster, this scan is a list of {len(one.positions)} positions"
+        )
+    if one.noise == "measured" and one.n_rays is None:
+        is_fit = wanted.get("method", settings.method) == "refine"
+        one = calibrate(one) if one.alignment is None else calibrate_rotated(one, keeps_multiple=is_fit)
+    chosen = settings.changed(**_with_priors(settings, one, wanted))
+    return _Reconstructing(chosen, workers).finish(one, report)
+
+
+def reconstruct_scans(
+    scans: MicrographSet,
+    *,
+    settings: ReconstructSettings | None = None,
+    motions: Motions = "stage",
+    report: Report | None = None,
+    workers: int | None = None,
+) -> tuple[Reconstruction, JoinedScans]:
+    """Make one surface of several scans of a sample, rotated between them: what one beam does not see others do.
+
+    Heights belong to x, y of the sample frame, seen straight down (the frame of an unrotated sample). With oblique
+    beams images are read anew on every fitted surface until their places stay (`join_scans`).
+
+    Args:
+        scans: two or more, of one plate at one distance; simulated or calibrated.
+        settings, motions, report, workers: as in `reconstruct`.
+
+    Returns:
+        The heights, and the scans as they were joined at the end; `stack` holds the images that the heights explain.
+
+    Raises:
+        GuardError: too few images; the linear method, where beams are oblique.
+        InputFileError: measured scans that are not aligned (normal incidence) or not calibrated; other distances.
+    """
+    chosen = settings or ReconstructSettings()
+    is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
+    for scan in scans.stacks:
+        if scan.noise == "measured" and not is_oblique:
+            scans.only()  # says that they must be aligned
+        if scan.noise == "measured" and scan.n_rays is None:
+            raise InputFileError(f"{scan.name}: calibrate measured scans before they are joined (helio calibrate)")
+    if is_oblique and chosen.method == "linear":
+        tilt = max(s.instrument.beam.incidence_deg for s in scans.stacks)
+        raise GuardError(
+            "method 'linear' takes a pixel for one point of the sample in all images, which holds for rotations about "
+            "the beam; these samples were rotated about the plate's normal under a beam at "
+            f"{tilt:g} deg, where heights move pixels: use method nearfield or refine"
+        )
+    say = (lambda text: report(0, MAX_FITS, text)) if report else (lambda text: None)
+    joined = join_scans(scans, chosen, motions=motions, say=say)
+    work = _Reconstructing(chosen, workers)
+    if is_oblique and chosen.method == "refine":
+        for number in range(1, MAX_FITS):
+            height = work.fit(joined.stack, report).height
+            joined = joined.on(scans, height, number)
+            if joined.change < FITTED:
+                break
+    rec = work.finish(joined.stack, report)
+    return replace(rec, warnings=(*rec.warnings, *joined.warnings)), joined
+
+
+@dataclass(frozen=True)
+class _Reconstructing:
+    """How stacks become heights: settings, and threads that trace."""
+
+    settings: ReconstructSettings
+    workers: int | None
+
+    def fit(self, stack: MicrographStack, report: Report | None) -> Reconstruction:
+        """Reconstruct without error bars or a test of the result."""
+        refine = self.settings.refine.model_copy(update={"samples": 0})
+        quick = self.settings.model_copy(update={"refine": refine})
+        return reconstruct_stack(stack, quick, self._make_predict(stack), report, start=stack.parallax_height)
+
+    def finish(self, stack: MicrographStack, report: Report | None) -> Reconstruction:
+        """Reconstruct with error bars, and test the result against the data."""
+        known = {"border": self.settings.border, "workers": self.workers, "masks_by": "rays"}
+        trace = make_predictor(stack, VERDICT_PATHS, self.settings.refine.substrate_um, **known)
+        make_predict = self._make_predict(stack)
+        rec = reconstruct_stack(stack, self.settings, make_predict, report, trace, stack.parallax_height)
+        rec = replace(rec, provenance={**rec.provenance, **this_run()})
+        others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind != "cosine"]
+        if not others:
+            return rec
+        law = f"NOT the cosine law, which heights assume, holds for {', '.join(others)}"
+        return replace(rec, warnings=(*rec.warnings, law))
+
+    def _make_predict(self, stack: MicrographStack) -> Callable[[int], Predict]:
+        refine = self.settings.refine
+
+        def make_predict(n_rays: int) -> Predict:
+            about = {"multiple": refine.multiple, "border": self.settings.border, "workers": self.workers}
+            return make_predictor(stack, n_rays, refine.substrate_um, **about)
+
+        return make_predict

@@ -1,0 +1,210 @@
+"""One surface from several scans of a sample: other rotations or beams, one plate and distance.
+
+The surface is a height for every x, y of the sample frame, seen straight down. Each scan's images are read where its
+own beam meets the current surface, so that a point's place in oblique scans tells its height, too; what one beam
+shadows another one sees. Heights and places are found in turn. At normal incidence heights move no pixel: one turn.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+
+from helio_jax.alignment.correction import correct_motion
+from helio_jax.alignment.resample import common_raster, resample
+from helio_jax.alignment.rigid import Rigid
+from helio_jax.arrays import pitch
+from helio_jax.errors import InputFileError
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import single_scattering
+from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_linear
+from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.measure.sample_grid import resample_heights
+from helio_jax.micrograph import MicrographSet, MicrographStack
+
+MAX_TURNS = 30
+"""Largest number of turns between heights and places."""
+SETTLED = 0.05
+"""The turns end where places change by less than this, root mean square [pixels]."""
+FIRST_SMOOTHING, LAST_SMOOTHING, FALL = 3.0, 1.0, 0.8
+"""Fitted motions: smoothing of the images in the first turn, the least one [pixels], its factor from turn to turn."""
+UNSETTLED = 0.2
+"""A larger change in the last turn is warned of [pixels]."""
+DAMPING = 0.6
+"""Share of the way to the new heights: on steep flanks undamped turns oscillate."""
+Motions = Literal["stage", "fitted"]
+
+
+@dataclass(frozen=True)
+class JoinedScans:
+    """Several scans on one raster of the sample frame.
+
+    Attributes:
+        stack: their images; the detectors of all scans one after the other.
+        motions: of each scan, from the common frame.
+        motion_std: standard deviation of a pixel's place by each motion [um]; 0 where the stage is taken at its word.
+        turns: how often heights and places were found.
+        change: of the places in the last turn, root mean square [pixels].
+    """
+
+    stack: MicrographStack
+    motions: tuple[Rigid, ...]
+    motion_std: tuple[float, ...]
+    turns: int
+    change: float
+
+    def on(self, scans: MicrographSet, height: np.ndarray, turns: int) -> "JoinedScans":
+        """Read the images anew on other heights [y, x], um, found in so many turns."""
+        stack = resample(scans, self.motions, "reference", self.motion_std, height)
+        return replace(self, stack=stack, turns=turns, change=_moved(scans, height - self.stack.parallax_height))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before heights of the stack are trusted."""
+        if self.change < UNSETTLED:
+            return ()
+        return (
+            f"the scans' places on the surface have not settled in {self.turns} turns: the last one moved them by "
+            f"{self.change:.2f} pixels (limit {UNSETTLED:g})",
+        )
+
+
+def stage_motions(scans: MicrographSet) -> tuple[Rigid, ...]:
+    """Return the motions that the stage states: the samples' rotations about the raster's origin."""
+    return tuple(Rigid(s.sample_rotation, (0.0, 0.0)) for s in scans.stacks)
+
+
+def join_scans(
+    scans: MicrographSet,
+    settings: ReconstructSettings | None = None,
+    *,
+    motions: Motions | tuple[Rigid, ...] = "stage",
+    say: Callable[[str], None] = lambda text: None,
+) -> JoinedScans:
+    """Bring scans of one sample onto one raster of the sample frame, by heights of the photometric method.
+
+    Args:
+        scans: two or more, of one plate at one distance, three or more images in all; calibrated or simulated.
+        settings: of the reconstruction: border, integrator.
+        motions: rotations and shifts of the sample from scan to scan: "stage": as the files state them; "fitted": from
+            there on, by the images (the first scan stays); or given.
+        say: called with what was done.
+
+    Raises:
+        InputFileError: scans of different distances, or a list of positions.
+    """
+    _check(scans)
+    scans = _comparable(scans)
+    found = stage_motions(scans) if isinstance(motions, str) else motions
+    std = (0.0,) * len(found)
+    raster = common_raster(scans.stacks, found, "reference")
+    is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
+    if not is_oblique and motions != "fitted":
+        return JoinedScans(resample(scans, found, "reference"), found, std, 1, 0.0)
+    quick = (settings or ReconstructSettings()).changed(method="nearfield", samples=0)
+    height = _first_heights(scans, found, quick, *raster)
+    for turn in range(1, MAX_TURNS + 1):
+        moved = 0.0
+        if motions == "fitted":
+            joined = resample(scans, found, "reference", height=height)
+            smoothing = max(LAST_SMOOTHING, FIRST_SMOOTHING * FALL ** (turn - 1))
+            found, std, moved = _corrected_motions(scans, joined, found, height, smoothing)
+        before, joined = height, resample(scans, found, "reference", std, height)
+        height = before + DAMPING * (reconstruct_stack(joined, quick).height - before)
+        change = float(np.hypot(moved, _moved(scans, height - before)))
+        say(f"turn {turn}: places on the surface changed by {change:.2f} pixels")
+        if change < SETTLED and (motions != "fitted" or smoothing == LAST_SMOOTHING):
+            break
+    return JoinedScans(resample(scans, found, "reference", std, height), found, std, turn, change)
+
+
+def _moved(scans: MicrographSet, change: np.ndarray) -> float:
+    """Compute by how much changed heights move places in the most oblique scan, root mean square [pixels]."""
+    tan = max(float(np.hypot(*s.instrument.beam_shift)) for s in scans.stacks)
+    return tan * float(np.sqrt(np.mean(change**2))) / pitch(scans.stacks[0].x)
+
+
+def _first_heights(
+    scans: MicrographSet, motions: tuple[Rigid, ...], settings: ReconstructSettings, x: np.ndarray, y: np.ndarray
+) -> np.ndarray:
+    """Start from what each scan of three or more images shows alone, mean of all; without such scans from a flat."""
+    points, found = np.stack(np.meshgrid(x, y), -1), []
+    for stack, motion in zip(scans.stacks, motions, strict=True):
+        if stack.shape[0] < MIN_IMAGES:
+            continue
+        seen = resample_heights(reconstruct_stack(stack, settings), pitch(x), use_all=True)
+        at = motion.apply(points)
+        place = [(at[..., 1] - seen.y[0]) / pitch(seen.y), (at[..., 0] - seen.x[0]) / pitch(seen.x)]
+        found.append(ndimage.map_coordinates(seen.height, place, order=1, cval=np.nan))
+    if not found:
+        return np.zeros(points.shape[:2])
+    is_seen = np.isfinite(found)
+    return np.where(is_seen, found, 0.0).sum(0) / np.maximum(is_seen.sum(0), 1)
+
+
+def _corrected_motions(
+    scans: MicrographSet,
+    joined: MicrographStack,
+    motions: tuple[Rigid, ...],
+    height: np.ndarray,
+    smoothing: float,
+) -> tuple[tuple[Rigid, ...], tuple[float, ...], float]:
+    """Correct every motion by what the other scans predict (all, where others have too few images).
+
+    The first scan's motion stays: where it disagrees with the others, the common frame is moved.
+
+    Returns:
+        The motions, the standard deviation of a pixel's place by each [um], and by how much the largest correction
+        moves places [pixels].
+    """
+    signal, variance = signal_of(joined)
+    phi = form_factor(Optics.of(joined.instrument), height)
+    number = np.repeat(np.arange(len(scans.stacks)), [s.shape[0] for s in scans.stacks])
+    corrections, std, moved = [], [], 0.0
+    for scan in range(len(scans.stacks)):
+        own = number == scan
+        used = ~own if np.sum(~own) >= MIN_IMAGES else np.ones(len(own), bool)
+        solution = solve_linear(signal[used], variance[used], phi[used])
+        predicted = single_scattering(phi[own], np.moveaxis(solution.albedo[..., None] * solution.normals, -1, 0))
+        is_known = joined.is_observed[own] & (joined.is_observed[used].sum(0) >= MIN_IMAGES) & np.isfinite(predicted)
+        correction, shift, place = correct_motion(signal[own], predicted, is_known, joined.x, joined.y, smoothing)
+        corrections.append(correction)
+        std.append(place)
+        moved = max(moved, shift / pitch(joined.x))
+    frame = corrections[0].inverse()
+    found = tuple(m.after(c.after(frame)) for m, c in zip(motions, corrections, strict=True))
+    return found, tuple(std), moved
+
+
+def _comparable(scans: MicrographSet) -> MicrographSet:
+    """Bring the counts of all scans to the first one's number of beam atoms, where it is known; give each a name."""
+    dose, names = scans.stacks[0].n_rays, [s.name for s in scans.stacks]
+    out = []
+    for number, s in enumerate(scans.stacks, 1):
+        if len(set(names)) < len(names):
+            s = s.replace(name=f"{number} {s.name}")
+        factor = dose / s.n_rays if dose and s.n_rays else 1.0
+        background = None if s.background is None else factor * s.background
+        variance = None if s.variance is None else factor**2 * s.variance
+        scaled = s.replace(counts=factor * s.counts, variance=variance, background=background, n_rays=dose)
+        out.append(s if factor == 1.0 else scaled)
+    return MicrographSet(tuple(out))
+
+
+def _check(scans: MicrographSet) -> None:
+    """Refuse scans that one surface below one plate cannot explain."""
+    first = scans.stacks[0]
+    for stack in scans.stacks:
+        if stack.positions is not None:
+            raise InputFileError(f"{stack.name}: heights need rasters, this scan is a list of positions: leave it out")
+        for name in ("sample_distance", "working_distance"):
+            a, b = getattr(first.instrument, name), getattr(stack.instrument, name)
+            if not np.isclose(a, b):
+                raise InputFileError(
+                    f"scans {first.name!r} and {stack.name!r} must have one {name.replace('_', ' ')}, got {a:g} and "
+                    f"{b:g} um: reconstruct them one by one"
+                )

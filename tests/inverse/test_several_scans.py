@@ -1,0 +1,170 @@
+"""One surface from several scans: geometry in closed form, then heights of traced scans at 45 degrees."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import helio_jax as hx
+from helio_jax.alignment.correction import correct_motion
+from helio_jax.alignment.resample import is_lit, joined_instrument, resample
+from helio_jax.alignment.rigid import Rigid
+from helio_jax.errors import GuardError, InputFileError
+from helio_jax.forward.form_factor import form_factor
+from helio_jax.instrument import Instrument
+from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.workflows import several_scans
+from helio_jax.workflows.scene_file import load_instrument, load_scene
+from helio_jax.workflows.truth import true_surface
+
+TURNS_DEG = 0.0, 72.0, 144.0, 216.0, 288.0
+
+
+def make_scan(instrument: Instrument, turn_deg: float, counts=None, n: int = 21, step: float = 20.0) -> MicrographStack:
+    axis = step * (np.arange(n) - 0.5 * (n - 1))
+    counts = np.ones((len(instrument.detector), n, n)) if counts is None else counts
+    return MicrographStack(
+        counts, axis, axis, instrument, n_rays=1.0, sample_rotation=math.radians(turn_deg), name=f"at {turn_deg:g}"
+    )
+
+
+def rotated(vectors: np.ndarray, angle: float) -> np.ndarray:
+    """Rotate x, y of vectors [detector, 3, ...] counter-clockwise."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]], 1)
+
+
+@pytest.mark.parametrize("drop", [0.0, 150.0])
+def test_joined_instrument_sees_each_point_as_its_own_scan_does(drop):
+    """The form factors of joined scans are those of the scans, turned back, at every height.
+
+    Catches: a rotation of the wrong sense, the beam's azimuth left in the scan's frame, the spot of the wrong beam.
+    """
+    one = load_instrument("bshem_wd4")
+    one = one.at_distance(one.working_distance + drop)
+    scans = tuple(make_scan(one, turn) for turn in (0.0, 50.0))
+    motions = tuple(Rigid(s.sample_rotation, (0.0, 0.0)) for s in scans)
+    joined, height = joined_instrument(scans, motions), np.array([-30.0, 0.0, 200.0])
+    found = form_factor(hx.Optics.of(joined), height)
+    own = form_factor(hx.Optics.of(one), height)
+    turned = rotated(own, -math.radians(50.0))
+    np.testing.assert_allclose(found, np.concatenate([own, turned]), rtol=1e-9, atol=1e-12)
+    assert joined.beam_shift == (0.0, 0.0) and joined.has_several_beams
+    parts = joined.by_beam()
+    assert [of_beam for _, of_beam in parts] == [(0, 1, 2), (3, 4, 5)]
+    assert parts[0][0].beam.incidence_deg == one.beam.incidence_deg and not parts[0][0].has_several_beams
+
+
+def test_optics_of_several_beams_move_and_refuse_one_raster_frame():
+    """Turning the beam turns that of every scan; the raster's own view stays. Catches a beam that is left behind."""
+    one = load_instrument("ashem_45")
+    scans = tuple(make_scan(one, turn) for turn in (0.0, 90.0))
+    optics = hx.Optics.of(joined_instrument(scans, several_scans.stage_motions(MicrographSet(scans))))
+    moved = optics.moved(incidence=math.radians(5.0))
+    np.testing.assert_allclose(np.hypot(*np.asarray(moved.beam_shifts).T), math.tan(math.radians(50.0)))
+    np.testing.assert_allclose(moved.beam_shift, 0.0)
+
+
+def test_shadow_has_the_length_of_geometry():
+    """Behind a block of height h a beam at incidence t leaves h tan t unlit, on the far side only."""
+    x = 10.0 * np.arange(60)
+    height = np.zeros((20, 60))
+    height[:, 20:30] = 80.0
+    lit = is_lit(height, x, x[:20], np.array([math.tan(math.radians(45.0)), 0.0]))
+    shadow = np.flatnonzero(~lit[10])
+    assert shadow.min() == 29 and abs(shadow.max() - 37) <= 1  # the pixel beside counts as shadowed, too
+    assert is_lit(height, x, x[:20], np.zeros(2)).all()
+
+
+def test_images_are_read_where_each_beam_meets_the_surface():
+    """A scan whose image is its beam position's x gives x + h tan t, and 0.5 / um for a slope of 0.5 per um of place.
+
+    Catches: parallax of the wrong sign, in the wrong frame, or per pixel instead of per um.
+    """
+    one = load_instrument("ashem_45")
+    x = 20.0 * (np.arange(41) - 20)
+    image = np.broadcast_to(0.5 * x + 1000.0, (1, 41, 41))
+    scans = MicrographSet((make_scan(one, 0.0, image, 41), make_scan(one, 180.0, image, 41)))
+    height = np.full((41, 41), 40.0)
+    joined = resample(scans, several_scans.stage_motions(scans), "reference", height=height)
+    middle = joined.counts[:, 20, 10:30] - 1000.0
+    np.testing.assert_allclose(middle[0], 0.5 * (x[10:30] + 40.0), atol=1e-6)
+    np.testing.assert_allclose(middle[1], 0.5 * (-x[10:30] + 40.0), atol=1e-6)
+    np.testing.assert_allclose(joined.parallax[:, 20, 10:30], 0.5, rtol=1e-4)
+
+
+def test_correction_finds_a_rigid_motion():
+    """A rotation of 0.5 deg and a shift of a third of a pixel are found to 10 % in one step, in images of another gain."""
+    x = 10.0 * (np.arange(80) - 39.5)
+    rng = np.random.default_rng(3)
+    waves = [(rng.normal(0, 0.03, 2), rng.uniform(0, 6)) for _ in range(8)]
+    scene = lambda points: 5.0 + sum(np.sin(points @ k + phase) for k, phase in waves)  # noqa: E731
+    points = np.stack(np.meshgrid(x, x), -1)
+    error = Rigid(math.radians(0.5), (3.0, -2.0))
+    images = 1.1 * scene(error.inverse().apply(points))[None]
+    predicted = scene(points)[None]
+    known = np.ones(images.shape, bool)
+    found, moved, std = correct_motion(images, predicted, known, x, x, 1.0)
+    assert math.isclose(found.rotation_deg, 0.5, rel_tol=0.1)
+    np.testing.assert_allclose(found.shift, error.shift, atol=0.3)
+    assert 3.0 < moved < 6.0 and std < 0.2
+
+
+@pytest.fixture(scope="module")
+def crystal(tmp_path_factory) -> tuple[MicrographSet, np.ndarray]:
+    """Five scans of a low pyramid by one detector at 45 degrees, and its true heights seen straight down."""
+    path = Path(tmp_path_factory.mktemp("crystal")) / "crystal.toml"
+    path.write_text(
+        'extends = "ashem_45"\nname = "crystal"\n[plate]\nsample_distance_um = 2200.0\n'
+        '[sample]\nkind = "pyramid"\nbase_um = 700.0\ntop_um = 300.0\nheight_um = 100.0\nazimuth_deg = 20.0\n'
+        '[scan]\nnx = 41\nny = 41\npixel_size_um = 30.0\npitch = "sample"\nrotations_deg = [0, 72, 144, 216, 288]\n'
+        "[trace]\nrays = 128\n"
+    )
+    scene = load_scene(path)
+    scans = hx.simulate(scene)
+    assert isinstance(scans, MicrographSet)
+    down = scene.beam.changed(incidence_deg=0.0)
+    return scans, true_surface(scene, scans.stacks[0].x, scans.stacks[0].y, down).height
+
+
+def relative_rms(height: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((height - truth) ** 2)) / truth.max())
+
+
+def test_one_detector_at_45_degrees_gives_heights(crystal):
+    """Five rotations about the plate normal under an oblique beam: 2 % of the height, where reading all images at the
+    substrate's places, as for rotations about the beam, is off by more than 3 %. The linear method refuses.
+    """
+    scans, truth = crystal
+    joined = several_scans.join_scans(scans)
+    assert joined.change < several_scans.SETTLED and joined.stack.instrument.has_several_beams
+    assert relative_rms(joined.stack.parallax_height, truth) < 0.02
+    flat = resample(scans, joined.motions, "reference", height=np.zeros(truth.shape))
+    rec = hx.reconstruct(flat.replace(parallax=None, parallax_height=None), "nearfield", samples=0)
+    assert relative_rms(rec.height, truth) > 0.03
+    with pytest.raises(GuardError, match="rotated about the plate's normal under a beam at 45 deg"):
+        hx.reconstruct(scans, "linear")
+
+
+def test_fitted_motions_return_to_the_true_ones(crystal, monkeypatch):
+    """Scans displaced by 1 to 2 pixels come back to within 0.4 pixels, and the heights to 2.5 %."""
+    scans, truth = crystal
+    true = several_scans.stage_motions(scans)
+    errors = np.random.default_rng(5).normal(0.0, 40.0, (5, 2)) * (np.arange(5) > 0)[:, None]
+    wrong = tuple(Rigid(m.rotation, (float(a), float(b))) for m, (a, b) in zip(true, errors, strict=True))
+    monkeypatch.setattr(several_scans, "stage_motions", lambda _: wrong)
+    joined = several_scans.join_scans(scans, motions="fitted")
+    off = [np.hypot(*np.subtract(m.shift, t.shift)) for m, t in zip(joined.motions, true, strict=True)]
+    assert max(off) < 12.0 < np.hypot(*errors.T).max()
+    assert relative_rms(joined.stack.parallax_height, truth) < 0.025
+
+
+def test_scans_that_one_surface_cannot_explain_are_refused():
+    one = load_instrument("ashem_45")
+    far = make_scan(one.at_distance(one.sample_distance + 100.0), 90.0)
+    with pytest.raises(InputFileError, match="must have one sample distance, got 2100 and 2200 um"):
+        several_scans.join_scans(MicrographSet((make_scan(one, 0.0), far)))
+    measured = make_scan(one, 0.0).replace(noise="measured", n_rays=None)
+    with pytest.raises(InputFileError, match="calibrate measured scans before they are joined"):
+        hx.reconstruct(MicrographSet((measured, measured)))
