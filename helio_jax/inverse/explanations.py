@@ -259,7 +259,8 @@ class _Fits:
 
     def from_heights(self, height: np.ndarray, patches: AlbedoPatches) -> Explanation:
         """Fit from given heights, whose levels are taken to be right [y, x], um."""
-        start = surface_of_heights(height, Raster.of(self.stack))
+        with jax.enable_x64(True):
+            start = jax.tree.map(np.asarray, surface_of_heights(height, Raster.of(self.stack)))
         smoothed = Surface(*np.zeros((3, *height.shape)))
         return Explanation(self.fitted(start, smoothed, patches), np.zeros(height.shape, bool))
 

@@ -199,6 +199,9 @@ def _check(scans: MicrographSet) -> None:
     """Refuse scans that one surface below one plate cannot explain."""
     first = scans.stacks[0]
     for stack in scans.stacks:
+        if min(stack.shape[1:]) < 2:
+            size = " x ".join(map(str, stack.shape[1:]))
+            raise InputFileError(f"heights need rasters of 2 x 2 or more pixels, scan {stack.name!r} has {size}")
         if stack.positions is not None:
             raise InputFileError(f"{stack.name}: heights need rasters, this scan is a list of positions: leave it out")
         for name in ("sample_distance", "working_distance"):

@@ -1,6 +1,8 @@
 """One surface from several scans: geometry in closed form, then heights of traced scans at 45 degrees."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.instrument import Instrument
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.workflows import several_scans
 from helio_jax.workflows.scene_file import load_instrument, load_scene
@@ -95,7 +98,7 @@ def test_images_are_read_where_each_beam_meets_the_surface():
 
 
 def test_correction_finds_a_rigid_motion():
-    """A rotation of 0.5 deg and a shift of a third of a pixel are found to 10 % in one step, in images of another gain."""
+    """A rotation of 0.5 deg and a shift of a third of a pixel are found to 10 % in one step, whatever the gain."""
     x = 10.0 * (np.arange(80) - 39.5)
     rng = np.random.default_rng(3)
     waves = [(rng.normal(0, 0.03, 2), rng.uniform(0, 6)) for _ in range(8)]
@@ -158,6 +161,24 @@ def test_fitted_motions_return_to_the_true_ones(crystal, monkeypatch):
     off = [np.hypot(*np.subtract(m.shift, t.shift)) for m, t in zip(joined.motions, true, strict=True)]
     assert max(off) < 12.0 < np.hypot(*errors.T).max()
     assert relative_rms(joined.stack.parallax_height, truth) < 0.025
+
+
+def test_command_joins_the_scans_of_several_files(crystal, tmp_path):
+    """helio reconstruct of two files is hx.reconstruct of their scans; the joined images belong to the heights."""
+    scans, _ = crystal
+    hx.write(MicrographSet(scans.stacks[:3]), tmp_path / "a.h5")
+    hx.write(MicrographSet(scans.stacks[3:]), tmp_path / "b.h5")
+    command = ["reconstruct", "a.h5", "b.h5", "-o", "height.h5", "--method", "nearfield", "--write-joined", "joined.h5"]
+    done = subprocess.run(
+        [sys.executable, "-m", "helio_jax", *command], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rec, joined = hx.read(tmp_path / "height.h5"), hx.read(tmp_path / "joined.h5")
+    wanted, parts = hx.reconstruct_scans(scans, settings=ReconstructSettings(method="nearfield"))
+    np.testing.assert_allclose(rec.height, wanted.height, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(joined.counts, parts.stack.counts)
+    np.testing.assert_allclose(joined.parallax, parts.stack.parallax)
+    assert rec.instrument.has_several_beams and rec.instrument.beam.incidence_deg == 0.0
 
 
 def test_scans_that_one_surface_cannot_explain_are_refused():

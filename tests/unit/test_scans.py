@@ -212,6 +212,14 @@ def test_wrong_files_and_uses_say_so(tmp_path):
         simulate(scene_of(tmp_path, FLAT, "kind = 'list'\nfile = 'points.csv'\n"))
     with pytest.raises(SceneError, match="in the view '100 um' the sample's top at 300 um touches the plate"):
         simulate(scene_of(tmp_path, CAP, ONE + "sample_distances_um = [4000.0, 100.0]\n"))
+    wanted = {
+        "sample_distances_um = [5000.0, 6000.0]": "heights come from rasters at one distance",
+        "rotations_deg = [0.0, 90.0]\nrotate = 'detectors'": "need a sample that rotates about the plate normal",
+    }
+    for scan, message in wanted.items():
+        scene_of(tmp_path, CAP, ONE + scan + "\n")
+        with pytest.raises(SceneError, match=message):
+            run(tmp_path / "scene.toml", tmp_path / "out")
     scene_of(tmp_path, CAP, ONE + "rotations_deg = [0.0, 90.0]\n")
-    with pytest.raises(SceneError, match="heights come from one raster"):
+    with pytest.raises(InputFileError, match="need rasters of 2 x 2 or more pixels, .* has 1 x 1"):
         run(tmp_path / "scene.toml", tmp_path / "out")
