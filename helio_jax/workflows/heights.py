@@ -8,6 +8,7 @@ from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
+from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict
@@ -16,7 +17,7 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import this_run
-from helio_jax.workflows.several_scans import JoinedScans, Motions, join_scans
+from helio_jax.workflows.several_scans import JoinedScans, Motions, join_scans, merged_heights
 
 VERDICT_PATHS = 400_000
 """Paths of the multiple scattering by which a finished height map is tested against its data."""
@@ -152,6 +153,8 @@ def reconstruct_scans(
     joined = join_scans(scans, chosen, motions=motions, say=say)
     work = _Reconstructing(chosen, workers)
     if is_oblique and chosen.method == "refine":
+        if all(s.shape[0] >= MIN_IMAGES for s in scans.stacks):  # each fitted alone shows depth jumps, too
+            joined = joined.on(scans, merged_heights(scans, joined.motions, lambda s: work.fit(s, report)), 0)
         for number in range(1, MAX_FITS):
             height = work.fit(joined.stack, report).height
             joined = joined.on(scans, height, number)

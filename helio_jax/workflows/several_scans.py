@@ -15,7 +15,7 @@ from scipy import ndimage
 from helio_jax.alignment.correction import correct_motion
 from helio_jax.alignment.resample import common_raster, resample
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.arrays import pitch
+from helio_jax.arrays import fill_gaps, pitch
 from helio_jax.errors import InputFileError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics
@@ -25,6 +25,7 @@ from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.measure.sample_grid import resample_heights
 from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.reconstruction import Reconstruction
 
 MAX_TURNS = 30
 """Largest number of turns between heights and places."""
@@ -101,12 +102,11 @@ def join_scans(
     scans = _comparable(scans)
     found = stage_motions(scans) if isinstance(motions, str) else motions
     std = (0.0,) * len(found)
-    raster = common_raster(scans.stacks, found, "reference")
     is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
     if not is_oblique and motions != "fitted":
         return JoinedScans(resample(scans, found, "reference"), found, std, 1, 0.0)
     quick = (settings or ReconstructSettings()).changed(method="nearfield", samples=0)
-    height = _first_heights(scans, found, quick, *raster)
+    height = merged_heights(scans, found, lambda scan: reconstruct_stack(scan, quick))
     for turn in range(1, MAX_TURNS + 1):
         moved = 0.0
         if motions == "fitted":
@@ -128,22 +128,26 @@ def _moved(scans: MicrographSet, change: np.ndarray) -> float:
     return tan * float(np.sqrt(np.mean(change**2))) / pitch(scans.stacks[0].x)
 
 
-def _first_heights(
-    scans: MicrographSet, motions: tuple[Rigid, ...], settings: ReconstructSettings, x: np.ndarray, y: np.ndarray
+def merged_heights(
+    scans: MicrographSet, motions: tuple[Rigid, ...], height_of: Callable[[MicrographStack], Reconstruction]
 ) -> np.ndarray:
-    """Start from what each scan of three or more images shows alone, mean of all; without such scans from a flat."""
+    """Merge what each scan of three or more images shows alone, on the common raster [y, x], um: the mean of all.
+
+    Where none shows anything, the nearest heights; a flat without such scans.
+    """
+    x, y = common_raster(scans.stacks, motions, "reference")
     points, found = np.stack(np.meshgrid(x, y), -1), []
     for stack, motion in zip(scans.stacks, motions, strict=True):
         if stack.shape[0] < MIN_IMAGES:
             continue
-        seen = resample_heights(reconstruct_stack(stack, settings), pitch(x), use_all=True)
+        seen = resample_heights(height_of(stack), pitch(x), use_all=True)
         at = motion.apply(points)
         place = [(at[..., 1] - seen.y[0]) / pitch(seen.y), (at[..., 0] - seen.x[0]) / pitch(seen.x)]
         found.append(ndimage.map_coordinates(seen.height, place, order=1, cval=np.nan))
     if not found:
         return np.zeros(points.shape[:2])
     is_seen = np.isfinite(found)
-    return np.where(is_seen, found, 0.0).sum(0) / np.maximum(is_seen.sum(0), 1)
+    return fill_gaps(np.where(is_seen, found, 0.0).sum(0) / np.maximum(is_seen.sum(0), 1), is_seen.any(0))
 
 
 def _corrected_motions(
