@@ -16,11 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.child import GIB, MIB, check_size
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats import safe
+from helio_jax.texts import parse_json
 
-MAX_PART_BYTES = safe.GIB
-MAX_MANIFEST_BYTES = 16 * safe.MIB
+MAX_PART_BYTES = GIB
+MAX_MANIFEST_BYTES = 16 * MIB
 _OWN = re.compile(r"\d{6}\.npz|whole\.\w+|\.(\d{6}|manifest|whole)\.[0-9a-f]{8}\.part\.\w+")
 """Names that parts have, finished or not."""
 
@@ -58,9 +60,9 @@ class Parts:
             InputFileError: missing or damaged.
         """
         path = self.folder / "manifest.json"
-        safe.check_size(path, MAX_MANIFEST_BYTES)
+        check_size(path, MAX_MANIFEST_BYTES)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            found = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as e:
             raise InputFileError(f"{path} is damaged ({e}): remove {self.folder} and start again") from None
         if not isinstance(found, dict):
@@ -91,7 +93,7 @@ class Parts:
             InputFileError: missing, too large or damaged.
         """
         path = self.path(number)
-        safe.check_size(path, MAX_PART_BYTES)
+        check_size(path, MAX_PART_BYTES)
         try:
             data = path.read_bytes()
             with zipfile.ZipFile(io.BytesIO(data)) as archive:

@@ -2,10 +2,10 @@
 
 import os
 
+from helio_jax.child import check_size
 from helio_jax.errors import InputFileError
 from helio_jax.formats.hdf5 import MAX_BYTES, read
 from helio_jax.formats.matlab import import_micrographs
-from helio_jax.formats.safe import check_size
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.heightmap import HeightMap
 from helio_jax.instrument import Instrument

@@ -82,7 +82,7 @@ def nest(overrides: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_index(key: str, array: list) -> bool:
     """Whether a key is the index of an element."""
-    return key in map(str, range(len(array)))
+    return key.isdecimal() and len(key) < 10 and str(int(key)) == key and int(key) < len(array)
 
 
 def _is_tables(value: Any) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from helio_jax import child
 from helio_jax.errors import InputFileError, MissingDependencyError, SceneError
 from helio_jax.formats import hdf5, safe
 from helio_jax.formats.matlab import import_micrographs
@@ -218,10 +219,10 @@ def test_spoiled_helio_file(spoil, match, helio_file):
 
 
 def _with_child_function(monkeypatch, body: str) -> str:
-    """Add a function to the child's copy of `safe` and return its name."""
-    code = f"from helio_jax.formats import safe; import ctypes, time, sys; safe.probe = {body}; "
-    monkeypatch.setattr(safe, "_BOOT", code + safe._BOOT)
-    return "helio_jax.formats.safe:probe"
+    """Add a function to the child's copy of `child` and return its name."""
+    code = f"from helio_jax import child; import ctypes, time, sys; child.probe = {body}; "
+    monkeypatch.setattr(child, "_BOOT", code + child._BOOT)
+    return "helio_jax.child:probe"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="resource limits need POSIX")
@@ -239,30 +240,31 @@ def test_child_that_fails_becomes_one_error(body, match, monkeypatch, tmp_path):
     """Catches a crash, an endless loop or a memory bomb that reaches the caller as anything else."""
     name = _with_child_function(monkeypatch, body)
     with pytest.raises(InputFileError, match=match) as caught:
-        safe.call_in_child(name, tmp_path / "bad.bin", memory_bytes=safe.GIB, seconds=1 if "iter" in body else 30)
+        child.call_in_child(name, tmp_path / "bad.bin", memory_bytes=child.GIB, seconds=1 if "iter" in body else 30)
     assert "bad.bin" in str(caught.value)
 
 
 def test_child_that_sleeps_is_stopped(monkeypatch, tmp_path):
     """Catches a CPU limit alone: a reader that waits (on a pipe, say) uses none."""
     name = _with_child_function(monkeypatch, "lambda p: time.sleep(60)")
-    monkeypatch.setattr(safe, "_run_child", lambda request, _, run=safe._run_child: run(request, 1.5))
+    monkeypatch.setattr(child, "_run_child", lambda request, _, run=child._run_child: run(request, 1.5))
     with pytest.raises(InputFileError, match=r"stopped after 1\.5 s"):
-        safe.call_in_child(name, tmp_path / "bad.bin", seconds=1)
+        child.call_in_child(name, tmp_path / "bad.bin", seconds=1)
 
 
 def test_missing_package_is_not_the_files_fault(monkeypatch, tmp_path):
     """Catches an ImportError in the child reported as a corrupt file."""
     name = _with_child_function(monkeypatch, "lambda p: __import__('no_such_package')")
     with pytest.raises(MissingDependencyError, match="no_such_package"):
-        safe.call_in_child(name, tmp_path / "a.bin")
+        child.call_in_child(name, tmp_path / "a.bin")
 
 
 def test_child_result_comes_back_whole(monkeypatch, tmp_path):
     """Catches arrays, tables or texts mixed up on the way, among them a table with a key named "array"."""
-    body = "lambda p, n: {'array': safe.np.arange(n), 'dict': {'a': [1, None, 'µ', safe.np.float64(0.1)]}, 'p': str(p)}"
+    numbers = "[1, None, 'µ', child.np.float64(0.1)]"
+    body = f"lambda p, n: {{'array': child.np.arange(n), 'dict': {{'a': {numbers}}}, 'p': str(p)}}"
     name = _with_child_function(monkeypatch, body)
-    value = safe.call_in_child(name, tmp_path / "ä b.bin", 3)
+    value = child.call_in_child(name, tmp_path / "ä b.bin", 3)
     np.testing.assert_array_equal(value.pop("array"), [0, 1, 2])
     assert value == {"dict": {"a": [1, None, "µ", 0.1]}, "p": str(tmp_path / "ä b.bin")}
 
@@ -299,6 +301,6 @@ def test_atomic_path_keeps_or_replaces(tmp_path):
 def test_check_size_refuses_large(tmp_path):
     """Catches a limit compared the wrong way round."""
     (tmp_path / "a").write_bytes(b"12345")
-    assert safe.check_size(tmp_path / "a", 5) == 5
+    assert child.check_size(tmp_path / "a", 5) == 5
     with pytest.raises(InputFileError, match="at most"):
-        safe.check_size(tmp_path / "a", 4)
+        child.check_size(tmp_path / "a", 4)
