@@ -8,6 +8,7 @@ has `--quiet`, every command that writes `--force`. Imports nothing heavy, so th
 import functools
 import inspect
 import itertools
+import sys
 import typing
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
@@ -18,6 +19,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from helio_jax.commands.interrupts import INTERRUPTED
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -159,6 +161,9 @@ class Command(TyperCommand):
         token = is_quiet.set(bool(ctx.params.get("quiet")))
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:  # typer would say nothing
+            print(INTERRUPTED, file=sys.stderr, flush=True)
+            raise typer.Exit(130) from None
         finally:
             is_quiet.reset(token)
 

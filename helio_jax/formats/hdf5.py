@@ -1,7 +1,8 @@
 """Write and read helio files: HDF5 with a NeXus layout (see `nexus`). The only import of h5py.
 
 The HDF5 library can crash on a corrupt file. Every file is therefore opened in a limited child process, which returns
-plain arrays; this costs a Python start (0.7 s on a slow core). `nexus` is imported late to keep that start short.
+plain arrays; this costs a Python start (0.7 s on a slow core). `nexus` and the records are imported late to keep that
+start short.
 Refused: external and soft links, external storage, virtual datasets, unknown filters, objects, oversized data.
 """
 
@@ -20,12 +21,12 @@ import numpy as np
 from helio_jax.child import GIB, MIB, UNPACKED_BYTES, UNPACKED_RATIO, call_in_child, check_size, check_unpacked
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
-from helio_jax.micrograph import Micrographs, MicrographStack
-from helio_jax.reconstruction import Reconstruction
 from helio_jax.texts import parse_json
 
 if TYPE_CHECKING:
     from helio_jax.formats.nexus import Node, Noun
+    from helio_jax.micrograph import Micrographs, MicrographStack
+    from helio_jax.reconstruction import Reconstruction
 
 FORMAT = "1.1"
 """1.1: what steers later steps has places of its own; in files of 1.0 it is in the provenance."""
@@ -55,7 +56,7 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
     from helio_jax.formats import nexus
 
     nodes = nexus.lay_out(obj)
-    root = {
+    root: dict[str, str | list[str]] = {
         "NX_class": "NXroot",
         "default": "entry",
         "creator": "helio_jax",
@@ -65,10 +66,19 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
         "file_time": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     # v110: the library then stores checksums of its own structures, which reveal damage
-    with safe.atomic_path(path) as temporary, h5py.File(temporary, "w", libver=("v110", "v110")) as file:
+    with safe.atomic_path(path) as temporary:
+        temporary.write_bytes(_image(root, nodes))
+
+
+def _image(root: dict[str, str | list[str]], nodes: list["Node"]) -> bytes:
+    """Return the bytes of a file; made in memory, for the library crashes if the disk is full when it closes a file."""
+    options = {"driver": "core", "backing_store": False, "block_size": 16 * MIB}
+    with h5py.File("in memory", "w", libver=("v110", "v110"), **options) as file:
         _put_attributes(file, root)
         for node in nodes:
             _put_node(file, node)
+        file.flush()
+        return file.id.get_file_image()
 
 
 def _put_node(file: h5py.File, node: "Node") -> None:
@@ -122,19 +132,21 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
     return nexus.rebuild(found["filetype"], found["entries"], str(path), found["helio_format"])
 
 
-def read_micrographs(path: str | os.PathLike) -> Micrographs:
+def read_micrographs(path: str | os.PathLike) -> "Micrographs":
     """Read a helio file that must hold micrographs: a stack, or a set of several scans.
 
     Raises:
         InputFileError: as `read`, or the file holds a height map.
     """
+    from helio_jax.reconstruction import Reconstruction
+
     found = read(path)
     if isinstance(found, Reconstruction):
         raise InputFileError(f"{path}: holds a height map, needed are micrographs: run helio simulate or helio import")
     return found
 
 
-def read_stack(path: str | os.PathLike) -> MicrographStack:
+def read_stack(path: str | os.PathLike) -> "MicrographStack":
     """Read a helio file that must hold one stack: a set of several scans has no common raster.
 
     Raises:
@@ -147,12 +159,14 @@ def read_stack(path: str | os.PathLike) -> MicrographStack:
         raise InputFileError(f"{path}: {e}") from None
 
 
-def read_height(path: str | os.PathLike) -> Reconstruction:
+def read_height(path: str | os.PathLike) -> "Reconstruction":
     """Read a helio file that must hold a height map.
 
     Raises:
         InputFileError: as `read`, or the file holds micrographs.
     """
+    from helio_jax.reconstruction import Reconstruction
+
     found = read(path)
     if not isinstance(found, Reconstruction):
         raise InputFileError(f"{path}: holds micrographs, needed is a height map: run helio reconstruct")
@@ -171,7 +185,22 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
     """
     from helio_jax.formats import nexus
 
-    found = _load_in_child(path, nexus.COMMON_PLACES, MAX_BYTES)
+    return _summary_of(path, _load_in_child(path, nexus.COMMON_PLACES, MAX_BYTES))
+
+
+def read_described(path: str | os.PathLike) -> tuple["Noun", dict[str, Any]]:
+    """Read a helio file once and return what `read` and `describe` return (errors as those)."""
+    from helio_jax.formats import nexus
+
+    found = _load_in_child(path, nexus.READ_PLACES, MAX_BYTES)
+    about = _summary_of(path, found)
+    return nexus.rebuild(found["filetype"], found["entries"], str(path), found["helio_format"]), about
+
+
+def _summary_of(path: str | os.PathLike, found: dict[str, Any]) -> dict[str, Any]:
+    """Summarise what the child has read, for `describe`."""
+    from helio_jax.formats import nexus
+
     entries = {}
     for name, values in found["entries"].items():
         texts = {place: _json(path, name, place, values.get(place, "null")) for place in nexus.COMMON_PLACES}

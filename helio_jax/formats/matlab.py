@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from helio_jax.arrays import as_json
 from helio_jax.child import MIB, call_in_child, check_size, check_unpacked
@@ -351,6 +350,8 @@ def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
     Weights 1 / count would favour low counts and bias every mean by one count (-0.25 % at 400 counts).
     Source: Mighell, ApJ 518 (1999) 380, sec. 2.
     """
+    from scipy.ndimage import uniform_filter  # half a second that `helio info` does not need
+
     padded = np.pad(np.asarray(counts, float), ((0, 0), (1, 1), (1, 1)), mode="reflect")
     return (9.0 * np.asarray(uniform_filter(padded, 3, axes=(1, 2)))[:, 1:-1, 1:-1] - counts) / 8.0
 

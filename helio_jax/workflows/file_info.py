@@ -100,8 +100,7 @@ Found = tuple[str, Rows, dict[str, Any]]
 
 
 def _of_hdf5(path: Path) -> Found:
-    about = hdf5.describe(path)
-    record = hdf5.read(path)
+    record, about = hdf5.read_described(path)
     del about["file"], about["bytes"]
     if isinstance(record, Reconstruction):
         about["trust"] = record.trust

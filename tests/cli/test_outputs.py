@@ -293,7 +293,7 @@ def test_parts_leave_what_is_not_theirs(tmp_path):
     parts = Parts(tmp_path / "a.h5")
     parts.begin({})
     parts.save(3, {})
-    (parts.folder / "claimed").mkdir()
+    assert parts.claim("1/2")
     (parts.folder / "notes.txt").write_text("mine")
     parts.remove()
     assert [p.name for p in parts.folder.iterdir()] == ["notes.txt"]
