@@ -168,8 +168,13 @@ def _run_child(request: dict[str, Any], wall_seconds: float) -> int:
 def serve_request(text: str) -> None:
     """Answer one request of `call_in_child`; runs in the child only."""
     request = json.loads(text)
-    folder, path = Path(request["folder"]), request["shown"]
     _limit_self(request["memory_bytes"], request["seconds"])
+    serve(request)
+
+
+def serve(request: dict[str, Any]) -> None:
+    """Call the function of a request and write reply and arrays into its folder."""
+    folder, path = Path(request["folder"]), request["shown"]
     arrays: dict[str, np.ndarray] = {}
     reply = answer(request, arrays)
     if "value" in reply:

@@ -214,6 +214,8 @@ def _of_table(path: Path) -> Found:
     separator = "," if path.suffix.lower() == ".csv" else None
     titles = first.replace(" ", "") if has_names else ""
     table = read_table(path, MAX_HEIGHT_MAP_MB, "a table of numbers", separator=separator, titles=titles)
+    if not table.size:
+        raise InputFileError(f"{path}: holds no numbers below its titles: write it again")
     n_rows, n_columns = table.shape
     rows = [("table", f"{n_rows} lines of {plural(n_columns, 'number')}")]
     if n_columns > _MANY or (not has_names and n_columns > 7):

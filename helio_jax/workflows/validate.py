@@ -9,7 +9,7 @@ from helio_jax.detector import Detector
 from helio_jax.figures.summary import Rows, summarise
 from helio_jax.instrument import Instrument
 from helio_jax.scene.plates import check_solid
-from helio_jax.scene.sample import check_body
+from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.workflows.scene_file import (
     SceneFile,
     is_scene,
@@ -108,5 +108,7 @@ def _describe_detector(detector: Detector, working_distance: float) -> dict[str,
 
 def _check_sample(scene: SceneFile) -> dict[str, Any]:
     """Check the triangles of a scene's sample."""
-    untilted = scene.sample.build_shape(scene.base_dir) if scene.sample.is_tilted else None
+    sample = scene.sample
+    stands_on_flat = isinstance(sample, MeshSample) and sample.flat_size_um is not None  # which does not tilt with it
+    untilted = sample.build_shape(scene.base_dir) if sample.is_tilted and not stands_on_flat else None
     return check_body(scene.build_body(), untilted)
