@@ -30,6 +30,14 @@ def parse_toml(text: str) -> dict[str, Any]:
     return _parse(tomllib.loads, text)
 
 
+def parse_value(text: str) -> Any:
+    """Parse a value as in TOML; anything else is a text."""
+    try:
+        return parse_toml(f"value = {text}")["value"]
+    except ValueError:
+        return text
+
+
 def parse_json(text: str | bytes) -> Any:
     """Parse a JSON document.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from helio_jax.commands.app import TOML, AsJson, app, print_result
+from helio_jax.commands.app import TOML, AsJson, Set, app, print_result, scene_overrides
 from helio_jax.commands.door import Force, Reads, Writes
 from helio_jax.workflows.shipped import Kind, list_shipped
 
@@ -72,13 +72,14 @@ def validate(
         typer.Argument(help="Scene or instrument: file (TOML), or name that helio scenes lists.", metavar="SCENE"),
         Reads(names_files=True),
     ],
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
     from helio_jax.figures.summary import text_lines
     from helio_jax.workflows.validate import check_file
 
-    found = check_file(file)
+    found = check_file(file, scene_overrides(changes))
     if as_json:
         print(json.dumps(asdict(found)))
         return

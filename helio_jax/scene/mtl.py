@@ -20,7 +20,7 @@ from helio_jax.errors import InputFileError
 from helio_jax.scene.body import COSINE
 from helio_jax.scene.files import read_bytes
 from helio_jax.scene.scattering import Law
-from helio_jax.texts import parse_toml
+from helio_jax.texts import parse_value
 
 MAX_MTL_MB = 16.0
 """Largest .mtl file."""
@@ -118,7 +118,7 @@ def _law(path: Path, name: str, keys: dict[str, tuple[int, str]]) -> Any:
         raise InputFileError(
             f"{path}, line {first}: the material {name!r} has no helio_law: add one, the kind of its scattering law"
         )
-    table = {key: _value(text) for key, (_, text) in keys.items() if key != "law"}
+    table = {key: parse_value(text) for key, (_, text) in keys.items() if key != "law"}
     kind = keys["law"][1].strip("\"'")
     try:
         return _LAW.validate_python({"kind": kind, **table})
@@ -139,12 +139,4 @@ def _sentence(problem: Any, kind: str, keys: dict[str, tuple[int, str]]) -> str:
     if problem["type"] == "extra_forbidden":
         return f"line {number}: helio_{key}: the law {kind!r} has no such key: correct or remove it (helio schema)"
     reason = str(problem["ctx"]["error"]) if problem["type"] == "value_error" else problem["msg"].lower()
-    return f"line {number}: helio_{'.'.join(inner) or 'law'} {text}: {reason.removeprefix('input ')}: correct it"
-
-
-def _value(text: str) -> Any:
-    """Parse a value as in TOML; anything else is a text."""
-    try:
-        return parse_toml(f"value = {text}")["value"]
-    except ValueError:
-        return text
+    return f"line {number}: helio_{'.'.join(inner) or 'law'} {text[:60]}: {reason.removeprefix('input ')}: correct it"

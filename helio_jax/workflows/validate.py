@@ -1,6 +1,7 @@
 """Check a scene or instrument file for `helio validate`, and summarise what it describes."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,11 +48,12 @@ class Checked:
     warnings: tuple[str, ...] = ()
 
 
-def check_file(name: str | Path) -> Checked:
+def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Checked:
     """Check a scene, its sample and the files that it names, or an instrument.
 
     Args:
         name: of the file, or of a scene or instrument that comes with the program.
+        overrides: values that override the file, as in `load_scene`.
 
     Raises:
         SceneError: errors of the file; the message lists all of them.
@@ -60,8 +62,8 @@ def check_file(name: str | Path) -> Checked:
     path = locate(name)
     replaced = tuple(replaced_lists(path))
     if not is_scene(read_tables(path)):
-        return Checked(str(path), "instrument", *_describe(load_instrument(path)), replaced=replaced)
-    scene = load_scene(path)
+        return Checked(str(path), "instrument", *_describe(load_instrument(path, overrides)), replaced=replaced)
+    scene = load_scene(path, overrides)
     scene.read_laws()
     scene.read_rays()
     plate = scene.read_plate()

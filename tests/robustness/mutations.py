@@ -57,7 +57,14 @@ pixel_size_um = 10.0
 rays = 64
 seed = 1
 """
-STUDY = 'scene = "scene.toml"\n[set]\n"trace.rays" = 32\n[vary]\n"trace.seed" = [1, 2]\n"scan.nx" = { low = 3, high = 9, n = 3 }\n'
+STUDY = """
+scene = "scene.toml"
+[set]
+"trace.rays" = 32
+[vary]
+"trace.seed" = [1, 2]
+"scan.nx" = { low = 3, high = 9, n = 3 }
+"""
 MTL = "newmtl top\nKd 0.1 0.2 0.3\nhelio_law broad_specular\nhelio_sigma_deg 20\nhelio_diffuse_fraction 0.5\n"
 EXTREMES = ("9" * 5000, "1e400", "-1e400", "nan", "inf", "-1", "0", "1e-320", "18446744073709551616", "2147483648")
 EXTREMES += ("true", "[]", "{}", '"x"', "[" * 40, "0x" + "f" * 5000, "65537", "1000000", "")
