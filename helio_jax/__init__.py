@@ -249,6 +249,7 @@ workflows/            what joins the stages
   starting_file       starting files of a scene and an instrument
   merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
+  scene_warnings      probable mistakes that the built sample shows
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans
   calibrate_known     calibration of an instrument by known shapes

@@ -40,10 +40,8 @@ def show(
     from helio_jax.workflows.show import show as draw_file
 
     picture = output if output or window else path_beside(file, PICTURE)
-    overrides = scene_overrides(changes)
-    draw_file(
-        file, picture, window=window, instrument=instrument, common_scale=common_scale, view=view, overrides=overrides
-    )
+    options = {"window": window, "instrument": instrument, "common_scale": common_scale, "view": view}
+    draw_file(file, picture, **options, overrides=scene_overrides(changes))
     if picture:
         print_result(as_json, {"file": str(picture)}, str(picture))
 

@@ -85,9 +85,12 @@ def validate(
         return
     print("\n".join(text_lines(found.about)))
     for key, value in (found.body or {}).items():
-        print(f"  {key}: {value}")
+        print(f"  {key}: {value}") if key != "holes_um" else None
     if found.body and found.body["n_open_edges"] and not found.body["n_inner_open_edges"]:
         print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
+    if found.body and (holes := found.body["holes_um"]):
+        print("  rays leak at open edges within the sample: close the mesh there (the first ones, x, y, z in um):")
+        print("\n".join(f"    {x:g}, {y:g}, {z:g}" for x, y, z in holes))
     for key, value in (found.plate or {}).items():
         print(f"  plate {key}: {value}")
     for text in found.replaced:

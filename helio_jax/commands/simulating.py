@@ -4,7 +4,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -70,6 +70,7 @@ def run(
     executor = Executor(workers, processes, scheduler)
     if output is None and not force:
         keep_existing(("-o", default_folder(load_scene(scene, overrides)) / name) for name in RUN)
+    _warn_of_scene(scene, overrides)
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
@@ -109,6 +110,7 @@ def simulate(
     options = {"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator}
     overrides = scene_overrides(changes, **options)
     start = time.perf_counter()
+    _warn_of_scene(scene, overrides)
     with Bar("tracing") as bar:
         how = SimulateOptions(noise, Executor(workers, processes, scheduler), shard, restart, bar, say)
         stack = simulate_file(scene, output, overrides=overrides, options=how)
@@ -122,6 +124,16 @@ def simulate(
             if (missed := one.provenance.get("n_above_target")) is not None:
                 print(f"  {one.name}: {missed} of {one.counts[0].size} pixels are above the target error")
     tell_micrographs(stack, output, picture, as_json)
+
+
+def _warn_of_scene(scene: Path, overrides: dict[str, Any]) -> None:
+    """Print the probable mistakes of a scene before it is traced."""
+    from helio_jax.workflows.scene_file import load_scene
+    from helio_jax.workflows.scene_warnings import scene_warnings
+
+    loaded = load_scene(scene, overrides)
+    for text in scene_warnings(loaded, loaded.build_body()):
+        say(f"warning: {text}")
 
 
 @app.command()

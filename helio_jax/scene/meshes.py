@@ -26,7 +26,9 @@ Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices [n, 3], faces [m, 3] and the part of each face [m]."""
 
 
-def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple[str, ...] = ()) -> Mesh:
+def load_mesh(
+    path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple[str, ...] = (), *, flip: bool = False
+) -> Mesh:
     """Read a mesh in file units; equal vertices are merged, a closed mesh must not be inside out.
 
     Args:
@@ -34,6 +36,7 @@ def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple
         max_mb: largest file [MB].
         names: parts that the file must contain.
         own: materials of an OBJ (usemtl) to find among its other parts.
+        flip: reverse all faces.
 
     Returns:
         Vertices [n, 3], faces [m, 3], and 1 + the index of each face's part in (*names, *own), 0: another part [m].
@@ -50,19 +53,19 @@ def load_mesh(path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple
         raise InputFileError(f"{path}: has {n} parts with laws, the limit is {MAX_PARTS}: give fewer parts laws")
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return _parse_once(digest, path, names, own)
+    return _parse_once(digest, path, names, own, flip)
 
 
 @lru_cache(maxsize=2)  # a command reads its mesh several times, a child process takes half a second
-def _parse_once(digest: str, path: Path, names: tuple[str, ...], own: tuple[str, ...]) -> Mesh:
+def _parse_once(digest: str, path: Path, names: tuple[str, ...], own: tuple[str, ...], flip: bool) -> Mesh:
     """Parse the mesh of that hash; the arrays are shared, so they are read-only."""
-    arrays = call_in_child("helio_jax.scene.meshes:parse_mesh", path, names, own)
+    arrays = call_in_child("helio_jax.scene.meshes:parse_mesh", path, names, own, flip)
     for array in arrays:
         array.setflags(write=False)
     return tuple(arrays)
 
 
-def parse_mesh(path: Path, names: list[str], own: list[str]) -> Mesh:
+def parse_mesh(path: Path, names: list[str], own: list[str], flip: bool) -> Mesh:
     """Parse the mesh for `load_mesh`; runs in a child process."""
     import trimesh
 
@@ -89,7 +92,7 @@ def parse_mesh(path: Path, names: list[str], own: list[str]) -> Mesh:
         raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
     if missing := [name for i, name in enumerate(names) if not np.any(parts == i + 1)]:
         raise InputFileError(f"{path}: has no part {missing[0]!r}, which the scene names: correct the name")
-    clean = trimesh.Trimesh(vertices, faces, process=False)
+    clean = trimesh.Trimesh(vertices, faces[:, ::-1] if flip else faces, process=False)
     clean.merge_vertices(merge_tex=True, merge_norm=True)
     has_area = clean.nondegenerate_faces(height=0.0)
     clean.update_faces(has_area)
@@ -97,7 +100,8 @@ def parse_mesh(path: Path, names: list[str], own: list[str]) -> Mesh:
         raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit is wrong")
     if clean.is_watertight and clean.volume < 0:
         raise InputFileError(
-            f"{path}: the mesh is inside out (volume < 0): flip its normals in the program that made it"
+            f"{path}: the mesh is inside out (volume < 0): set sample.flip_normals = {'false' if flip else 'true'}, or "
+            "flip its normals in the program that made it"
         )
     return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
 

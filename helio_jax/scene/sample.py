@@ -32,6 +32,8 @@ from helio_jax.scene.shapes import (
 )
 from helio_jax.settings import UNITS_UM, Settings, Unit
 
+MAX_PLACES = 5
+"""Largest number of open edges whose places are listed."""
 MESH_EXTENT_UM = (1e-2, 1e6)
 """Smallest and largest plausible extent of a mesh [um]."""
 
@@ -46,6 +48,10 @@ class MeshSample(MaterialSample):
     """Unit of the file's coordinates (STL and OBJ do not state it; GLB is in m)."""
     flat_size_um: Length | None = None
     """Side of a substrate added at z = 0 under the placed mesh; the mesh's faces in that plane are removed [um]."""
+    flip_normals: bool = False
+    """Reverse all faces: for a mesh that is inside out."""
+    mirror: Literal["none", "x", "y", "z"] = "none"
+    """Axis of the file whose coordinates change their sign, for files of a left-handed program; faces stay outside."""
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
     materials: dict[str, str] = Field(default={}, max_length=1000)
@@ -60,7 +66,10 @@ class MeshSample(MaterialSample):
         """Read and check the mesh, in the file's unit (errors as `load_mesh`)."""
         laws = self.file_laws(base_dir)
         own = tuple(law.name for law in laws.values())
-        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials), own)
+        names, flip = tuple(self.materials), self.flip_normals
+        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, names, own, flip=flip)
+        if self.mirror != "none":  # which turns the outside of every face in
+            vertices, faces = vertices * np.where(np.array(["x", "y", "z"]) == self.mirror, -1.0, 1.0), faces[:, ::-1]
         by_part = (*self.material_names, *laws)
         names = tuple(dict.fromkeys(by_part))
         index = np.array([names.index(name) for name in by_part])[parts]
@@ -171,7 +180,8 @@ def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
     An open sheet is allowed: a substrate with structure is open along its outer border. `n_inner_open_edges` counts
-    open edges away from the sides of the bounding box, where rays would leak.
+    open edges away from the sides of the bounding box, where rays would leak; `holes_um` holds the middles of the first
+    `MAX_PLACES` of them.
 
     Args:
         body: after placement.
@@ -201,6 +211,7 @@ def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
         "is_inside_out": bool(mesh.is_watertight and mesh.volume < 0),
         "n_open_edges": len(open_edges),
         "n_inner_open_edges": int(np.sum(~on_side)),
+        "holes_um": body.vertices[unique[n_uses == 1][~on_side][:MAX_PLACES]].mean(1).round(4).tolist(),
         "n_edges_of_three_faces": int(np.sum(n_uses > 2)),
         "n_faces_without_area": int(np.sum(~np.any(body.normals, axis=1))),
         "n_duplicate_faces": len(body.faces) - len(sorted_faces),

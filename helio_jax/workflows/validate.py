@@ -9,6 +9,7 @@ from typing import Any
 from helio_jax.detector import Detector
 from helio_jax.figures.summary import Rows, summarise
 from helio_jax.instrument import Instrument
+from helio_jax.scene.body import Body
 from helio_jax.scene.plates import check_solid
 from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.workflows.scene_file import (
@@ -68,15 +69,18 @@ def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     scene.read_rays()
     plate = scene.read_plate()
     ny, nx = scene.image_shape
+    body = scene.build_body()
+    from helio_jax.workflows.scene_warnings import scene_warnings  # numba: seconds that a wrong file does not need
+
     return Checked(
         str(path),
         "scene",
         *_describe(scene.instrument),
         image={"nx": nx, "ny": ny, "views": scene.scan.n_views},
-        body=_check_sample(scene),
+        body=_check_sample(scene, body),
         plate=None if plate is None else check_solid(plate),
         replaced=replaced,
-        warnings=tuple(scene.warnings()),
+        warnings=(*scene.warnings(), *scene_warnings(scene, body)),
     )
 
 
@@ -108,9 +112,9 @@ def _describe_detector(detector: Detector, working_distance: float) -> dict[str,
     }
 
 
-def _check_sample(scene: SceneFile) -> dict[str, Any]:
+def _check_sample(scene: SceneFile, body: Body) -> dict[str, Any]:
     """Check the triangles of a scene's sample."""
     sample = scene.sample
     stands_on_flat = isinstance(sample, MeshSample) and sample.flat_size_um is not None  # which does not tilt with it
     untilted = sample.build_shape(scene.base_dir) if sample.is_tilted and not stands_on_flat else None
-    return check_body(scene.build_body(), untilted)
+    return check_body(body, untilted)
