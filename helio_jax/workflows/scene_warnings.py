@@ -1,4 +1,4 @@
-"""Probable mistakes of a scene that show only when its sample is built: where the beam goes, and how large things are."""
+"""Probable mistakes of a scene that show when its sample is built: where the beam goes, how large the structure is."""
 
 import numpy as np
 
