@@ -96,7 +96,8 @@ def call_in_child(
         args: JSON-compatible further arguments.
         memory_bytes: limit of the child's address space and of the files it writes; default: 1 GiB and 32 times the
             file, so that a small file cannot take more.
-        seconds: limit of its CPU time; default: 10 s and 1 s per MB. The wall-clock limit is 2 * seconds + 10 s.
+        seconds: limit of its CPU time; default: 10 s and 1 s per MB. The wall-clock limit is 10 * seconds + 60 s: on a
+            busy machine a sound file takes long.
 
     Returns:
         The function's result: nested dicts and lists of numpy arrays and JSON values (tuples become lists).
@@ -118,7 +119,7 @@ def call_in_child(
             "seconds": float(seconds),
             "folder": folder,
         }
-        code = _run_child(request, 2 * seconds + 10)
+        code = _run_child(request, 10 * seconds + 60)
         errors = _tail(Path(folder, "stderr.txt"))
         answer = Path(folder, "answer.json")
         reply = json.loads(answer.read_text("utf-8")) if code == 0 and answer.is_file() else None
