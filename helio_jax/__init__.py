@@ -20,6 +20,8 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name
+  texts               TOML and JSON of untrusted files
+  child               limited child processes that parse untrusted files
   validity            the rule of is_valid: reasons, limits, words
   settings            base class of all settings tables
   drawable            plot(), short repr, notebook view and to_xarray() of the records
@@ -34,7 +36,8 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   __main__            entry point of the command line
 scene/                what is imaged: settings tables and geometry; no tracing
   scene               Scene: instrument, sample and scan, checked against each other
-  sample              the [sample] table by kind; mesh files (the only door to trimesh for samples)
+  sample              the [sample] table by kind; mesh samples
+  meshes              reads mesh files (STL, OBJ, PLY, GLB)
   shapes              samples from numbers: flat, spheres, step, trench, pyramid
   rough               random rough samples
   maps                samples from height maps and reconstructions
@@ -49,7 +52,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   scan                the [scan] table: rasters, lines, lists of positions
   views               distances and rotations of a scan
   rays                beams from a file of rays
-  files               bounded reading of the files that a sample names
+  files               bounded reading of scene files and of the files that a scene names
 trace/                Scene -> MicrographStack by Monte Carlo (NumPy, numba, Embree); no JAX
   settings            the [trace] table
   intersect           ray-surface intersection; the only door to embreex
@@ -215,7 +218,7 @@ formats/              the only door to files
   hdf5                reads and writes stacks and reconstructions (HDF5)
   nexus               their NeXus layout
   parts               finished units on disk
-  safe                untrusted files, atomic writes
+  safe                checks of outputs, atomic writes
   suffixes            suffixes of files by format
   matlab              imports .mat files
   matlab_reference    the reference simulator's .mat layout
@@ -249,6 +252,7 @@ workflows/            what joins the stages
   starting_file       starting files of a scene and an instrument
   merge               tables over those of an extended file; lists that are added
   scene_errors        validation errors as sentences
+  scene_warnings      probable mistakes that the built sample shows
   corrections         predicted masking and multiple scattering for the fit
   calibrate_rotated   calibration of aligned rotated scans
   calibrate_known     calibration of an instrument by known shapes
@@ -262,6 +266,7 @@ workflows/            what joins the stages
   measure             what helio measure prints
   steps               what helio measure --steps prints
   study               sweeps of scene values
+  study_file          the study file
   export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
@@ -273,6 +278,8 @@ workflows/            what joins the stages
 commands/             the command line; no logic of its own
   app                 shared options and messages
   door                checks outputs against inputs before any work
+  interrupts          Ctrl-C at any moment
+  log                 the log file of a command (--log)
   simulating          run, simulate, rays, resume, rerun, study, spot, plate
   looking             show, info
   heights             reconstruct, evaluate, measure, report

@@ -1,38 +1,58 @@
 """Entry point of the command line `helio` (= `python -m helio_jax`)."""
 
+import errno
 import sys
 import traceback
+from typing import NoReturn
 
-from helio_jax.commands import (  # noqa: F401 (each registers its commands)
-    about,
-    heights,
-    looking,
-    measured,
-    scenes,
-    simulating,
-)
-from helio_jax.commands.app import app, say
-from helio_jax.errors import HelioError
-from helio_jax.workflows.compilation_cache import keep_compiled
+try:
+    from helio_jax.commands import (  # noqa: F401 (each registers its commands)
+        about,
+        heights,
+        looking,
+        measured,
+        scenes,
+        simulating,
+    )
+    from helio_jax.commands.app import app, say
+    from helio_jax.commands.interrupts import INTERRUPTED, not_lost
+    from helio_jax.errors import HelioError
+    from helio_jax.workflows.compilation_cache import keep_compiled
+except KeyboardInterrupt:  # before anything was begun
+    sys.exit(130)
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""A disk that is full, over quota, read-only or broken, and a file that may not grow."""
 
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line and end the process with an exit code of errors.py."""
-    keep_compiled()
     try:
-        app(args=args, standalone_mode=True)
+        keep_compiled()
+        with not_lost():
+            app(args=args, standalone_mode=True)
     except HelioError as e:
         say(f"helio: {e}")
         sys.exit(e.exit_code)
     except KeyboardInterrupt:
-        say("helio: interrupted; files written so far are complete")
+        say(INTERRUPTED)
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(0)
+    except OSError as e:
+        if e.errno not in DISK_ERRORS:
+            raise_as_bug()
+        say(f"helio: {e.filename or 'the output'} cannot be written: {e.strerror}; make room, or write elsewhere")
+        sys.exit(2)
     except Exception:
-        traceback.print_exc()
-        say("helio: this is a bug; please report it with the message above and the scene")
-        sys.exit(1)
+        raise_as_bug()
+
+
+def raise_as_bug() -> NoReturn:
+    """Print the traceback of the current exception and end with exit code 1."""
+    traceback.print_exc()
+    say("helio: this is a bug; please report it with the message above and the scene")
+    sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
-    {"errors", "spelling", "validity"},
-    {"arrays", "settings", "kernel", "robust", "block_fit", "drawable"},
+    {"errors", "spelling", "validity", "texts"},
+    {"arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
     {"detector"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction"},
@@ -33,7 +33,7 @@ LEVEL = {name: i for i, names in enumerate(LEVELS) for name in names}
 STAGES = LEVELS[6] | LEVELS[7]
 DOORS = {
     "embreex": {"trace/intersect.py"},
-    "trimesh": {"scene/sample.py", "formats/meshes.py"},
+    "trimesh": {"scene/sample.py", "scene/meshes.py"},
     "h5py": {"formats/hdf5.py"},
     "pymatreader": {"formats/matlab.py"},
     "pooch": {"formats/fetch.py"},

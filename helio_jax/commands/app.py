@@ -13,6 +13,7 @@ import typer
 
 from helio_jax import __version__
 from helio_jax.commands.door import Command, Reads, Writes, is_quiet, with_common_options
+from helio_jax.commands.log import log
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -76,6 +77,10 @@ Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FIL
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Rays = Annotated[int | None, typer.Option(min=8, help="Beam rays per pixel (default: the scene's).")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Another value: scan.nx=41, sample.rotate_deg=[0,0,9] (repeat)."),
+]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the tracer (default: the scene's).")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Threads, or processes (default: all CPUs).")]
 Processes = Annotated[bool, typer.Option("--processes", help="Let the workers be processes instead of threads.")]
@@ -87,7 +92,8 @@ Strict = Annotated[bool, typer.Option("--strict", help="Exit code 4 if the data 
 
 
 def say(message: str) -> None:
-    """Print a message to stderr; with --quiet only a warning."""
+    """Print a message to stderr, with --quiet only a warning; and add it to the log."""
+    log(message, message.startswith("warning"))
     if not is_quiet.get() or message.startswith("warning"):
         print(message, file=sys.stderr, flush=True)
 
@@ -191,6 +197,18 @@ def set_options(items: list[str] | None, **options: Any) -> dict[str, Any]:
             raise SceneError(f"--set {item}: {key} is given already: give it once")
         out[key] = value
     return out
+
+
+def scene_overrides(items: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Merge values of a scene given as KEY=VALUE (`--set`), VALUE as in TOML or a word, with given options.
+
+    Raises:
+        SceneError: as `set_options`.
+    """
+    from helio_jax.texts import parse_value
+
+    given = given_options(**options)
+    return {k: v if k in given else parse_value(v) for k, v in set_options(items, **options).items()}
 
 
 def given_options(**values: Any) -> dict[str, Any]:

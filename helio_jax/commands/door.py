@@ -8,6 +8,7 @@ has `--quiet`, every command that writes `--force`. Imports nothing heavy, so th
 import functools
 import inspect
 import itertools
+import sys
 import typing
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
@@ -18,6 +19,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from helio_jax.commands.interrupts import INTERRUPTED
+from helio_jax.commands.log import logged
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 
 
@@ -69,7 +72,7 @@ class Writes:
 
 def marks_of(function: Any) -> dict[str, Reads | Writes]:
     """Collect the mark of every parameter that has one."""
-    hints = typing.get_type_hints(inspect.unwrap(function), include_extras=True)
+    hints = typing.get_type_hints(function, include_extras=True)
     marks = ((name, m) for name, hint in hints.items() for m in getattr(hint, "__metadata__", ()))
     return {name: mark for name, mark in marks if isinstance(mark, (Reads, Writes))}
 
@@ -78,23 +81,29 @@ Force = Annotated[bool, typer.Option("--force", help="Replace files that exist."
 
 
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no messages, only results, warnings, errors.")]
+Log = Annotated[
+    Path | None,
+    typer.Option("--log", metavar="FILE", help="Append to this file: the command, messages, warnings, times."),
+    Writes("a log", keeps=True),
+]
 is_quiet: ContextVar[bool] = ContextVar("is_quiet", default=False)
 """Whether the running command was given `--quiet`."""
 
 
 def with_common_options(function: Any) -> Any:
-    """Add `--quiet` to a command, and `--force` if it writes and has no such option itself; `Command` acts on both."""
+    """Add `--quiet`, `--log`, and `--force` to what writes and has no such option itself; `Command` acts on them."""
     signature = inspect.signature(function)
     has_outputs = any(isinstance(m, Writes) and not m.keeps for m in marks_of(function).values())
     options = {"force": Force} if has_outputs and "force" not in signature.parameters else {}
-    options = options | {"quiet": Quiet}
+    options = options | {"quiet": Quiet, "log": Log}
 
     @functools.wraps(function)
     def command(*args: Any, **given: Any) -> Any:
         return function(*args, **{name: value for name, value in given.items() if name not in options})
 
     added = [
-        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in options.items()
+        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=None if n == "log" else False, annotation=a)
+        for n, a in options.items()
     ]
     command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore
     command.__annotations__ = {**function.__annotations__, **options}
@@ -158,7 +167,11 @@ class Command(TyperCommand):
                 keep_existing(file for mark, files in written if not mark.keeps for file in files)
         token = is_quiet.set(bool(ctx.params.get("quiet")))
         try:
-            return super().invoke(ctx)
+            with logged(ctx.params.get("log")):
+                return super().invoke(ctx)
+        except KeyboardInterrupt:  # typer would say nothing
+            print(INTERRUPTED, file=sys.stderr, flush=True)
+            raise typer.Exit(130) from None
         finally:
             is_quiet.reset(token)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import FIGURE, PICTURE, AsJson, app, print_result
+from helio_jax.commands.app import FIGURE, PICTURE, AsJson, Set, app, print_result, scene_overrides
 from helio_jax.commands.door import Reads
 
 
@@ -32,6 +32,7 @@ def show(
         bool, typer.Option("--common-scale", help="One grey scale for all micrographs (default: one for each).")
     ] = False,
     view: Annotated[int, typer.Option(min=0, help="Which view of a scene's scan, from 0.")] = 0,
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw a file: micrographs and apertures, heights, the instrument, or a scene before any tracing."""
@@ -39,7 +40,8 @@ def show(
     from helio_jax.workflows.show import show as draw_file
 
     picture = output if output or window else path_beside(file, PICTURE)
-    draw_file(file, picture, window=window, instrument=instrument, common_scale=common_scale, view=view)
+    options = {"window": window, "instrument": instrument, "common_scale": common_scale, "view": view}
+    draw_file(file, picture, **options, overrides=scene_overrides(changes))
     if picture:
         print_result(as_json, {"file": str(picture)}, str(picture))
 

@@ -18,11 +18,12 @@ from helio_jax.commands.app import (
     Picture,
     Rays,
     SceneArg,
+    Set,
     app,
-    given_options,
     print_result,
     print_table,
     say,
+    scene_overrides,
     set_options,
     tell_micrographs,
     warn,
@@ -103,15 +104,15 @@ def compare(
     ),
     explain: Annotated[bool, typer.Option(help="Add one effect at a time and tabulate what it does.")] = False,
     rays: Rays = None,
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene in the instrument that measured, and compare it with the measurement."""
     from helio_jax.formats.hdf5 import read_stack
     from helio_jax.workflows.compare import compare as compare_with_scene
 
-    found = compare_with_scene(
-        read_stack(stack), scene, overrides=given_options(**{"trace.rays": rays}), explain=explain, progress=say
-    )
+    overrides = scene_overrides(changes, **{"trace.rays": rays})
+    found = compare_with_scene(read_stack(stack), scene, overrides=overrides, explain=explain, progress=say)
     files = found.write(output)
     if as_json:
         print(json.dumps(found.as_dict() | {"files": list(map(str, files))}))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from helio_jax.commands.app import TOML, AsJson, app, print_result
+from helio_jax.commands.app import TOML, AsJson, Set, app, print_result, scene_overrides
 from helio_jax.commands.door import Force, Reads, Writes
 from helio_jax.workflows.shipped import Kind, list_shipped
 
@@ -72,21 +72,25 @@ def validate(
         typer.Argument(help="Scene or instrument: file (TOML), or name that helio scenes lists.", metavar="SCENE"),
         Reads(names_files=True),
     ],
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
     from helio_jax.figures.summary import text_lines
     from helio_jax.workflows.validate import check_file
 
-    found = check_file(file)
+    found = check_file(file, scene_overrides(changes))
     if as_json:
         print(json.dumps(asdict(found)))
         return
     print("\n".join(text_lines(found.about)))
     for key, value in (found.body or {}).items():
-        print(f"  {key}: {value}")
+        print(f"  {key}: {value}") if key != "holes_um" else None
     if found.body and found.body["n_open_edges"] and not found.body["n_inner_open_edges"]:
         print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
+    if found.body and (holes := found.body["holes_um"]):
+        print("  rays leak at open edges within the sample: close the mesh there (the first ones, x, y, z in um):")
+        print("\n".join(f"    {x:g}, {y:g}, {z:g}" for x, y, z in holes))
     for key, value in (found.plate or {}).items():
         print(f"  plate {key}: {value}")
     for text in found.replaced:

@@ -4,7 +4,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -23,13 +23,14 @@ from helio_jax.commands.app import (
     SceneArg,
     Scheduler,
     Seed,
+    Set,
     Strict,
     Workers,
     app,
-    given_options,
     print_result,
     print_table,
     say,
+    scene_overrides,
     tell_micrographs,
     warn,
 )
@@ -50,6 +51,7 @@ def run(
     rays: Rays = None,
     seed: Seed = None,
     method: Method = None,
+    changes: Set = None,
     workers: Workers = None,
     processes: Processes = False,
     scheduler: Scheduler = None,
@@ -64,10 +66,11 @@ def run(
     from helio_jax.workflows.pipeline import run as run_scene
     from helio_jax.workflows.scene_file import load_scene
 
-    overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
+    overrides = scene_overrides(changes, **{"trace.rays": rays, "trace.seed": seed, "reconstruct.method": method})
     executor = Executor(workers, processes, scheduler)
     if output is None and not force:
         keep_existing(("-o", default_folder(load_scene(scene, overrides)) / name) for name in RUN)
+    _warn_of_scene(scene, overrides)
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
@@ -92,6 +95,7 @@ def simulate(
     seed: Seed = None,
     workers: Workers = None,
     estimator: Annotated[str | None, typer.Option(help="expected or analog.")] = None,
+    changes: Set = None,
     noise: Annotated[bool, typer.Option(help="Add the scene's counting noise and background.")] = False,
     processes: Processes = False,
     shard: Annotated[str | None, typer.Option(help="i/N: trace the i-th of N shares; the last one writes.")] = None,
@@ -103,11 +107,13 @@ def simulate(
     """Trace the micrographs of a scene and write them to an HDF5 file; repeat the command to resume it."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions, simulate_file
 
-    overrides = given_options(**{"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator})
+    options = {"trace.rays": rays, "trace.seed": seed, "trace.estimator": estimator}
+    overrides = scene_overrides(changes, **options)
     start = time.perf_counter()
+    _warn_of_scene(scene, overrides)
     with Bar("tracing") as bar:
-        options = SimulateOptions(noise, Executor(workers, processes, scheduler), shard, restart, bar, say)
-        stack = simulate_file(scene, output, overrides=overrides, options=options)
+        how = SimulateOptions(noise, Executor(workers, processes, scheduler), shard, restart, bar, say)
+        stack = simulate_file(scene, output, overrides=overrides, options=how)
     if stack is None:
         return
     if not as_json:
@@ -118,6 +124,16 @@ def simulate(
             if (missed := one.provenance.get("n_above_target")) is not None:
                 print(f"  {one.name}: {missed} of {one.counts[0].size} pixels are above the target error")
     tell_micrographs(stack, output, picture, as_json)
+
+
+def _warn_of_scene(scene: Path, overrides: dict[str, Any]) -> None:
+    """Print the probable mistakes of a scene before it is traced."""
+    from helio_jax.workflows.scene_file import load_scene
+    from helio_jax.workflows.scene_warnings import scene_warnings
+
+    loaded = load_scene(scene, overrides)
+    for text in scene_warnings(loaded, loaded.build_body()):
+        say(f"warning: {text}")
 
 
 @app.command()
@@ -131,6 +147,7 @@ def rays(
     view: Annotated[int, typer.Option(help="Which view of the scan, from 0.")] = 0,
     n: Annotated[int | None, typer.Option("--rays", min=8, help="Atoms per pixel (default: the scene's).")] = None,
     seed: Seed = None,
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Follow single atoms: where each last scattered, its direction, its order and what became of it."""
@@ -139,7 +156,7 @@ def rays(
     from helio_jax.trace.tally import FATES
     from helio_jax.workflows.scene_file import load_scene
 
-    loaded = load_scene(scene, given_options(**{"trace.rays": n, "trace.seed": seed}))
+    loaded = load_scene(scene, scene_overrides(changes, **{"trace.rays": n, "trace.seed": seed}))
     atoms = follow_scene(loaded, loaded.trace, pixel, view)
     write_columns(output, atoms.columns())
     if directions:
@@ -230,6 +247,7 @@ def spot(
         Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf, .svg)."), FIGURE
     ] = None,
     heights: Annotated[str, typer.Option(help="Heights above the substrate [um], separated by commas.")] = "0",
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure and draw the beam's spot at one or more heights above the substrate."""
@@ -241,7 +259,7 @@ def spot(
         at = [float(text) for text in heights.split(",")]
     except ValueError:
         raise SceneError(f"--heights must be numbers separated by commas, got {heights!r}") from None
-    found = draw_spot(load_scene(scene), at, output)
+    found = draw_spot(load_scene(scene, scene_overrides(changes)), at, output)
     if as_json:
         print(json.dumps(found))
         return
@@ -264,6 +282,7 @@ def plate(
     channel_deg: Annotated[
         float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
     ] = None,
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
@@ -272,7 +291,7 @@ def plate(
     from helio_jax.workflows.scene_file import load_instrument
 
     angle = None if channel_deg is None else math.radians(channel_deg)
-    found = drill_plate(load_instrument(instrument), thickness_um, radius_um, angle)
+    found = drill_plate(load_instrument(instrument, scene_overrides(changes)), thickness_um, radius_um, angle)
     with atomic_path(output) as part:
         about = f"made by helio plate from {instrument.name}, {thickness_um:g} um thick; units: um"
         part.write_text(found.obj(about), encoding="utf-8")

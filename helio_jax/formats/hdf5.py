@@ -1,13 +1,13 @@
 """Write and read helio files: HDF5 with a NeXus layout (see `nexus`). The only import of h5py.
 
 The HDF5 library can crash on a corrupt file. Every file is therefore opened in a limited child process, which returns
-plain arrays; this costs a Python start (0.7 s on a slow core). `nexus` is imported late to keep that start short.
+plain arrays; this costs a Python start (0.7 s on a slow core). `nexus` and the records are imported late to keep that
+start short.
 Refused: external and soft links, external storage, virtual datasets, unknown filters, objects, oversized data.
 """
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -18,19 +18,25 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from helio_jax.child import GIB, MIB, UNPACKED_BYTES, UNPACKED_RATIO, call_in_child, check_size, check_unpacked
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
-from helio_jax.micrograph import Micrographs, MicrographStack
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.texts import parse_json
 
 if TYPE_CHECKING:
     from helio_jax.formats.nexus import Node, Noun
+    from helio_jax.micrograph import Micrographs, MicrographStack
+    from helio_jax.reconstruction import Reconstruction
 
 FORMAT = "1.1"
 """1.1: what steers later steps has places of its own; in files of 1.0 it is in the provenance."""
-MAX_BYTES = 4 * safe.GIB
+MAX_BYTES = 4 * GIB
 _MAX_OBJECTS = 20_000
 _MAX_DEPTH = 8
+_MAX_LINKS = 8
+"""Largest number of names of one object; its own are at most three."""
+_MAX_ATTRIBUTE_BYTES = 64 * 1024
+_MAX_TEXT_BYTES = 16 * MIB
 _FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
 _SCAN = re.compile(r"scan_[1-9][0-9]{0,5}")
 
@@ -50,7 +56,7 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
     from helio_jax.formats import nexus
 
     nodes = nexus.lay_out(obj)
-    root = {
+    root: dict[str, str | list[str]] = {
         "NX_class": "NXroot",
         "default": "entry",
         "creator": "helio_jax",
@@ -60,10 +66,19 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
         "file_time": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     # v110: the library then stores checksums of its own structures, which reveal damage
-    with safe.atomic_path(path) as temporary, h5py.File(temporary, "w", libver=("v110", "v110")) as file:
+    with safe.atomic_path(path) as temporary:
+        temporary.write_bytes(_image(root, nodes))
+
+
+def _image(root: dict[str, str | list[str]], nodes: list["Node"]) -> bytes:
+    """Return the bytes of a file; made in memory, for the library crashes if the disk is full when it closes a file."""
+    options = {"driver": "core", "backing_store": False, "block_size": 16 * MIB}
+    with h5py.File("in memory", "w", libver=("v110", "v110"), **options) as file:
         _put_attributes(file, root)
         for node in nodes:
             _put_node(file, node)
+        file.flush()
+        return file.id.get_file_image()
 
 
 def _put_node(file: h5py.File, node: "Node") -> None:
@@ -117,19 +132,21 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
     return nexus.rebuild(found["filetype"], found["entries"], str(path), found["helio_format"])
 
 
-def read_micrographs(path: str | os.PathLike) -> Micrographs:
+def read_micrographs(path: str | os.PathLike) -> "Micrographs":
     """Read a helio file that must hold micrographs: a stack, or a set of several scans.
 
     Raises:
         InputFileError: as `read`, or the file holds a height map.
     """
+    from helio_jax.reconstruction import Reconstruction
+
     found = read(path)
     if isinstance(found, Reconstruction):
         raise InputFileError(f"{path}: holds a height map, needed are micrographs: run helio simulate or helio import")
     return found
 
 
-def read_stack(path: str | os.PathLike) -> MicrographStack:
+def read_stack(path: str | os.PathLike) -> "MicrographStack":
     """Read a helio file that must hold one stack: a set of several scans has no common raster.
 
     Raises:
@@ -142,12 +159,14 @@ def read_stack(path: str | os.PathLike) -> MicrographStack:
         raise InputFileError(f"{path}: {e}") from None
 
 
-def read_height(path: str | os.PathLike) -> Reconstruction:
+def read_height(path: str | os.PathLike) -> "Reconstruction":
     """Read a helio file that must hold a height map.
 
     Raises:
         InputFileError: as `read`, or the file holds micrographs.
     """
+    from helio_jax.reconstruction import Reconstruction
+
     found = read(path)
     if not isinstance(found, Reconstruction):
         raise InputFileError(f"{path}: holds micrographs, needed is a height map: run helio reconstruct")
@@ -166,10 +185,25 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
     """
     from helio_jax.formats import nexus
 
-    found = _load_in_child(path, nexus.COMMON_PLACES, MAX_BYTES)
+    return _summary_of(path, _load_in_child(path, nexus.COMMON_PLACES, MAX_BYTES))
+
+
+def read_described(path: str | os.PathLike) -> tuple["Noun", dict[str, Any]]:
+    """Read a helio file once and return what `read` and `describe` return (errors as those)."""
+    from helio_jax.formats import nexus
+
+    found = _load_in_child(path, nexus.READ_PLACES, MAX_BYTES)
+    about = _summary_of(path, found)
+    return nexus.rebuild(found["filetype"], found["entries"], str(path), found["helio_format"]), about
+
+
+def _summary_of(path: str | os.PathLike, found: dict[str, Any]) -> dict[str, Any]:
+    """Summarise what the child has read, for `describe`."""
+    from helio_jax.formats import nexus
+
     entries = {}
     for name, values in found["entries"].items():
-        texts = {place: json.loads(values.get(place, "null")) for place in nexus.COMMON_PLACES}
+        texts = {place: _json(path, name, place, values.get(place, "null")) for place in nexus.COMMON_PLACES}
         entries[name] = {"fields": found["fields"][name]}
         entries[name] |= {place.partition("/")[0]: value for place, value in texts.items()}
     about = {key: found[key] for key in ("filetype", "helio_format", "creator", "creator_version", "file_time")}
@@ -178,17 +212,25 @@ def describe(path: str | os.PathLike) -> dict[str, Any]:
     return {"file": str(path), "bytes": Path(path).stat().st_size, **about, "entries": entries}
 
 
+def _json(path: str | os.PathLike, scan: str, place: str, text: Any) -> Any:
+    """Parse the JSON text at a place of an entry."""
+    try:
+        return parse_json(text)
+    except (TypeError, ValueError) as e:
+        where = "/".join(filter(None, ("/entry", scan, place)))
+        raise InputFileError(f"{path}: {where} is not JSON: {e}") from None
+
+
 def _load_in_child(path: str | os.PathLike, places: tuple[str, ...], max_bytes: int) -> dict[str, Any]:
     """Check the file's size and read it in a child process."""
-    safe.check_size(path, max_bytes)
+    check_size(path, max_bytes)
     with Path(path).open("rb") as file:
         head = file.read(8)
     if head != b"\x89HDF\r\n\x1a\n":
         raise InputFileError(f"{path} is not an HDF5 file: its first bytes are {head!r}")
-    memory = 2 * max_bytes + safe.GIB
-    return safe.call_in_child(
-        "helio_jax.formats.hdf5:load_fields", path, places, max_bytes, memory_bytes=memory, seconds=300
-    )
+    unpacked = min(max_bytes, UNPACKED_BYTES + UNPACKED_RATIO * Path(path).stat().st_size)
+    memory = 2 * unpacked + GIB
+    return call_in_child("helio_jax.formats.hdf5:load_fields", path, places, max_bytes, memory_bytes=memory)
 
 
 def load_fields(path: Path, places: list[str], max_bytes: int) -> dict[str, Any]:
@@ -206,9 +248,10 @@ def load_fields(path: Path, places: list[str], max_bytes: int) -> dict[str, Any]
             n_bytes += _check_item(path, place, item)
             if n_bytes > max_bytes:
                 raise InputFileError(
-                    f"{path}: the arrays up to {place} must take at most {max_bytes / safe.MIB:.0f} MiB, they declare "
-                    f"{n_bytes / safe.MIB:.0f} MiB: the file is corrupt, or read it with a larger max_bytes"
+                    f"{path}: the arrays up to {place} must take at most {max_bytes / MIB:.0f} MiB, they declare "
+                    f"{n_bytes / MIB:.0f} MiB: the file is corrupt, or read it with a larger max_bytes"
                 )
+            check_unpacked(path, n_bytes, f"the arrays up to {place}")
             scan, _, rest = place.removeprefix("/entry/").partition("/")
             name, inner = (scan, rest) if _SCAN.fullmatch(scan) else ("", place.removeprefix("/entry/"))
             if not isinstance(item, h5py.Dataset):
@@ -267,6 +310,8 @@ def _walk(path: Path, group: h5py.Group, depth: int = 1, count: list[int] | None
 
 def _check_item(path: Path, place: str, item: Any) -> int:
     """Refuse storage outside the file or with plugins; return the size that the item declares [bytes]."""
+    if (n_links := h5py.h5o.get_info(item.id).rc) > _MAX_LINKS:
+        raise InputFileError(f"{path}: {place} is linked {n_links} times, the limit is {_MAX_LINKS}: not a helio file")
     if isinstance(item, h5py.Group):
         return 0
     if not isinstance(item, h5py.Dataset):
@@ -281,6 +326,9 @@ def _check_item(path: Path, place: str, item: Any) -> int:
         raise InputFileError(f"{path}: {place} must be compressed with gzip only, got HDF5 filters {filters}")
     if item.dtype.kind not in "fiubS":
         raise InputFileError(f"{path}: {place} must hold numbers or fixed-length text, got {item.dtype}")
+    if item.dtype.kind == "S" and item.dtype.itemsize > _MAX_TEXT_BYTES:
+        size, limit = item.dtype.itemsize / MIB, _MAX_TEXT_BYTES / MIB
+        raise InputFileError(f"{path}: {place} is a text of {size:.0f} MiB, the limit is {limit:.0f} MiB: shorten it")
     if item.shape is None:
         raise InputFileError(f"{path}: {place} is a dataset without data: the file is incomplete")
     return int(item.dtype.itemsize) * int(np.prod([float(n) for n in item.shape]))
@@ -315,6 +363,8 @@ def _summary(path: Path, place: str, item: h5py.Dataset) -> dict[str, Any]:
 def _text_attribute(path: Path, place: str, item: Any, name: str) -> str:
     """Read a text attribute; "" if it is missing."""
     try:
+        if name in item.attrs and item.attrs.get_id(name).get_storage_size() > _MAX_ATTRIBUTE_BYTES:
+            raise ValueError(f"it has more than {_MAX_ATTRIBUTE_BYTES} bytes")
         value = item.attrs.get(name, "")
     except (OSError, RuntimeError, TypeError, ValueError) as e:
         raise InputFileError(f"{path}: {place}@{name} cannot be read, the file is damaged: {e}") from None

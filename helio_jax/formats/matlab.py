@@ -9,24 +9,27 @@ come from the instrument. All scalar metadata go to `provenance["metadata"]`. No
 import hashlib
 import math
 import os
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from helio_jax.arrays import as_json
+from helio_jax.child import MIB, call_in_child, check_size, check_unpacked
 from helio_jax.errors import InputFileError
-from helio_jax.formats import safe
 from helio_jax.formats.matlab_reference import complete_instrument, read_counts
 from helio_jax.formats.tables import get_array, get_number, get_table
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 
-MAX_FILE_BYTES = 256 * safe.MIB
+MAX_FILE_BYTES = 256 * MIB
 _IMAGES = ("image", "single", "multiple")
 _SUMMARISED = ("labtemp", "beam_pressure", "return_state")
 _SMALL = 64
+_COMPRESSED = 15
+"""Type of a compressed variable."""
 _EXAMPLE_INSTRUMENT = {
     "reference simulator": "bshem_wd4",
     "B-SHeM": "bshem_wd3",
@@ -102,9 +105,9 @@ def describe_matlab(path: str | os.PathLike) -> dict[str, Any]:
 
 def _read_tree(path: str | os.PathLike) -> dict[str, Any]:
     """Check a file's size and header and parse it in a child process."""
-    safe.check_size(path, MAX_FILE_BYTES)
+    check_size(path, MAX_FILE_BYTES)
     _check_header(Path(path))
-    return safe.call_in_child("helio_jax.formats.matlab:load_tree", path, memory_bytes=3 * safe.GIB, seconds=120)
+    return call_in_child("helio_jax.formats.matlab:load_tree", path)
 
 
 def _check_header(path: Path) -> None:
@@ -119,10 +122,40 @@ def _check_header(path: Path) -> None:
 
 def load_tree(path: Path) -> dict[str, Any]:
     """Parse a level 5 MATLAB file and drop large arrays other than images; runs in a child process."""
+    _check_packed(path)
     from pymatreader import read_mat  # loaded in the child process only
 
     tree = read_mat(str(path))
-    return {k: _reduce(k, v) for k, v in tree.items() if not k.startswith("__")}
+    found = {k: _reduce(k, v) for k, v in tree.items() if not k.startswith("__")}
+    check_unpacked(path, 8.0 * _n_numbers(found), "its images, 8 bytes a number,")
+    return found
+
+
+def _check_packed(path: Path) -> None:
+    """Refuse a file whose compressed variables declare more than `check_unpacked` allows, before they are unpacked.
+
+    Source: MATLAB MAT-File Format, level 5: a header of 128 bytes, then variables; the tag of each is its type and its
+        number of bytes; a compressed one (type 15) holds a whole variable with its own tag.
+    """
+    n_bytes = 0
+    with path.open("rb") as file:
+        file.seek(126)
+        order = "<" if file.read(2) == b"IM" else ">"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(f"{order}2I", tag)
+            start = file.tell()
+            if kind == _COMPRESSED:
+                inner = zlib.decompressobj().decompress(file.read(min(size, 512)), 8)
+                n_bytes += struct.unpack(f"{order}2I", inner)[1] if len(inner) == 8 else 0
+            file.seek(start + size)
+    check_unpacked(path, n_bytes, "its variables")
+
+
+def _n_numbers(value: Any) -> int:
+    """Count the numbers in a tree."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    return sum(map(_n_numbers, value)) if isinstance(value, list) else int(np.size(value))
 
 
 def _reduce(name: str, value: Any) -> Any:
@@ -317,6 +350,8 @@ def _mean_of_neighbours(counts: np.ndarray) -> np.ndarray:
     Weights 1 / count would favour low counts and bias every mean by one count (-0.25 % at 400 counts).
     Source: Mighell, ApJ 518 (1999) 380, sec. 2.
     """
+    from scipy.ndimage import uniform_filter  # half a second that `helio info` does not need
+
     padded = np.pad(np.asarray(counts, float), ((0, 0), (1, 1), (1, 1)), mode="reflect")
     return (9.0 * np.asarray(uniform_filter(padded, 3, axes=(1, 2)))[:, 1:-1, 1:-1] - counts) / 8.0
 

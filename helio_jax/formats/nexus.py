@@ -18,6 +18,7 @@ from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack, ScanAlignment
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.texts import parse_json
 from helio_jax.validity import REASONS, VALID_RULE
 
 Noun = MicrographStack | MicrographSet | Reconstruction
@@ -314,7 +315,7 @@ def _records_in_provenance(noun: type, provenance: Mapping[str, Any]) -> dict[st
 def _json_object(values: dict[str, Any], name: str, place: str) -> dict[str, Any]:
     """Read a JSON object; an empty one where it is missing."""
     try:
-        found = json.loads(values.get(name, "{}"))
+        found = parse_json(values.get(name, "{}"))
     except (TypeError, ValueError) as e:
         raise InputFileError(f"{place}/{name} is not JSON: {e}") from None
     if not isinstance(found, dict):

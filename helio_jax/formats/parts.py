@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.child import GIB, MIB, check_size
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats import safe
+from helio_jax.texts import parse_json
 
-MAX_PART_BYTES = safe.GIB
-MAX_MANIFEST_BYTES = 16 * safe.MIB
-_OWN = re.compile(r"\d{6}\.npz|whole\.\w+|\.(\d{6}|manifest|whole)\.[0-9a-f]{8}\.part\.\w+")
+MAX_PART_BYTES = GIB
+MAX_MANIFEST_BYTES = 16 * MIB
+_OWN = re.compile(r"claimed|\d{6}\.npz|whole\.\w+|\.(\d{6}|manifest|whole)\.[0-9a-f]{8}\.part\.\w+")
 """Names that parts have, finished or not."""
 
 
@@ -58,9 +60,9 @@ class Parts:
             InputFileError: missing or damaged.
         """
         path = self.folder / "manifest.json"
-        safe.check_size(path, MAX_MANIFEST_BYTES)
+        check_size(path, MAX_MANIFEST_BYTES)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            found = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as e:
             raise InputFileError(f"{path} is damaged ({e}): remove {self.folder} and start again") from None
         if not isinstance(found, dict):
@@ -91,7 +93,7 @@ class Parts:
             InputFileError: missing, too large or damaged.
         """
         path = self.path(number)
-        safe.check_size(path, MAX_PART_BYTES)
+        check_size(path, MAX_PART_BYTES)
         try:
             data = path.read_bytes()
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -102,13 +104,29 @@ class Parts:
         except Exception as e:  # zipfile and numpy raise many kinds on corrupt files
             raise InputFileError(f"{path} is damaged ({type(e).__name__}: {e})") from None
 
-    def claim(self) -> bool:
-        """Claim the merge of the complete parts; True for one of all concurrent callers."""
+    def claim(self, owner: str) -> bool:
+        """Claim the merge of the complete parts; True for one of all concurrent owners.
+
+        An owner that claimed it before gets it again: it was killed, and its command is repeated.
+        """
+        path = self.folder / "claimed"
         try:
-            (self.folder / "claimed").mkdir()
-        except (FileNotFoundError, FileExistsError):  # merged and removed already, or claimed
-            return False
-        return True
+            with path.open("x", encoding="utf-8") as file:
+                file.write(owner)
+            return True
+        except FileExistsError:
+            with contextlib.suppress(OSError):  # merged and removed meanwhile
+                return path.read_text(encoding="utf-8") in ("", owner)
+        except FileNotFoundError:  # merged and removed already
+            pass
+        return False
+
+    def claimed_by(self) -> str:
+        """Return the owner of the merge; "" if there is none any more."""
+        try:
+            return (self.folder / "claimed").read_text(encoding="utf-8")
+        except OSError:
+            return ""
 
     def finish(self, write: Callable[[Path], None]) -> None:
         """Write the complete file, and remove the parts.
@@ -142,6 +160,5 @@ class Parts:
             for path in self.folder.iterdir():
                 if _OWN.fullmatch(path.name) and path.is_file():
                     path.unlink(missing_ok=True)
-        for folder in (self.folder / "claimed", self.folder):
-            with contextlib.suppress(OSError):  # it holds something else, or is gone
-                folder.rmdir()
+        with contextlib.suppress(OSError):  # it holds something else, or is gone
+            self.folder.rmdir()

@@ -7,8 +7,9 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from helio_jax.child import MIB, check_size
 from helio_jax.errors import InputFileError
-from helio_jax.formats.safe import MIB, atomic_path, check_size
+from helio_jax.formats.safe import atomic_path
 
 HEADER = ["view", "point", "x_um", "y_um"]
 MAX_FILE_BYTES = 4 * MIB
@@ -25,7 +26,10 @@ def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, flo
         text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as e:
         raise InputFileError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}): save it as UTF-8") from None
-    lines = [(n, row) for n, row in enumerate(csv.reader(io.StringIO(text)), 1) if row and not row[0].startswith("#")]
+    try:
+        lines = [(n, r) for n, r in enumerate(csv.reader(io.StringIO(text)), 1) if r and not r[0].startswith("#")]
+    except csv.Error as e:
+        raise InputFileError(f"{path}: is not a CSV table: {e}") from None
     if not lines or [name.strip() for name in lines[0][1]] != HEADER:
         found = ",".join(lines[0][1]) if lines else "an empty file"
         raise InputFileError(f"{path}: the first line must be {','.join(HEADER)}, got {found[:200]}")

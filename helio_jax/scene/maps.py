@@ -20,6 +20,9 @@ from helio_jax.scene.files import read_height_map
 from helio_jax.scene.shapes import Length, MaterialSample
 from helio_jax.settings import UNITS_UM, Unit
 
+MAX_MAP_POINTS = 5_000_000
+"""Largest number of points of a map; each makes two triangles."""
+
 
 class MapSample(MaterialSample):
     """Base of samples given by heights: an optional substrate around the map."""
@@ -35,6 +38,10 @@ class MapSample(MaterialSample):
         self, x: np.ndarray, y: np.ndarray, height: np.ndarray, beam_shift: tuple[float, float] = (0.0, 0.0)
     ) -> Body:
         """Triangulate heights [y, x] and join the border to the substrate along the beam."""
+        if height.size > MAX_MAP_POINTS:
+            raise InputFileError(
+                f"{self.file}: the map has {height.size} points, the limit is {MAX_MAP_POINTS}: resample it"
+            )
         reach = None if self.size_um is None else 0.5 * self.size_um
         body = surfaces.surface_body(x, y, height, reach, level=self.level_um, beam_shift=beam_shift)
         return body.with_material(self.material)

@@ -8,8 +8,8 @@ helio_law is the `kind` of a scene's table [material.NAME], every other helio_KE
 TOML (a single word needs no quotes). A scene's table [material.NAME] overrides the file's material of that name.
 """
 
+import contextlib
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,12 @@ from helio_jax.errors import InputFileError
 from helio_jax.scene.body import COSINE
 from helio_jax.scene.files import read_bytes
 from helio_jax.scene.scattering import Law
+from helio_jax.texts import parse_value
 
 MAX_MTL_MB = 16.0
 """Largest .mtl file."""
+MAX_MTL_FILES = 100
+"""Largest number of .mtl files that an OBJ file names."""
 _LAW: TypeAdapter = TypeAdapter(Law)
 _PREFIX = "helio"
 
@@ -40,13 +43,20 @@ def mtl_files(obj: Path, data: bytes) -> tuple[list[Path], list[str]]:
     """Find the .mtl files that an OBJ file names (mtllib): paths of existing ones, names of missing ones.
 
     Folders in the names are ignored: files are untrusted, only files beside the OBJ are read.
+
+    Raises:
+        InputFileError: it names more than `MAX_MTL_FILES`.
     """
     found, missing = [], []
-    for line in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, re.MULTILINE):
+    lines = list(dict.fromkeys(re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", data, re.MULTILINE)))
+    if len(lines) > MAX_MTL_FILES:
+        raise InputFileError(f"{obj}: names {len(lines)} .mtl files, the limit is {MAX_MTL_FILES}: join them")
+    for line in lines:
         text = line.decode("utf-8", "replace")
-        for name in [text] if text.count(".mtl") == 1 else text.split():
+        for name in [text] if text.count(".mtl") == 1 else text.split()[:MAX_MTL_FILES]:
             path = obj.parent / name.replace("\\", "/").rpartition("/")[2]
-            (found if path.is_file() else missing).append(path)
+            with contextlib.suppress(ValueError, OSError):  # a name that no file can have
+                (found if path.is_file() else missing).append(path)
     return list(dict.fromkeys(found)), [path.name for path in dict.fromkeys(missing)]
 
 
@@ -108,7 +118,7 @@ def _law(path: Path, name: str, keys: dict[str, tuple[int, str]]) -> Any:
         raise InputFileError(
             f"{path}, line {first}: the material {name!r} has no helio_law: add one, the kind of its scattering law"
         )
-    table = {key: _value(text) for key, (_, text) in keys.items() if key != "law"}
+    table = {key: parse_value(text) for key, (_, text) in keys.items() if key != "law"}
     kind = keys["law"][1].strip("\"'")
     try:
         return _LAW.validate_python({"kind": kind, **table})
@@ -129,12 +139,4 @@ def _sentence(problem: Any, kind: str, keys: dict[str, tuple[int, str]]) -> str:
     if problem["type"] == "extra_forbidden":
         return f"line {number}: helio_{key}: the law {kind!r} has no such key: correct or remove it (helio schema)"
     reason = str(problem["ctx"]["error"]) if problem["type"] == "value_error" else problem["msg"].lower()
-    return f"line {number}: helio_{'.'.join(inner) or 'law'} {text}: {reason.removeprefix('input ')}: correct it"
-
-
-def _value(text: str) -> Any:
-    """Parse a value as in TOML; anything else is a text."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    return f"line {number}: helio_{'.'.join(inner) or 'law'} {text[:60]}: {reason.removeprefix('input ')}: correct it"

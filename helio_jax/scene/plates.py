@@ -13,8 +13,9 @@ from helio_jax.detector import Detector
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Plate
 from helio_jax.scene.body import Body
+from helio_jax.scene.meshes import load_mesh
 from helio_jax.scene.placement import rotation_matrix
-from helio_jax.scene.sample import MESH_EXTENT_UM, check_body, load_mesh
+from helio_jax.scene.sample import MESH_EXTENT_UM, check_body
 from helio_jax.settings import UNITS_UM
 
 MAX_PLATE_MB = 200.0

@@ -4,13 +4,13 @@ Lab axes, relative to the pinhole's centre; z points up, away from the sample, s
 untrusted, see files.py.
 """
 
-import io
 from pathlib import Path
 
 import numpy as np
 
+from helio_jax.child import call_in_child
 from helio_jax.errors import InputFileError
-from helio_jax.scene.files import read_arrays, read_bytes, read_table
+from helio_jax.scene.files import check_file, read_arrays, read_table
 
 MAX_RAYS_MB = 256.0
 """Largest file of rays, and largest content of an .npz after decompression."""
@@ -30,9 +30,13 @@ def read_rays(path: Path) -> np.ndarray:
     kind = path.suffix.lower()
     if kind not in (".csv", ".npy", ".npz"):
         raise InputFileError(f"{path}: rays must be .csv, .npy or .npz, got {kind or 'no suffix'!r}")
-    data = read_bytes(path, MAX_RAYS_MB)
-    is_text, what = kind == ".csv", "a table of numbers separated by commas"
-    rows = read_table(path, data, what) if is_text else _read_numpy(path, data, kind)
+    if kind == ".csv":
+        rows = read_table(path, MAX_RAYS_MB, "a table of numbers separated by commas")
+    elif kind == ".npz":
+        rows = _stack(path, read_arrays(path, MAX_RAYS_MB, ("position", "direction"), ("weight",)))
+    else:
+        check_file(path, MAX_RAYS_MB)
+        rows = call_in_child("helio_jax.scene.rays:load_npy", path)
     if rows.ndim != 2 or rows.shape[1] not in (6, 7) or not len(rows):
         raise InputFileError(f"{path}: rays need 6 or 7 columns ({_COLUMNS}), got the shape {rows.shape}")
     rows = rows if rows.shape[1] == 7 else np.column_stack([rows, np.ones(len(rows))])
@@ -53,13 +57,14 @@ def read_rays(path: Path) -> np.ndarray:
     return rows
 
 
-def _read_numpy(path: Path, data: bytes, kind: str) -> np.ndarray:
-    """Read the rows of a NumPy file."""
+def _stack(path: Path, columns: list[np.ndarray]) -> np.ndarray:
+    """Join position, direction and weight of the rays."""
     try:
-        if kind == ".npz":
-            return np.column_stack(read_arrays(path, data, MAX_RAYS_MB, ("position", "direction"), ("weight",)))
-        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float64)
-    except InputFileError:
-        raise
-    except Exception as e:  # numpy raises many kinds on corrupt files
-        raise InputFileError(f"{path}: is not a readable {kind} file ({type(e).__name__}: {e})") from None
+        return np.column_stack(columns)
+    except ValueError as e:
+        raise InputFileError(f"{path}: position, direction and weight must be of one length: {e}") from None
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """Read the numbers of an .npy file; runs in a child process."""
+    return np.asarray(np.load(path, allow_pickle=False), np.float64)

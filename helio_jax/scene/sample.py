@@ -1,8 +1,8 @@
-"""Sample models, the table `[sample]`, selected by `kind`; mesh samples and the import of trimesh.
+"""Sample models, the table `[sample]`, selected by `kind`; mesh samples, and the check of a body by trimesh.
 
-Parametric samples are in shapes.py and rough.py, height maps in maps.py. `build(base_dir)` of each gives a `Body`:
-sample frame, z up, z = 0 on the substrate, um. Files are untrusted: size and number of faces are limited, contents are
-checked, every failure is an `InputFileError` that names the file.
+Parametric samples are in shapes.py and rough.py, height maps in maps.py, readers of meshes in meshes.py.
+`build(base_dir)` of each gives a `Body`: sample frame, z up, z = 0 on the substrate, um. Files are untrusted: size and
+number of faces are limited, contents are checked, every failure is an `InputFileError` that names the file.
 """
 
 from dataclasses import replace
@@ -17,6 +17,7 @@ from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes
 from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
+from helio_jax.scene.meshes import load_mesh
 from helio_jax.scene.mtl import FileLaw, mtl_files, used_laws
 from helio_jax.scene.placement import PlaceableSample
 from helio_jax.scene.rough import RoughSample
@@ -31,7 +32,8 @@ from helio_jax.scene.shapes import (
 )
 from helio_jax.settings import UNITS_UM, Settings, Unit
 
-MAX_FACES = 5_000_000
+MAX_PLACES = 5
+"""Largest number of open edges whose places are listed."""
 MESH_EXTENT_UM = (1e-2, 1e6)
 """Smallest and largest plausible extent of a mesh [um]."""
 
@@ -46,6 +48,10 @@ class MeshSample(MaterialSample):
     """Unit of the file's coordinates (STL and OBJ do not state it; GLB is in m)."""
     flat_size_um: Length | None = None
     """Side of a substrate added at z = 0 under the placed mesh; the mesh's faces in that plane are removed [um]."""
+    flip_normals: bool = False
+    """Reverse all faces: for a mesh that is inside out."""
+    mirror: Literal["none", "x", "y", "z"] = "none"
+    """Axis of the file whose coordinates change their sign, for files of a left-handed program; faces stay outside."""
     max_file_mb: float = Field(default=200.0, gt=0.0, le=10_000.0)
     """Larger files are refused [MB]."""
     materials: dict[str, str] = Field(default={}, max_length=1000)
@@ -60,7 +66,10 @@ class MeshSample(MaterialSample):
         """Read and check the mesh, in the file's unit (errors as `load_mesh`)."""
         laws = self.file_laws(base_dir)
         own = tuple(law.name for law in laws.values())
-        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, tuple(self.materials), own)
+        names, flip = tuple(self.materials), self.flip_normals
+        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, names, own, flip=flip)
+        if self.mirror != "none":  # which turns the outside of every face in
+            vertices, faces = vertices * np.where(np.array(["x", "y", "z"]) == self.mirror, -1.0, 1.0), faces[:, ::-1]
         by_part = (*self.material_names, *laws)
         names = tuple(dict.fromkeys(by_part))
         index = np.array([names.index(name) for name in by_part])[parts]
@@ -171,7 +180,8 @@ def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
     An open sheet is allowed: a substrate with structure is open along its outer border. `n_inner_open_edges` counts
-    open edges away from the sides of the bounding box, where rays would leak.
+    open edges away from the sides of the bounding box, where rays would leak; `holes_um` holds the middles of the first
+    `MAX_PLACES` of them.
 
     Args:
         body: after placement.
@@ -201,101 +211,8 @@ def check_body(body: Body, untilted: Body | None = None) -> dict[str, Any]:
         "is_inside_out": bool(mesh.is_watertight and mesh.volume < 0),
         "n_open_edges": len(open_edges),
         "n_inner_open_edges": int(np.sum(~on_side)),
+        "holes_um": body.vertices[unique[n_uses == 1][~on_side][:MAX_PLACES]].mean(1).round(4).tolist(),
         "n_edges_of_three_faces": int(np.sum(n_uses > 2)),
         "n_faces_without_area": int(np.sum(~np.any(body.normals, axis=1))),
         "n_duplicate_faces": len(body.faces) - len(sorted_faces),
     }
-
-
-def load_mesh(
-    path: Path, max_mb: float, names: tuple[str, ...] = (), own: tuple[str, ...] = ()
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Read a mesh in file units; equal vertices are merged, a closed mesh must not be inside out.
-
-    Args:
-        path: STL, OBJ, PLY or GLB file.
-        max_mb: largest file [MB].
-        names: parts that the file must contain.
-        own: materials of an OBJ (usemtl) to find among its other parts.
-
-    Returns:
-        Vertices [n, 3], faces [m, 3], and 1 + the index of each face's part in (*names, *own), 0: another part [m].
-
-    Raises:
-        InputFileError: the file is unreadable, holds no valid mesh, or lacks a part.
-    """
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in ("stl", "obj", "ply", "glb"):
-        raise InputFileError(f"{path}: a mesh must be .stl, .obj, .ply or .glb, got {path.suffix or 'no suffix'!r}")
-    data = read_bytes(path, max_mb)
-    import trimesh
-
-    try:
-        pieces = [piece for text, label in _split(data, kind, names, own) for piece in _pieces(text, kind, label)]
-    except Exception as e:  # trimesh's readers raise anything on corrupt files
-        raise InputFileError(f"{path}: cannot be read as a {kind.upper()} mesh ({type(e).__name__}: {e})") from e
-    first = np.cumsum([0, *(len(vertices) for vertices, _, _ in pieces)])
-    vertices = np.concatenate([np.zeros((0, 3)), *(v for v, _, _ in pieces)])
-    faces = np.concatenate([np.zeros((0, 3), np.int64), *(f + n for (_, f, _), n in zip(pieces, first, strict=False))])
-    known = (*names, *own)
-    parts = np.repeat([known.index(p) + 1 if p in known else 0 for _, _, p in pieces], [len(f) for _, f, _ in pieces])
-    if not len(faces):
-        raise InputFileError(f"{path}: the mesh has no triangles: export a surface, not points or lines")
-    if len(faces) > MAX_FACES:
-        raise InputFileError(f"{path}: the mesh has {len(faces)} triangles, the limit is {MAX_FACES}: decimate it")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputFileError(f"{path}: faces point to vertices that do not exist: the file is corrupt")
-    if not np.all(np.isfinite(vertices[faces])):
-        raise InputFileError(f"{path}: the mesh has non-finite coordinates: the file is corrupt")
-    if missing := [name for i, name in enumerate(names) if not np.any(parts == i + 1)]:
-        raise InputFileError(f"{path}: has no part {missing[0]!r}, which the scene names: correct the name")
-    clean = trimesh.Trimesh(vertices, faces, process=False)
-    clean.merge_vertices(merge_tex=True, merge_norm=True)
-    has_area = clean.nondegenerate_faces(height=0.0)
-    clean.update_faces(has_area)
-    if not len(clean.faces):
-        raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit is wrong")
-    if clean.is_watertight and clean.volume < 0:
-        raise InputFileError(
-            f"{path}: the mesh is inside out (volume < 0): flip its normals in the program that made it"
-        )
-    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
-
-
-def _split(data: bytes, kind: str, names: tuple[str, ...], own: tuple[str, ...]) -> list[tuple[bytes, str]]:
-    """Split an OBJ file into one text per named part, with the faces of that part; other kinds stay whole."""
-    if kind != "obj" or not (names or own):
-        return [(data, "")]
-    rest: list[bytes] = []
-    faces: dict[str, list[bytes]] = {}
-    current: dict[bytes, str] = {}
-    for line in data.replace(b"\\\n", b" ").splitlines():
-        word, _, value = line.strip().partition(b" ")
-        if word in (b"usemtl", b"g", b"o"):
-            current[word] = value.strip().decode("utf-8", "replace")
-        elif word == b"f":
-            found = [current[w] for w in (b"usemtl", b"g", b"o") if current.get(w) in names]
-            found += [current[b"usemtl"]] if current.get(b"usemtl") in own else []
-            faces.setdefault(found[0] if found else "", []).append(line)
-        elif word in (b"v", b"vn", b"vt"):
-            rest.append(line)
-    return [(b"\n".join(rest + lines), name) for name, lines in faces.items()]
-
-
-def _pieces(data: bytes, kind: str, label: str) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """Read vertices, faces and name of every geometry of a file, in its scene; `label` overrides the names."""
-    import io
-
-    import trimesh
-
-    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
-    loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, **options)
-    out = []
-    for node in loaded.graph.nodes_geometry:
-        matrix, name = loaded.graph[node]
-        mesh = loaded.geometry[name].copy()
-        if not isinstance(mesh, trimesh.Trimesh):
-            continue
-        mesh.apply_transform(matrix)
-        out.append((np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), label or str(name)))
-    return out

@@ -86,7 +86,9 @@ class Raster(Scan):
     ny: int = Field(ge=1, le=65536)
     """Rows."""
     pixel_size_um: float = Field(gt=0.0, le=1e5)
-    """Distance between neighbouring pixels; see `pitch` [um]."""
+    """Distance between neighbouring pixels, see `pitch`; of a column see pixel_size_y_um [um]."""
+    pixel_size_y_um: float | None = Field(default=None, gt=0.0, le=1e5)
+    """Distance between rows, where it is another one than between columns; default: pixel_size_um [um]."""
     pitch: Literal["beam", "sample"] = "beam"
     """`beam`: pixel size measured across the beam; on the sample it is pixel_size / cos t along the beam's azimuth
     (which must be a multiple of 90 deg); `sample`: equal in x and y on the sample."""
@@ -113,16 +115,18 @@ class Raster(Scan):
 
     def positions(self, beam: Beam, base_dir: Path = Path()) -> tuple[np.ndarray, np.ndarray]:
         stretch = 1.0 / math.cos(math.radians(beam.incidence_deg)) if self.pitch == "beam" else 1.0
-        step_x, step_y = self.pixel_size_um * stretch, self.pixel_size_um
+        step_x, step_y = self.pixel_size_um, self.pixel_size_y_um or self.pixel_size_um
         if beam.azimuth_deg % 180 != 0:
-            step_x, step_y = step_y, step_x
+            step_y *= stretch
+        else:
+            step_x *= stretch
         x = self.center_um[0] + (np.arange(self.nx) - 0.5 * (self.nx - 1)) * step_x
         y = self.center_um[1] + (np.arange(self.ny) - 0.5 * (self.ny - 1)) * step_y
         return x, y
 
     @property
     def spacing(self) -> float | None:
-        return self.pixel_size_um
+        return min(self.pixel_size_um, self.pixel_size_y_um or self.pixel_size_um)
 
 
 class Line(Scan):

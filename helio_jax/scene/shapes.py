@@ -17,6 +17,8 @@ from helio_jax.settings import Settings
 
 Length = Annotated[float, Field(gt=0.0, le=1e6)]
 """A length of a sample [um]."""
+MAX_MOATS = 100
+"""Largest number of moats of a sample; each is made of thousands of triangles and takes 0.1 s."""
 
 
 class MaterialSample(PlaceableSample):
@@ -113,6 +115,8 @@ class SpheresSample(SubstrateSample):
     @model_validator(mode="after")
     def _has_room_for_moats(self) -> "SpheresSample":
         moats = self._moats()
+        if len(moats) > MAX_MOATS:
+            raise ValueError(f"at most {MAX_MOATS} spheres can have a moat, got {len(moats)}: remove some of them")
         reach = np.abs(moats[:, :2]) + moats[:, 2:3]
         if reach.size and reach.max() >= 0.5 * self.size_um:
             raise ValueError(

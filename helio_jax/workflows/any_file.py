@@ -1,11 +1,13 @@
 """Read a file of any kind that holds a record: micrographs, heights, a scene, an instrument."""
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
-from helio_jax.errors import InputFileError
+from helio_jax.child import check_size
+from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import MAX_BYTES, read
 from helio_jax.formats.matlab import import_micrographs
-from helio_jax.formats.safe import check_size
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.heightmap import HeightMap
 from helio_jax.instrument import Instrument
@@ -19,22 +21,29 @@ Record = Micrographs | Reconstruction | HeightMap | Instrument
 """What a file can hold; a scene is an instrument, too."""
 
 
-def read_any(path: str | os.PathLike, instrument: str | os.PathLike | None = None) -> Record:
+def read_any(
+    path: str | os.PathLike,
+    instrument: str | os.PathLike | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Record:
     """Read a record from a file by its suffix and, of TOML, by its tables.
 
     Args:
         path: .h5 of helio; .toml of a scene or an instrument, or the name of one that comes with the program; .mat of
             micrographs; .npz of a height map (in um).
         instrument: file or name of the instrument, for a .mat file.
+        overrides: values that override a scene or an instrument, dotted keys.
 
     Raises:
         InputFileError: missing, damaged, or of an unknown kind.
-        SceneError: a wrong scene or instrument file, or an unknown name.
+        SceneError: a wrong scene or instrument file, an unknown name, or overrides of another file.
     """
     path = locate(path)
     kind = path.suffix.lower()
     if kind == ".toml":
-        return load_scene(path) if is_scene(read_tables(path)) else load_instrument(path)
+        return load_scene(path, overrides) if is_scene(read_tables(path)) else load_instrument(path, overrides)
+    if overrides:
+        raise SceneError(f"{path}: --set {next(iter(overrides))}: only values of a scene or an instrument can be set")
     check_size(path, MAX_BYTES)
     if kind in HDF5_SUFFIXES:
         return read(path)

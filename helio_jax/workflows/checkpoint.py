@@ -155,12 +155,15 @@ class CheckpointedRun:
         """Return the micrographs when all shards are finished, to one process only."""
         if self.shard is not None:
             n_there = sum(self.parts.has(unit.number) for unit in units)
-            mine = f"shard {self.shard.number}/{self.shard.of} is finished"
+            own = f"{self.shard.number}/{self.shard.of}"
+            mine = f"shard {own} is finished"
             if n_there < len(units):
                 self.say(f"{mine}; {n_there} of all {len(units)} units are finished")
                 return None
-            if not self.parts.claim():
-                self.say(f"{mine}, as are all others; another process writes {self.parts.output}")
+            if not self.parts.claim(own):
+                other = self.parts.claimed_by()
+                how = f": if it was killed, repeat it or run `helio resume {self.parts.output}`" if other else ""
+                self.say(f"{mine}, as are all others; shard {other or 'i/N'} writes {self.parts.output}{how}")
                 return None
             for unit in units:
                 if unit.number in scan_result.missing:

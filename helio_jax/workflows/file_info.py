@@ -11,23 +11,24 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.child import check_size
 from helio_jax.errors import InputFileError
 from helio_jax.figures.summary import Rows, summarise
 from helio_jax.figures.wording import plural
 from helio_jax.formats import hdf5
 from helio_jax.formats.matlab import describe_matlab
 from helio_jax.formats.points import HEADER, read_points
-from helio_jax.formats.safe import check_size
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.body import Body
-from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, read_bytes, read_height_map, read_table
-from helio_jax.scene.sample import MeshSample, check_body, load_mesh
+from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, check_file, read_bytes, read_height_map, read_table
+from helio_jax.scene.meshes import KINDS as MESHES
+from helio_jax.scene.meshes import load_mesh
+from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.workflows.scene_file import SceneFile, is_scene, load_instrument, load_scene, read_tables, resolved
 from helio_jax.workflows.shipped import locate
-from helio_jax.workflows.study import load_study
+from helio_jax.workflows.study_file import load_study
 
-MESHES = (".stl", ".obj", ".ply", ".glb")
 TABLES = (".csv", ".tsv", ".txt")
 _MANY = 12
 """A table with more columns is a grid."""
@@ -99,8 +100,7 @@ Found = tuple[str, Rows, dict[str, Any]]
 
 
 def _of_hdf5(path: Path) -> Found:
-    about = hdf5.describe(path)
-    record = hdf5.read(path)
+    record, about = hdf5.read_described(path)
     del about["file"], about["bytes"]
     if isinstance(record, Reconstruction):
         about["trust"] = record.trust
@@ -163,12 +163,12 @@ def _of_mesh(path: Path) -> Found:
 
 
 def _of_npz(path: Path) -> Found:
-    data = read_bytes(path, MAX_HEIGHT_MAP_MB)
+    check_file(path, MAX_HEIGHT_MAP_MB)
     try:
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
     except zipfile.BadZipFile as e:
-        raise InputFileError(f"{path}: is not a readable .npz file ({len(data)} bytes): {e}") from None
+        raise InputFileError(f"{path}: is not a readable .npz file: {e}") from None
     if {"x", "y", "height"} <= sizes.keys():
         rows = summarise(read_height_map(path, 1.0, None))
         return "height map", [*rows, ("unit", "um is assumed here; a scene states it (sample.unit)")], {"arrays": sizes}
@@ -201,8 +201,10 @@ def _of_mtl(path: Path) -> Found:
 
 
 def _of_table(path: Path) -> Found:
-    data = read_bytes(path, MAX_HEIGHT_MAP_MB)
-    first = data[:4096].decode("utf-8-sig", "replace").splitlines()[0]
+    check_file(path, MAX_HEIGHT_MAP_MB)
+    with path.open("rb") as file:
+        head = file.read(4096)
+    first = head.decode("utf-8-sig", "replace").splitlines()[0]
     names = [name.strip() for name in first.split(",")]
     if names == HEADER:
         views = read_points(path)
@@ -210,9 +212,10 @@ def _of_table(path: Path) -> Found:
         return "control points", rows, {"points": views}
     has_names = re.search(r"[A-Za-z_]{2}", first) is not None and not first.lstrip().startswith("#")
     separator = "," if path.suffix.lower() == ".csv" else None
-    table = read_table(
-        path, data, "a table of numbers", separator=separator, titles=first.replace(" ", "") if has_names else ""
-    )
+    titles = first.replace(" ", "") if has_names else ""
+    table = read_table(path, MAX_HEIGHT_MAP_MB, "a table of numbers", separator=separator, titles=titles)
+    if not table.size:
+        raise InputFileError(f"{path}: holds no numbers below its titles: write it again")
     n_rows, n_columns = table.shape
     rows = [("table", f"{n_rows} lines of {plural(n_columns, 'number')}")]
     if n_columns > _MANY or (not has_names and n_columns > 7):

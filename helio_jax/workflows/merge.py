@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from helio_jax.errors import SceneError
+from helio_jax.texts import MAX_DEPTH
 
 APPEND = "append"
 """Table whose lists are added to those of the extended file."""
@@ -71,9 +72,15 @@ def append(tables: Mapping[str, Any], more: Any, above: str = "") -> dict[str, A
 
 
 def nest(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert dotted keys to nested tables."""
+    """Convert dotted keys to nested tables.
+
+    Raises:
+        SceneError: a key has more than `MAX_DEPTH` parts.
+    """
     out: dict[str, Any] = {}
     for key, value in overrides.items():
+        if key.count(".") >= MAX_DEPTH:
+            raise SceneError(f"{key[:60]}...: a key has at most {MAX_DEPTH} parts: correct it (helio schema)")
         first, _, rest = key.partition(".")
         nested = {rest: value} if rest else value
         out = merge(out, {first: nest(nested) if isinstance(nested, Mapping) else nested})
@@ -82,7 +89,7 @@ def nest(overrides: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_index(key: str, array: list) -> bool:
     """Whether a key is the index of an element."""
-    return key in map(str, range(len(array)))
+    return key.isdecimal() and len(key) < 10 and str(int(key)) == key and int(key) < len(array)
 
 
 def _is_tables(value: Any) -> bool:

@@ -27,13 +27,17 @@ def explain_errors(source: str, error: ValidationError, model: type[BaseModel], 
         model: the validated model.
         data: the validated tables.
     """
-    lines = []
+    lines: list[str] = []
+    n_more = 0
     for item in error.errors(include_url=False):
+        if len(lines) >= MAX_SHOWN:
+            n_more += 1
+            continue
         loc = _without_tags(item["loc"], data)
         if item["type"] in ("too_short", "too_long") and not _has_wrong_length(item):
             continue  # pydantic reports a list with invalid items as too short, too
         lines += _explain(item, loc, model, data)
-    n = len(lines)
+    n = len(lines) + n_more
     shown = lines[:MAX_SHOWN] + ([f"... and {n - MAX_SHOWN} more"] if n > MAX_SHOWN else [])
     return f"{source}: {n} error{'s' if n != 1 else ''}:\n" + "\n".join(f"  {line}" for line in shown)
 

@@ -4,7 +4,6 @@
 """
 
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.reconstruction import Reconstruction
-from helio_jax.scene.files import read_bytes
+from helio_jax.scene.files import read_toml
 from helio_jax.scene.scan import with_scan_kind
 from helio_jax.scene.scene import Scene
 from helio_jax.scores.settings import TruthSettings
@@ -178,7 +177,7 @@ def replaced_lists(path: Path) -> list[str]:
 
 def _read_layers(path: Path) -> tuple[dict[str, Any], dict[str, Any], Path | None]:
     """Read the tables of the file that a file extends, its own tables without `extends`, and the path of the former."""
-    data = _read_toml(path)
+    data = read_toml(path, MAX_SCENE_MB)
     if "extends" not in data:
         if APPEND in data:
             raise SceneError(f"{path}: {APPEND} adds to the lists of another file: name it with extends")
@@ -188,7 +187,7 @@ def _read_layers(path: Path) -> tuple[dict[str, Any], dict[str, Any], Path | Non
         raise SceneError(f"{path}: extends must be the name of one TOML file in quotes, got {name!r}")
     try:
         base_path = locate(name, path.parent)
-        base = _read_toml(base_path)
+        base = read_toml(base_path, MAX_SCENE_MB)
     except SceneError as e:
         raise SceneError(f"{path}: extends = {name!r}: {e}") from None
     if "extends" in base:
@@ -220,18 +219,3 @@ def with_files(tables: Mapping[str, Any], change: Callable[[str], str]) -> dict[
 
     tables_with_files = ("beam", "plate", "sample", "material", "scan")
     return {key: changed(node) if key in tables_with_files else node for key, node in tables.items()}
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    """Read one TOML file; numbers must be finite."""
-    raw = read_bytes(path, MAX_SCENE_MB, SceneError)
-    try:
-        return tomllib.loads(raw.decode("utf-8-sig"))
-    except UnicodeDecodeError as e:
-        line = raw[: e.start].count(b"\n") + 1
-        text = f"{path}: is not UTF-8 text (byte {raw[e.start]:#04x} in line {line}): save it as UTF-8"
-        raise SceneError(text) from None
-    except tomllib.TOMLDecodeError as e:
-        raise SceneError(f"{path}: is not valid TOML: {e}") from None
-    except RecursionError:
-        raise SceneError(f"{path}: is nested too deeply: a scene has tables of plain values") from None

@@ -5,6 +5,7 @@ The functions behind `hx.show`, `stack.plot()`, `rec.plot()`, `scene.plot()` and
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,7 @@ def show(
     instrument: str | os.PathLike | None = None,
     common_scale: bool = False,
     view: int = 0,
+    overrides: Mapping[str, Any] | None = None,
 ) -> canvas.Figure:
     """Draw a record or a file; write the picture, open a window, or return the figure for a notebook.
 
@@ -87,6 +89,7 @@ def show(
         instrument: file or name of an instrument for a .mat file, which lacks its own.
         common_scale: micrographs: one grey scale for all images.
         view: scene: which view of the scan, from 0.
+        overrides: file of a scene or an instrument: values that override it, dotted keys.
 
     Raises:
         SceneError: nothing can be drawn of it, an unknown name, or the picture cannot be written.
@@ -99,7 +102,7 @@ def show(
         path = locate(what)
         if output is not None:
             check_outputs([("file", path)], [("-o", Path(output))])
-        what = read_any(path, instrument)
+        what = read_any(path, instrument, overrides)
     figure = draw(what, common_scale=common_scale, view=view)
     if output is not None:
         canvas.save_figure(figure, Path(output))

@@ -9,19 +9,13 @@ finished units, so a killed study loses seconds.
 import csv
 import hashlib
 import io
-import itertools
 import json
 import math
 import time
-import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-from pydantic import Field, ValidationError, model_validator
-from scipy.stats import qmc
+from typing import Any
 
 from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.figures.sweep import save_sweep
@@ -29,143 +23,17 @@ from helio_jax.formats.safe import atomic_path, check_outputs, files_within, mak
 from helio_jax.formats.toml import to_toml
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.files import read_bytes
-from helio_jax.settings import Settings
+from helio_jax.texts import parse_json
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.checkpoint import Shard
-from helio_jax.workflows.scene_errors import explain_errors
 from helio_jax.workflows.scene_file import files_read, load_scene, resolved, with_files
 from helio_jax.workflows.shipped import locate
+from helio_jax.workflows.study_file import MAX_STUDY_MB, Study, load_study
 
-MAX_POINTS = 100_000
 INDEX_SECONDS = 5.0
 """Minimum time between two updates of the index [s]."""
-MAX_STUDY_MB = 4.0
 WRITTEN = ("study.json", "index.json", "index.csv", "index.png")
 """Files in a study's folder, beside those of its points."""
-
-
-class Range(Settings):
-    """A range of numbers."""
-
-    low: float
-    """Smallest value."""
-    high: float
-    """Largest value."""
-    n: int | None = Field(default=None, ge=2, le=MAX_POINTS)
-    """`grid`, `list`: number of equally spaced values."""
-    log: bool = False
-    """Spaced equally in the logarithm."""
-    whole: bool = False
-    """Rounded to whole numbers."""
-
-    @model_validator(mode="after")
-    def _is_range(self) -> "Range":
-        if not self.low < self.high or (self.log and self.low <= 0):
-            limit = "0 < low < high with log" if self.log else "low < high"
-            raise ValueError(f"a range needs {limit}, got low = {self.low:g}, high = {self.high:g}")
-        return self
-
-    def at(self, shares: np.ndarray) -> list[float | int]:
-        """Return the values at fractions `shares` (0 to 1) of the range."""
-        ends = np.log([self.low, self.high]) if self.log else np.array([self.low, self.high])
-        found = ends[0] + shares * (ends[1] - ends[0])
-        found = np.clip(np.exp(found) if self.log else found, self.low, self.high)
-        return [round(v) if self.whole else float(v) for v in found]
-
-
-class Study(Settings):
-    """A study file."""
-
-    scene: str = Field(min_length=1, max_length=4096)
-    """Scene file, relative to the study file."""
-    name: str = Field(default="study", min_length=1, max_length=200)
-    """Title of the plot."""
-    design: Literal["grid", "list", "sobol"] = "grid"
-    """`grid`: all combinations; `list`: the i-th values together; `sobol`: scrambled Sobol points in the ranges."""
-    n_points: int | None = Field(default=None, ge=1, le=MAX_POINTS)
-    """`sobol`: number of points."""
-    seed: int = Field(default=1, ge=0, lt=2**63)
-    """`sobol`: seed of the scrambling (the tracer's seed is "trace.seed")."""
-    reconstruct: bool = True
-    """Reconstruct and score the heights, too; false: micrographs only."""
-    report: bool = False
-    """Write an HTML report for each point, too."""
-    score: str | None = None
-    """Column of the index to plot; default: the RMS error, or the share of multiple scattering."""
-    set: dict[str, Any] = {}
-    """Values for all points, by dotted key, e.g. "trace.rays" = 32."""
-    vary: dict[str, list[Any] | Range] = Field(min_length=1)
-    """Values or ranges, by dotted key, e.g. "sample.spheres.0.cap_height_um" = [100.0, 400.0]."""
-
-    @model_validator(mode="after")
-    def _fits_design(self) -> "Study":
-        problems = []
-        for key, values in self.vary.items():
-            is_range = isinstance(values, Range)
-            if self.design == "sobol" and not is_range:
-                problems.append(f'vary: "{key}" must be a range for design "sobol", e.g. {{ low = 1.0, high = 2.0 }}')
-            if self.design != "sobol" and is_range and values.n is None:
-                problems.append(f'vary: "{key}" needs n, the number of values, for design "{self.design}"')
-            if not is_range and not values:
-                problems.append(f'vary: "{key}" must have at least one value, got []')
-        if self.design == "sobol" and self.n_points is None:
-            problems.append('n_points: is missing, design "sobol" needs it')
-        if not problems and (n := self._n_points()) > MAX_POINTS:
-            problems.append(f"vary: gives {n} points, the limit is {MAX_POINTS}: vary less")
-        if not problems and self.design == "list" and len({len(v) for v in self._lists()}) > 1:
-            counts = ", ".join(f'"{k}" {len(v)}' for k, v in zip(self.vary, self._lists(), strict=True))
-            problems.append(f'vary: design "list" needs as many values of each, got {counts}')
-        if problems:
-            raise ValueError("\n".join(problems))
-        return self
-
-    def _lists(self) -> list[list[Any]]:
-        return [v.at(np.linspace(0, 1, v.n)) if isinstance(v, Range) else v for v in self.vary.values()]  # type: ignore[arg-type]
-
-    def _n_points(self) -> int:
-        sizes = [v.n if isinstance(v, Range) else len(v) for v in self.vary.values()]
-        if self.design == "sobol":
-            return self.n_points or 0
-        return math.prod(n or 0 for n in sizes) if self.design == "grid" else sizes[0] or 0
-
-    def points(self) -> list[dict[str, Any]]:
-        """Return the varied values of each point, by dotted key."""
-        if self.design == "sobol":
-            n = self._n_points()
-            unit = qmc.Sobol(len(self.vary), scramble=True, rng=self.seed).random_base2((n - 1).bit_length())[:n]
-            columns = [v.at(unit[:, i]) for i, v in enumerate(self.vary.values()) if isinstance(v, Range)]
-            rows: Any = zip(*columns, strict=True)
-        else:
-            rows = itertools.product(*self._lists()) if self.design == "grid" else zip(*self._lists(), strict=True)
-        return [dict(zip(self.vary, row, strict=True)) for row in rows]
-
-
-def load_study(path: Path) -> Study:
-    """Read a study file.
-
-    Raises:
-        SceneError: missing, not TOML, or invalid; the message lists all errors.
-    """
-    try:
-        data = tomllib.loads(read_bytes(path, MAX_STUDY_MB, SceneError).decode("utf-8-sig"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
-        raise SceneError(f"{path}: is not valid TOML: {e}") from None
-    for table in ("set", "vary"):
-        if isinstance(data.get(table), Mapping):
-            data[table] = dict(_flat(data[table]))
-    try:
-        return Study.model_validate(data)
-    except ValidationError as e:
-        raise SceneError(explain_errors(str(path), e, Study, data)) from None
-
-
-def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and values of a table whose keys are quoted ("trace.rays") or nested (trace.rays)."""
-    for key, value in table.items():
-        if isinstance(value, Mapping) and not set(value) <= set(Range.model_fields):
-            yield from _flat(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
 
 
 @dataclass(frozen=True)
@@ -179,7 +47,7 @@ class _Point:
     def row(self) -> dict[str, Any] | None:
         """Return the row of the index of a finished or failed point, or None."""
         try:
-            return json.loads((self.folder / "point.json").read_text(encoding="utf-8"))
+            return parse_json((self.folder / "point.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
 
@@ -234,7 +102,7 @@ def resume_study(folder: Path, *, say: Callable[[str], None] = print) -> Path:
     """
     manifest = folder / "study.json"
     try:
-        path = Path(json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError))["study"])
+        path = Path(parse_json(read_bytes(manifest, MAX_STUDY_MB, SceneError))["study"])
     except (KeyError, TypeError, ValueError) as e:
         raise ResumeError(f"{manifest} is damaged ({e!r}): repeat the study command with --resume") from None
     if not path.is_file():
@@ -254,7 +122,7 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
     if not is_shared:
         raise ResumeError(f"{folder} holds a study already: continue it with --resume, or set another folder with -o")
     try:
-        then = dict(json.loads(read_bytes(manifest, MAX_STUDY_MB, SceneError)))
+        then = dict(parse_json(read_bytes(manifest, MAX_STUDY_MB, SceneError)))
     except (ValueError, TypeError):
         raise ResumeError(f"{manifest} is damaged: remove it, and repeat the study command with --resume") from None
     if then.get("scenes") != now["scenes"]:

@@ -1,6 +1,7 @@
 """Check a scene or instrument file for `helio validate`, and summarise what it describes."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,9 @@ from typing import Any
 from helio_jax.detector import Detector
 from helio_jax.figures.summary import Rows, summarise
 from helio_jax.instrument import Instrument
+from helio_jax.scene.body import Body
 from helio_jax.scene.plates import check_solid
-from helio_jax.scene.sample import check_body
+from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.workflows.scene_file import (
     SceneFile,
     is_scene,
@@ -47,11 +49,12 @@ class Checked:
     warnings: tuple[str, ...] = ()
 
 
-def check_file(name: str | Path) -> Checked:
+def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Checked:
     """Check a scene, its sample and the files that it names, or an instrument.
 
     Args:
         name: of the file, or of a scene or instrument that comes with the program.
+        overrides: values that override the file, as in `load_scene`.
 
     Raises:
         SceneError: errors of the file; the message lists all of them.
@@ -60,21 +63,24 @@ def check_file(name: str | Path) -> Checked:
     path = locate(name)
     replaced = tuple(replaced_lists(path))
     if not is_scene(read_tables(path)):
-        return Checked(str(path), "instrument", *_describe(load_instrument(path)), replaced=replaced)
-    scene = load_scene(path)
+        return Checked(str(path), "instrument", *_describe(load_instrument(path, overrides)), replaced=replaced)
+    scene = load_scene(path, overrides)
     scene.read_laws()
     scene.read_rays()
     plate = scene.read_plate()
     ny, nx = scene.image_shape
+    body = scene.build_body()
+    from helio_jax.workflows.scene_warnings import scene_warnings  # numba: seconds that a wrong file does not need
+
     return Checked(
         str(path),
         "scene",
         *_describe(scene.instrument),
         image={"nx": nx, "ny": ny, "views": scene.scan.n_views},
-        body=_check_sample(scene),
+        body=_check_sample(scene, body),
         plate=None if plate is None else check_solid(plate),
         replaced=replaced,
-        warnings=tuple(scene.warnings()),
+        warnings=(*scene.warnings(), *scene_warnings(scene, body)),
     )
 
 
@@ -106,7 +112,9 @@ def _describe_detector(detector: Detector, working_distance: float) -> dict[str,
     }
 
 
-def _check_sample(scene: SceneFile) -> dict[str, Any]:
+def _check_sample(scene: SceneFile, body: Body) -> dict[str, Any]:
     """Check the triangles of a scene's sample."""
-    untilted = scene.sample.build_shape(scene.base_dir) if scene.sample.is_tilted else None
-    return check_body(scene.build_body(), untilted)
+    sample = scene.sample
+    stands_on_flat = isinstance(sample, MeshSample) and sample.flat_size_um is not None  # which does not tilt with it
+    untilted = sample.build_shape(scene.base_dir) if sample.is_tilted and not stands_on_flat else None
+    return check_body(body, untilted)

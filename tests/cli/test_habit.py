@@ -2,16 +2,23 @@
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
+import warnings
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
 import helio_jax.__main__
+from helio_jax import __version__
 from helio_jax.commands.app import app, say
 from helio_jax.commands.door import is_quiet
+from helio_jax.commands.interrupts import not_lost
+from helio_jax.commands.log import logged
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -79,6 +86,110 @@ def test_warnings_and_errors_stay(capsys):
     with pytest.raises(SystemExit) as end:
         helio_jax.__main__.main(["info", "nowhere.h5", "--quiet"])
     assert end.value.code == 3 and "nowhere.h5" in capsys.readouterr().err
+
+
+def test_log_holds_command_messages_warnings_and_end(tmp_path, monkeypatch):
+    """Two commands in one log: version and command, messages, Python's and our warnings, the error; times.
+
+    Catches a log that is replaced by the next command, one that --quiet empties, and handlers that stay.
+    """
+    path = tmp_path / "a log.txt"
+    monkeypatch.setattr(sys, "argv", ["helio", "simulate", "my scene"])
+    with logged(path):
+        token = is_quiet.set(True)
+        say("tracing")
+        is_quiet.reset(token)
+        say("warning: do not trust it")
+        warnings.warn("a division by zero", stacklevel=1)
+    say("after it")
+    done = CliRunner().invoke(app, ["info", str(tmp_path / "nowhere.h5"), "--log", str(path)])
+    assert done.exception is not None
+    found = path.read_text()
+    assert len(re.findall(r"(?m)^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING) ", found)) == 7
+    wanted = (f"helio_jax {__version__}", "helio simulate 'my scene'", "tracing", "WARNING warning: do not trust it")
+    wanted += ("a division by zero", "ended well", "ended with exit code 3", "nowhere.h5 does not exist")
+    places = [found.find(text) for text in wanted]
+    assert -1 not in places and places == sorted(places) and "after it" not in found
+
+
+def test_log_is_no_input(tmp_path):
+    """Catches a log that is written into the file that the command reads."""
+    (tmp_path / "a.h5").write_bytes(b"measured for a week")
+    path = str(tmp_path / "a.h5")
+    done = CliRunner().invoke(app, ["info", path, "--log", path])
+    assert "is the same file as" in str(done.exception) and (tmp_path / "a.h5").read_bytes() == b"measured for a week"
+
+
+SCENE_COMMANDS = ("run", "simulate", "rays", "spot", "plate", "validate", "show", "compare")
+
+
+@pytest.mark.parametrize("name", SCENE_COMMANDS)
+def test_values_of_a_scene_can_be_set(name):
+    """Catches a command that takes a scene and no --set."""
+    assert "--set" in {option for param in COMMANDS[name].params for option in param.opts}
+
+
+def test_set_takes_values_as_in_toml():
+    """Numbers, lists and words; what is wrong is told. Catches values that stay texts, and a key set twice."""
+
+    def validate(*items: str) -> tuple[int, str]:
+        words = [word for item in items for word in ("--set", item)]
+        done = CliRunner().invoke(app, ["validate", "sphere_a", "--json", *words])
+        return getattr(done.exception, "exit_code", done.exit_code), done.stdout + str(done.exception)
+
+    code, text = validate("scan.nx=7", "sample.spheres.0.center_um=[50, 0]", "scan.pitch=sample")
+    assert code == 0 and json.loads(text.removesuffix("None"))["image"]["nx"] == 7
+    for items, told in (
+        (["scan.nx"], "give it as KEY=VALUE"),
+        (["scan.nx=7", "scan.nx=8"], "is given already"),
+        (["scan.nnx=7"], "unknown key 'nnx'"),
+        (["a." * 50 + "b=1"], "at most 32 parts"),
+    ):
+        code, text = validate(*items)
+        assert code == 2 and told in text, text
+
+
+@pytest.mark.skipif(os.name != "posix", reason="interval timer")
+def test_interrupt_that_python_drops_comes_again():
+    """Ctrl-C inside a destructor, where Python drops KeyboardInterrupt: it ends the block within a second.
+
+    Catches a command that goes on after Ctrl-C (JAX's callback of the garbage collector drops it, too).
+    """
+
+    class Interrupted:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    start, before = time.monotonic(), (sys.unraisablehook, signal.getsignal(signal.SIGALRM))
+    with pytest.raises(KeyboardInterrupt), not_lost():
+        it = Interrupted()
+        del it
+        while time.monotonic() < start + 10.0:
+            pass
+    assert time.monotonic() < start + 5.0 and before == (sys.unraisablehook, signal.getsignal(signal.SIGALRM))
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is always full")
+def test_full_disk_under_stdout_is_no_bug():
+    """`helio info > FILE` on a full disk: exit code 2 and the reason. Catches a traceback (exit code 1)."""
+    code = "import sys; sys.argv[1:] = ['schema']; from helio_jax.__main__ import main; main()"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 2 and "No space left on device" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_read_only_home_no_display_and_spaces(tmp_path):
+    """A scene drawn without a home, a display or colours, into a folder with a space. Catches a need of any of them."""
+    folder = tmp_path / "with space"
+    folder.mkdir()
+    code = f"import sys; sys.argv[1:] = ['show', 'step', '-o', {str(folder / 'a b.png')!r}]; "
+    code += "from helio_jax.__main__ import main; main()"
+    gone = {name: str(tmp_path / "nowhere" / name) for name in ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")}
+    (tmp_path / "nowhere").touch()  # a file: nothing can be made below it, not even by root
+    asked = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "JAX_COMPILATION_CACHE_DIR")} | gone
+    done = subprocess.run([sys.executable, "-c", code], env=asked, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and (folder / "a b.png").is_file(), done.stderr
+    assert "\x1b" not in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(

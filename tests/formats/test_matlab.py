@@ -13,7 +13,7 @@ import scipy.io
 from scipy import ndimage
 
 from helio_jax.errors import InputFileError
-from helio_jax.formats import matlab, safe
+from helio_jax.formats import matlab
 from helio_jax.formats.matlab import import_micrographs
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.workflows.shipped import find_shipped
@@ -73,7 +73,8 @@ def import_tree(monkeypatch, tmp_path):
     def run(tree, instrument):
         path = tmp_path / "made.mat"
         path.write_bytes(b"MATLAB 5.0 MAT-file")
-        monkeypatch.setattr(safe, "call_in_child", lambda *_, **__: {k: matlab._reduce(k, v) for k, v in tree.items()})
+        reduced = {k: matlab._reduce(k, v) for k, v in tree.items()}
+        monkeypatch.setattr(matlab, "call_in_child", lambda *_, **__: reduced)
         return import_micrographs(path, instrument)
 
     return run

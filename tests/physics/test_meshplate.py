@@ -15,8 +15,8 @@ from helio_jax.errors import InputFileError, MissingDependencyError, SceneError
 from helio_jax.formats.hdf5 import read
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.drill import SOLID_NAME, DrilledPlate, drill_plate
+from helio_jax.scene.meshes import load_mesh
 from helio_jax.scene.plates import read_plate
-from helio_jax.scene.sample import load_mesh
 from helio_jax.scene.scattering import CosineLaw
 from helio_jax.scene.shapes import FlatSample, Sphere, SpheresSample
 from helio_jax.trace.intersect import Hits

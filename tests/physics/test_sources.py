@@ -181,7 +181,7 @@ def test_scene_with_rays(tmp_path):
         ("rays.csv", "0,0,0,0,0,0\n", "a vector of length 0"),
         ("rays.csv", "0,0,0,0,0,-1,-2\n", "must have a weight >= 0"),
         ("rays.csv", "0,0,0,0,0,-1,0\n", "all 1 weights are 0"),
-        ("rays.npy", "junk", "is not a readable .npy file"),
+        ("rays.npy", "junk", "cannot be read, it is corrupt"),
         ("rays.npz", "junk", "is not a readable .npz file"),
     ],
 )

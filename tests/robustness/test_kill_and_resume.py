@@ -218,6 +218,34 @@ def test_shards_make_the_same_file(whole, tmp_path):
     assert f"{N_UNITS // 3} of {N_UNITS // 3} units are finished" in said[2]
 
 
+def test_shard_that_was_killed_while_it_wrote_is_repeated(whole, tmp_path, monkeypatch):
+    """The last shard dies after it claimed the merge: the other one says whose turn it is, the same command writes.
+
+    Catches a claim that outlives its owner: the command then ended with exit code 0 and never a file.
+    """
+    output, said = tmp_path / "out.h5", []
+
+    def simulate(shard: str) -> None:
+        options = pipeline.SimulateOptions(executor=Executor(1), shard=shard, say=said.append)
+        pipeline.simulate_file(SCENE, output, overrides=SMALL, options=options)
+
+    class Killed(BaseException):
+        pass
+
+    def die(self, write):
+        raise Killed
+
+    simulate("1/2")
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Parts, "finish", die)
+        simulate("2/2")
+    simulate("1/2")
+    assert not output.exists() and "shard 2/2 writes" in said[-1] and "if it was killed, repeat it" in said[-1]
+    simulate("2/2")
+    assert_same_bits(hx.read(output), whole[0])
+    assert list(tmp_path.iterdir()) == [output]
+
+
 def test_killed_process_is_replaced(whole, tmp_path):
     """One of two worker processes killed half-way: the run ends well, with the same bits; twice nothing is traced.
 

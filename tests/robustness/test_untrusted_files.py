@@ -1,20 +1,31 @@
 """Bad files end in an InputFileError that names the file; they never crash or hang this process."""
 
+import json
 import os
+import struct
 import subprocess
 import sys
+import time
+import zlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
+import trimesh
 
+from helio_jax import child
 from helio_jax.errors import InputFileError, MissingDependencyError, SceneError
 from helio_jax.formats import hdf5, safe
 from helio_jax.formats.matlab import import_micrographs
 from helio_jax.instrument import Detector, Instrument, Plate
 from helio_jax.micrograph import MicrographStack
+from helio_jax.scene.files import read_height_map
+from helio_jax.scene.meshes import load_mesh, parse_mesh
+from helio_jax.texts import parse_toml
+from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.study_file import load_study
 
 
 def make_instrument() -> Instrument:
@@ -179,6 +190,28 @@ def _kind(file):
     file.attrs["filetype"] = "spectrum"
 
 
+def _many_links(file):
+    file["entry/x0"] = np.zeros(2)
+    for i in range(9):
+        file[f"entry/x0_{i}"] = file["entry/x0"]
+
+
+def _never_filled(file):
+    del file["entry/micrographs/counts"]
+    file["entry/micrographs"].create_dataset("counts", (3, 3000, 3000), "f8", chunks=(1, 500, 500), compression="gzip")
+
+
+def _text(place: str, text: str):
+    """Return what replaces a text by another one, without its checksum."""
+
+    def spoil(file):
+        file.pop(place, None)
+        file[place] = np.array(text.encode())
+
+    spoil.__name__ = f"_text_{place.rpartition('/')[2]}_{text[:9]}"
+    return spoil
+
+
 def _no_counts(file):
     del file["entry/micrographs/counts"]
 
@@ -205,6 +238,14 @@ def _shape(file):
         (_cycle, "8 deep"),
         (_new_major, "helio_format must be 1.x, got '2.0'"),
         (_kind, "filetype must be one of"),
+        (_many_links, "linked 10 times, the limit is 8"),
+        (_never_filled, "64 MiB and 100 times the file"),
+        (_text("entry/provenance/data", '{"a":' * 900 + "1" + "}" * 900), "nested deeper than 32"),
+        (_text("entry/provenance/data", "[" * 200_000), "nested deeper than 32"),
+        (_text("entry/provenance/data", '{"a": %s}' % ("9" * 5000)), "more than 64 bits"),
+        (_text("entry/provenance/data", "[1]"), "must be a JSON object, got list"),
+        (_text("entry/calibration", '{"how": 1}'), "unexpected keyword"),
+        (_text("entry/instrument/settings", "[" * 200_000), "not a valid instrument"),
         (_no_counts, "counts missing"),
         (_wrong_number, "/entry/n_rays does not match its checksum"),
         (_shape, "counts must have the shape"),
@@ -218,10 +259,10 @@ def test_spoiled_helio_file(spoil, match, helio_file):
 
 
 def _with_child_function(monkeypatch, body: str) -> str:
-    """Add a function to the child's copy of `safe` and return its name."""
-    code = f"from helio_jax.formats import safe; import ctypes, time, sys; safe.probe = {body}; "
-    monkeypatch.setattr(safe, "_BOOT", code + safe._BOOT)
-    return "helio_jax.formats.safe:probe"
+    """Add a function to the child's copy of `child` and return its name."""
+    code = f"from helio_jax import child; import ctypes, time, sys; child.probe = {body}; "
+    monkeypatch.setattr(child, "_BOOT", code + child._BOOT)
+    return "helio_jax.child:probe"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="resource limits need POSIX")
@@ -239,30 +280,31 @@ def test_child_that_fails_becomes_one_error(body, match, monkeypatch, tmp_path):
     """Catches a crash, an endless loop or a memory bomb that reaches the caller as anything else."""
     name = _with_child_function(monkeypatch, body)
     with pytest.raises(InputFileError, match=match) as caught:
-        safe.call_in_child(name, tmp_path / "bad.bin", memory_bytes=safe.GIB, seconds=1 if "iter" in body else 30)
+        child.call_in_child(name, tmp_path / "bad.bin", memory_bytes=child.GIB, seconds=1 if "iter" in body else 30)
     assert "bad.bin" in str(caught.value)
 
 
 def test_child_that_sleeps_is_stopped(monkeypatch, tmp_path):
     """Catches a CPU limit alone: a reader that waits (on a pipe, say) uses none."""
     name = _with_child_function(monkeypatch, "lambda p: time.sleep(60)")
-    monkeypatch.setattr(safe, "_run_child", lambda request, _, run=safe._run_child: run(request, 1.5))
+    monkeypatch.setattr(child, "_run_child", lambda request, _, run=child._run_child: run(request, 1.5))
     with pytest.raises(InputFileError, match=r"stopped after 1\.5 s"):
-        safe.call_in_child(name, tmp_path / "bad.bin", seconds=1)
+        child.call_in_child(name, tmp_path / "bad.bin", seconds=1)
 
 
 def test_missing_package_is_not_the_files_fault(monkeypatch, tmp_path):
     """Catches an ImportError in the child reported as a corrupt file."""
     name = _with_child_function(monkeypatch, "lambda p: __import__('no_such_package')")
     with pytest.raises(MissingDependencyError, match="no_such_package"):
-        safe.call_in_child(name, tmp_path / "a.bin")
+        child.call_in_child(name, tmp_path / "a.bin")
 
 
 def test_child_result_comes_back_whole(monkeypatch, tmp_path):
     """Catches arrays, tables or texts mixed up on the way, among them a table with a key named "array"."""
-    body = "lambda p, n: {'array': safe.np.arange(n), 'dict': {'a': [1, None, 'µ', safe.np.float64(0.1)]}, 'p': str(p)}"
+    numbers = "[1, None, 'µ', child.np.float64(0.1)]"
+    body = f"lambda p, n: {{'array': child.np.arange(n), 'dict': {{'a': {numbers}}}, 'p': str(p)}}"
     name = _with_child_function(monkeypatch, body)
-    value = safe.call_in_child(name, tmp_path / "ä b.bin", 3)
+    value = child.call_in_child(name, tmp_path / "ä b.bin", 3)
     np.testing.assert_array_equal(value.pop("array"), [0, 1, 2])
     assert value == {"dict": {"a": [1, None, "µ", 0.1]}, "p": str(tmp_path / "ä b.bin")}
 
@@ -299,6 +341,137 @@ def test_atomic_path_keeps_or_replaces(tmp_path):
 def test_check_size_refuses_large(tmp_path):
     """Catches a limit compared the wrong way round."""
     (tmp_path / "a").write_bytes(b"12345")
-    assert safe.check_size(tmp_path / "a", 5) == 5
+    assert child.check_size(tmp_path / "a", 5) == 5
     with pytest.raises(InputFileError, match="at most"):
-        safe.check_size(tmp_path / "a", 4)
+        child.check_size(tmp_path / "a", 4)
+
+
+def make_glb(tree: dict) -> bytes:
+    """A GLB file of one triangle with this JSON chunk."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + np.arange(3, dtype="<u4").tobytes()
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(corners)
+    head = struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(corners), b"BIN\0") + corners
+
+
+def glb_tree(n: int) -> dict:
+    """The JSON of `n` nodes that show one triangle."""
+    views = [{"buffer": 0, "byteOffset": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 12}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}]
+    accessors += [{"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}]
+    return {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": list(range(n))}], "buffers": [{"byteLength": 48}],
+        "nodes": [{"mesh": 0, "translation": [i, 0, 0]} for i in range(n)], "bufferViews": views,
+        "accessors": accessors, "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }  # fmt: skip
+
+
+def write_mat_bomb(path: Path, n_bytes: int) -> None:
+    """A level 5 file whose one compressed variable is a matrix of so many zeros."""
+    element = lambda kind, data: struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)  # noqa: E731
+    shape = struct.pack("<ii", 1, n_bytes)
+    inner = element(6, struct.pack("<II", 9, 0)) + element(5, shape) + element(1, b"meas_list")
+    inner += struct.pack("<II", 2, n_bytes)
+    packed = zlib.compress(struct.pack("<II", 14, len(inner) + n_bytes) + inner + bytes(n_bytes))
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
+    path.write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
+
+
+def test_what_unpacks_to_far_more_is_refused(tmp_path):
+    """Zeros packed a thousandfold, as MAT and as NPZ: refused by the size that they would have.
+
+    Catches a limit on the file alone: 0.3 MB took 5 GB and more before.
+    """
+    write_mat_bomb(tmp_path / "a.mat", 200 * child.MIB)
+    assert_refused(tmp_path / "a.mat", "its variables must take at most 8. MiB")
+    axis = np.arange(4000.0)
+    np.savez_compressed(tmp_path / "a.npz", x=axis, y=axis, height=np.zeros((4000, 4000), "u1"))
+    with pytest.raises(InputFileError, match="8 bytes a number, must take at most"):
+        read_height_map(tmp_path / "a.npz", 1.0, None)
+
+
+def test_parts_of_meshes_are_limited(tmp_path):
+    """Nodes of a GLB are counted before trimesh makes a mesh of each (100 000 took a minute and 10 GB).
+
+    Catches a limit that is checked on the result. Few nodes are read, each at its place.
+    """
+    path = tmp_path / "a.glb"
+    path.write_bytes(make_glb(glb_tree(3)))
+    vertices, faces, _ = load_mesh(path, 1.0)
+    assert len(faces) == 3 and sorted(set(vertices[:, 0])) == [0.0, 1.0, 2.0, 3.0]
+    path.write_bytes(make_glb(glb_tree(1001)))
+    with pytest.raises(InputFileError, match="1001 nodes, the limit is 1000"):
+        load_mesh(path, 1.0)
+    many = glb_tree(900)
+    many["accessors"][1]["count"] = 30_000
+    path.write_bytes(make_glb(many))
+    with pytest.raises(InputFileError, match="9000000 triangles, the limit is 5000000"):
+        load_mesh(path, 1.0)
+
+
+def test_many_materials_are_parsed_once(tmp_path, monkeypatch):
+    """200 materials of one OBJ: every face keeps its own. Catches one pass over all vertices for each (41 s)."""
+    calls, load = [], trimesh.load_scene
+    monkeypatch.setattr(trimesh, "load_scene", lambda *a, **options: (calls.append(1), load(*a, **options))[1])
+    names = [f"m{i}" for i in range(200)]
+    vertices = "".join(f"v {i % 40} {i // 40} 0\n" for i in range(1600))
+    faces = "".join(f"usemtl m{i}\nf {i + 1} {i + 2} {i + 42}\n" for i in range(200))
+    (tmp_path / "a.obj").write_text(vertices + faces)
+    corners, triangles, parts = parse_mesh(tmp_path / "a.obj", names, [], False)
+    found = {int(p): corners[f].min(0).tolist() for f, p in zip(triangles, parts, strict=True)}
+    assert len(calls) == 1 and len(found) == 200
+    for i in (0, 57, 130):
+        assert found[i + 1] == [i % 40, i // 40, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[plate]\n" + ".".join(["a"] * 20_000) + " = 1", "line 2 has more than 32 parts"),
+        ("[" + ".".join(["'a'"] * 100_000) + "]", "line 1 has more than 32 parts"),
+        ('["' + '"."'.join(['\\"'] * 50_000) + '"]', "line 1 has more than 32 parts"),
+        ("x = " + "[" * 100_000 + "]" * 100_000, "nested deeper than 32"),
+        ("x = " + "[" * 50 + "]" * 50, "nested deeper than 32"),
+        ("x = " + "9" * 5000, "more than 64 bits"),
+        ("x = 0x" + "f" * 5000, "20000 bits, the limit is 64"),
+        ("\n".join(f"a{i} = 1" for i in range(10_001)), "a table of 10001 keys"),
+    ],
+)
+def test_hostile_toml(tmp_path, text, told):
+    """Scenes and studies are read by one function, which refuses within a second what took minutes or gigabytes.
+
+    Catches tomllib's quadratic time for long keys, RecursionError, and whole numbers that Python refuses to print.
+    """
+    (tmp_path / "a.toml").write_text(text)
+    before = time.process_time()
+    for read in (load_scene, load_study):
+        with pytest.raises(SceneError, match=told) as caught:
+            read(tmp_path / "a.toml")
+        assert "a.toml" in str(caught.value) and len(str(caught.value)) < 1000
+    assert time.process_time() - before < 2.0
+
+
+def test_dotted_numbers_and_texts_are_no_long_keys():
+    """Catches a limit on the dots of a line: a list of numbers has many, and a text may."""
+    text = f"x = [{', '.join(['1.5'] * 1000)}]\ny = 'see a.b.c and 1.2.3.4'\n" + '"a.b"."c\\"d".e = 1\n'
+    assert parse_toml(text)["a.b"]['c"d'] == {"e": 1}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file size limits need POSIX")
+def test_full_disk_is_an_error(helio_file, tmp_path):
+    """A file that may not grow, as on a full disk: SceneError, the old file kept, nothing left behind.
+
+    Catches HDF5's crash (signal 11) when it cannot write while it closes a file.
+    """
+    script = (
+        "import resource, sys; import helio_jax as hx; from helio_jax.errors import SceneError\n"
+        f"stack = hx.read({str(helio_file)!r}); before = open({str(helio_file)!r}, 'rb').read()\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        f"try: hx.write(stack, {str(helio_file)!r})\n"
+        f"except SceneError as e: print(e, open({str(helio_file)!r}, 'rb').read() == before)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0 and "File too large; check the folder, rights and space True" in done.stdout, done
+    assert [p.name for p in tmp_path.iterdir()] == ["good.h5"]
