@@ -8,6 +8,7 @@ from helio_jax.commands import (  # noqa: F401 (each registers its commands)
     heights,
     looking,
     measured,
+    planning,
     scenes,
     simulating,
 )
