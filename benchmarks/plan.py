@@ -14,6 +14,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -91,26 +92,27 @@ def times_and_speed_ups() -> list[Row]:
 def windows_row() -> Row:
     """Row 3: two scans predict where the crystal's points were on the stage in the other three scans."""
     picks = read_points(ROOT / "benchmarks" / "alum_points.csv")
-    files = {name: DATA / f"{name}.mat" for name in ALUM}
-    first, second, *others = ALUM
+    first, second, *others = (read_acquisitions(DATA / f"{name}.mat")[0] for name in ALUM)
+    files = [DATA / f"{scan.name}.mat" for scan in (first, second)]
+    center = plan_windows(files, picks, [0.0]).rotation_center
     misses = []
-    for name in others:
-        scan, origin = (read_acquisitions(files[n])[0] for n in (name, first))
-        for point in picks[first].keys() & picks[name].keys():
-            found = plan_windows(
-                [files[first], files[second]], picks, [np.degrees(scan.rotation)], center_um=picks[first][point]
-            )
-            misses.append(found.centers[0] - scan.center - picks[name][point])
+    for scan in others:
+        for point in picks[first.name].keys() & picks[scan.name].keys():
+            there = np.add(first.center, picks[first.name][point])
+            found = center.windows(there, first.rotation, np.array([scan.rotation]))[0]
+            misses.append(found - scan.center - picks[scan.name][point])
     rms = float(np.sqrt(np.mean(np.square(misses))))
     worst = float(np.hypot(*np.transpose(misses)).max())
     value = f"{rms:.0f} um per axis, worst {worst:.0f} um ({len(misses)} points)"
-    pixel = origin.pixel[0]
+    pixel = first.pixel[0]
     return row(
         "3", f"stage windows from two scans, rms miss ({pixel:g} um pixels)", value, "< 2 pixels", rms < 2 * pixel
     )
 
 
-def prediction_rows(per_family: int, draws: int, size: tuple[int, int], seed: int, families: list[str], keep) -> None:
+def prediction_rows(
+    per_family: int, draws: int, size: tuple[int, int], seed: int, families: Sequence[str], keep
+) -> None:
     """Rows 4: predicted over obtained standard deviation of typical heights."""
     for family in families:
         for member in members(family, seed, range(per_family), size):

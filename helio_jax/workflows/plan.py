@@ -292,6 +292,7 @@ def expect(scene: SceneFile, n_samples: int = N_SAMPLES) -> Expected:
     x, y = scene.positions()
     truth = true_surface(scene, x, y)
     optics, n = Optics.of(scene.instrument), len(scene.detector)
+    assert truth.normals is not None  # of a scene
     surface = Surface(truth.height, *slopes_of_normal(truth.normals, np.asarray(optics.beam_shift))[:2])
     gain, background = (scene.noise.per_detector(key, n) for key in ("gain", "background_per_pixel"))
     dose = scene.scan.atoms_per_pixel * gain * _substrate_albedo(scene)
@@ -360,8 +361,9 @@ def _candidate(
 
 def _seconds(timing: Timing, scene: SceneFile, shape: tuple[int, int], n_scans: int) -> float:
     """Compute the time of scans of rows and columns, in the order of the scene's fast axis [s]."""
-    lines = shape if scene.noise.fast_axis == "x" else shape[::-1]
-    return timing.seconds(*lines, n_scans)
+    rows, columns = shape
+    n_lines, n_per_line = (rows, columns) if scene.noise.fast_axis == "x" else (columns, rows)
+    return timing.seconds(n_lines, n_per_line, n_scans)
 
 
 def _at_error(curve: Sequence[Candidate], wanted_um: float, timing: Timing, scene: SceneFile) -> Candidate | None:
