@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -208,8 +209,9 @@ def by_law(monkeypatch, errors: list[SceneFile]) -> None:
 
     def expect(scene: SceneFile, n_samples: int) -> planning.Expected:
         errors.append(scene)
-        shape, dwell = scene.image_shape, scene.noise.dwell_s
-        std = 3.0 * (30.0 / scene.scan.pixel_size_um) * math.sqrt(3.0 / len(scene.detector) / dwell)
+        shape, dwell, pixel = scene.image_shape, scene.noise.dwell_s, scene.scan.spacing
+        assert dwell and pixel
+        std = 3.0 * (30.0 / pixel) * math.sqrt(3.0 / len(scene.detector) / dwell)
         samples = std * np.random.default_rng(0).standard_normal((n_samples, *shape))
         return planning.Expected(np.zeros(shape), samples, np.ones(3))
 
@@ -262,12 +264,13 @@ def test_refusals(scene):
     """Each says what is missing. Catches a plan for two images, and one that takes the counts for those of 1 s."""
     timeless = scene.model_copy(update={"noise": scene.noise.model_copy(update={"dwell_s": None})})
     oblique = scene.model_copy(update={"beam": scene.beam.model_copy(update={"incidence_deg": 30.0})})
-    for wrong, options, message in (
+    cases: tuple[tuple[SceneFile, dict[str, Any], str], ...] = (
         (timeless, {}, "noise.dwell_s is needed"),
         (scene, {}, "3 images or more, got 1 scans of 1 detectors"),
         (oblique, {"rotations_deg": [(0, 120, 240)]}, "normal incidence, got a beam at 30 deg"),
         (scene, {"dwell_s": [0.0]}, "every dwell of a plan must be > 0, got 0"),
-    ):
+    )
+    for wrong, options, message in cases:
         with pytest.raises(SceneError, match=message):
             planning.plan(wrong, **options)
 
