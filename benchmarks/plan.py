@@ -114,8 +114,9 @@ def prediction_rows(
     per_family: int, draws: int, size: tuple[int, int], seed: int, families: Sequence[str], keep
 ) -> None:
     """Rows 4: predicted over obtained standard deviation of typical heights."""
-    for family in families:
-        for member in members(family, seed, range(per_family), size):
+    for number in range(per_family):
+        for family in families:
+            (member,) = members(family, seed, range(number, number + 1), size)
             started = time.perf_counter()
             try:
                 with tempfile.TemporaryDirectory() as folder:

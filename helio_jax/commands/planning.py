@@ -1,6 +1,7 @@
 """Commands before a measurement: plan, plan-windows. They only parse, call, print."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -40,6 +41,7 @@ def plan(
     timing: Annotated[
         Path | None, typer.Option(help="Measured scan (.mat, .h5): pause and time to move are taken from it."), Reads()
     ] = None,
+    change: Annotated[float, typer.Option(help="Time between two scans, to rotate the sample [s].")] = 0.0,
     draws: Annotated[
         int, typer.Option("--check", min=0, help="Simulate and reconstruct the chosen candidate so often.")
     ] = 0,
@@ -48,18 +50,20 @@ def plan(
     """Plan an acquisition: time, SNR and expected errors of the heights by dwell, pixel and rotations."""
     from helio_jax.figures.planning import Curve, save_plan
     from helio_jax.figures.wording import duration
-    from helio_jax.workflows.plan import measured_timing
+    from helio_jax.workflows.plan import measured_timing, stated_timing
     from helio_jax.workflows.plan import plan as plan_scene
     from helio_jax.workflows.scene_file import load_scene
 
+    loaded = load_scene(scene)
+    stage = measured_timing(timing) if timing else stated_timing(loaded)
     even = [[360.0 * i / int(n) for i in range(int(n))] for n in _numbers("--views", views)]
     found = plan_scene(
-        load_scene(scene),
+        loaded,
         dwell_s=_numbers("--dwell", dwell),
         pixel_size_um=_numbers("--pixel", pixel),
         rotations_deg=[*even, *(_numbers("--rotations", text) for text in rotations or ())],
         wanted_um=error,
-        timing=measured_timing(timing) if timing else None,
+        timing=replace(stage, change=change),
         draws=draws,
         say=say,
     )
@@ -75,13 +79,13 @@ def plan(
         print(json.dumps(found.as_dict()))
         return
     head = f"{'scans':>5} {'images':>6} {'pixel':>8} {'dwell':>8} {'time':>10} {'SNR':>6} {'heights':>9} {'level':>9}"
-    print(f"{head} {'seen':>6}")
+    print(f"{head} {'seen':>6} {'speed-up':>8}")
 
     def line(c) -> str:
         return (
             f"{len(c.rotations_deg):>5} {c.n_images:>6} {c.pixel_size_um:>5g} um {c.dwell_s:>6.3g} s "
             f"{duration(c.seconds):>10} {c.snr:>6.1f} {c.height_std_um:>6.3g} um {c.level_std_um:>6.3g} um "
-            f"{c.seen_by_all:>6.0%}"
+            f"{c.seen_by_all:>6.0%} {c.speed_up:>8.2f}"
         )
 
     print("\n".join(map(line, found.candidates)))

@@ -51,6 +51,8 @@ class Candidate:
         height_std_um: standard deviation of typical heights (`typical`), off the border, that all scans see.
         level_std_um: standard deviation of the mean height of the upper half of the relief above the substrate.
         seen_by_all: share of the first scan's pixels that all scans see.
+        speed_up: time per reconstructed pixel that one detector would take for as many images, by even rotations of the
+            sample about the middle of the field, over that of this candidate.
     """
 
     rotations_deg: tuple[float, ...]
@@ -63,11 +65,7 @@ class Candidate:
     height_std_um: float
     level_std_um: float
     seen_by_all: float
-
-    @property
-    def seconds_per_height(self) -> float:
-        """Time per reconstructed pixel [s]."""
-        return seconds_per_height(self.seconds, math.prod(self.shape), self.seen_by_all)
+    speed_up: float
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,8 @@ class Plan:
         candidates: of every combination of views, pixel and dwell, in this order.
         wanted_um: wanted `height_std_um`, or None.
         reaching: where it is wanted: of every combination of views and pixel that reaches it within the dwell times,
-            the candidate of just this error, the fastest first; its dwell is interpolated.
+            the candidate of just this error, its dwell interpolated (or the shortest dwell, if that reaches it), the
+            fastest first.
         check: of the fastest one (or of the first candidate, if no error is wanted), or None.
     """
 
@@ -176,11 +175,7 @@ def plan(
 
     Source: Cramer-Rao bound as in `hx.fisher`.
     """
-    scan, base = scene.scan, scene.noise.dwell_s
-    if base is None:
-        raise SceneError(
-            "noise.dwell_s is needed for a plan, got none: give the counting time that scan.atoms_per_pixel belongs to"
-        )
+    scan, base = scene.scan, stated_timing(scene).dwell
     if not isinstance(scan, Raster) or scan.sample_distances_um:
         raise SceneError(
             "scan: a plan needs a raster at one distance: set scan.kind = 'raster', no sample_distances_um"
@@ -188,7 +183,7 @@ def plan(
     for name, values in (("dwell", dwell_s), ("pixel size", pixel_size_um), ("error", [wanted_um or 1.0])):
         if wrong := [v for v in values if not (math.isfinite(v) and v > 0.0)]:
             raise SceneError(f"every {name} of a plan must be > 0, got {wrong[0]:g}: correct it")
-    timing = timing or Timing(base, 0.0, scene.noise.move_s, scene.noise.flyback_s)
+    timing = timing or stated_timing(scene)
     dwells = sorted(dwell_s) or ([0.25 * base, base, 4.0 * base] if wanted_um else [base])
     views = [tuple(v) for v in rotations_deg] or [scan.rotations_deg or (0.0,)]
     pixels = list(pixel_size_um) or [scan.pixel_size_um]
@@ -205,6 +200,20 @@ def plan(
         say(f"simulating the chosen candidate, {draws} draws of the noise")
         found = replace(found, check=check(at(scene, c.rotations_deg, c.pixel_size_um, c.dwell_s), draws, n_samples))
     return found
+
+
+def stated_timing(scene: SceneFile) -> Timing:
+    """Take the times of a stage from table [noise] of a scene.
+
+    Raises:
+        SceneError: it states no dwell time.
+    """
+    noise = scene.noise
+    if noise.dwell_s is None:
+        raise SceneError(
+            "noise.dwell_s is needed for a plan, got none: give the counting time that scan.atoms_per_pixel belongs to"
+        )
+    return Timing(noise.dwell_s, 0.0, noise.move_s, noise.flyback_s)
 
 
 def measured_timing(path: str | Path) -> Timing:
@@ -334,29 +343,44 @@ def _candidate(
     """Evaluate a candidate, given as one scan (`at`)."""
     scan, dwell = one.scan, one.noise.dwell_s
     assert isinstance(scan, Raster) and dwell is not None  # of `at`
-    x, y = one.positions()
-    is_sample, angles = scene.scan.rotate == "sample", np.radians(rotations)
-    count = scans_per_pixel(x, y, angles, shifts_about(scene.scan.axis_um, angles)) if is_sample else len(rotations)
-    seen = np.broadcast_to(count == len(rotations), (scan.ny, scan.nx))
+    seen = (
+        _seen_by_all(one, rotations, scene.scan.axis_um) if scene.scan.rotate == "sample" else _seen_by_all(one, (0.0,))
+    )
     use = seen & ~border_mask(seen.shape, scene.reconstruct.border_fraction)
     if not use.any():
         raise SceneError(
             f"no pixel is seen by all scans rotated by {', '.join(f'{a:g}' for a in rotations)} deg about "
             f"{list(scene.scan.axis_um)} um: move scan.axis_um into the field"
         )
-    expected = expect(one, n_samples)
+    expected, timing, n_images = expect(one, n_samples), timing.at_dwell(dwell), len(one.detector)
+    seconds, alone = (_seconds(timing, scene, seen.shape, n) for n in (len(rotations), n_images))
+    even = _seen_by_all(one, [360.0 * i / n_images for i in range(n_images)])
+    per_height, per_height_alone = (
+        seconds_per_height(s, seen.size, float(by.mean())) for s, by in ((seconds, seen), (alone, even))
+    )
     return Candidate(
         rotations_deg=rotations,
-        n_images=len(one.detector),
+        n_images=n_images,
         pixel_size_um=scan.pixel_size_um,
         shape=seen.shape,
         dwell_s=dwell,
-        seconds=_seconds(timing.at_dwell(dwell), scene, seen.shape, len(rotations)),
+        seconds=seconds,
         snr=float(expected.snr.min()),
         height_std_um=typical(expected.samples[:, use]),
         level_std_um=expected.level_std,
         seen_by_all=float(seen.mean()),
+        speed_up=per_height_alone / per_height,
     )
+
+
+def _seen_by_all(
+    one: SceneFile, rotations_deg: Sequence[float], axis_um: tuple[float, float] | None = None
+) -> np.ndarray:
+    """Return True where all scans of a rotated sample see a pixel [y, x]; default axis: the middle of the field."""
+    x, y = one.positions()
+    angles = np.radians(rotations_deg)
+    axis = axis_um or (0.5 * (x[0] + x[-1]), 0.5 * (y[0] + y[-1]))
+    return scans_per_pixel(x, y, angles, shifts_about(axis, angles)) == len(angles)
 
 
 def _seconds(timing: Timing, scene: SceneFile, shape: tuple[int, int], n_scans: int) -> float:

@@ -260,6 +260,23 @@ def test_candidate_as_one_scan(scene, monkeypatch):
     assert c.seen_by_all == 1.0
 
 
+def test_speed_up_of_several_detectors(scene, monkeypatch):
+    """Four detectors over one that sees half of a 2 : 1 field in all of four rotations: 4 / 0.5; rotating takes time t.
+
+    Then (4 t + 3 t) / t / 0.5. One detector that does just that has 1. Catches a share on the wrong side of the ratio.
+    """
+    by_law(monkeypatch, [])
+    d = scene.detector[0]
+    many = tuple(d.model_copy(update={"name": f"d{k}", "azimuth_deg": 90.0 * k}) for k in range(4))
+    (c,) = planning.plan(scene.model_copy(update={"detector": many})).candidates
+    assert c.speed_up == pytest.approx(4.0 / 0.5)
+    slow = Timing(0.5, 0.0, 0.2, 3.0, change=c.seconds)
+    (c,) = planning.plan(scene.model_copy(update={"detector": many}), timing=slow).candidates
+    assert c.speed_up == pytest.approx(7.0 / 0.5)
+    (c,) = planning.plan(scene, rotations_deg=[(0, 90, 180, 270)]).candidates
+    assert c.speed_up == pytest.approx(1.0) and c.seen_by_all == pytest.approx(0.5)
+
+
 def test_refusals(scene):
     """Each says what is missing. Catches a plan for two images, and one that takes the counts for those of 1 s."""
     timeless = scene.model_copy(update={"noise": scene.noise.model_copy(update={"dwell_s": None})})
