@@ -37,6 +37,9 @@ def save_plan(
         ax.plot(*chosen, "*", color="black", markersize=13, zorder=3, label="reaches it soonest")
     ax.set_xlabel("time of the acquisition [h]")
     ax.set_ylabel("s.d. of typical heights [um]")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:g}")
     ax.grid(which="both", alpha=0.3)
     ax.legend(fontsize=8)
     fig.suptitle(title)

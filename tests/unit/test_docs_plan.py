@@ -14,7 +14,7 @@ from helio_jax.commands.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "plan.md").read_text(encoding="utf-8")
-SMALL = {"nx = 61": "nx = 11", "ny = 61": "ny = 11", "pixel_size_um = 20.0": "pixel_size_um = 110.0"}
+SMALL = {"nx = 61": "nx = 11", "ny = 61": "ny = 11", "pixel_size_um = 20.0": "pixel_size_um = 60.0"}
 
 
 @pytest.fixture
@@ -48,13 +48,13 @@ def test_plan(folder):
     one of dwell, movement, pixels and scans.
     """
     first, second = lines()[:2]
-    record = json.loads(run([*(w.replace("20,30", "110").replace("3,4", "3") for w in second), "--json"]))
+    record = json.loads(run([*(w.replace("20,30", "60").replace("3,4", "3") for w in second), "--json"]))
     assert (folder / "plan.png").stat().st_size > 5000
     assert [c["seconds"] for c in record["candidates"]] == pytest.approx(
         [3 * 121 * (d + 0.45) for d in (0.125, 0.5, 2)]
     )
     (reaching,) = record["reaching"]
-    assert reaching["height_std_um"] == 1.5 and 0.125 < reaching["dwell_s"] < 2.0
+    assert reaching["height_std_um"] == 1.0 and 0.125 < reaching["dwell_s"] < 2.0
     table = run(first).splitlines()
     assert len(table) == 2 and f"{record['candidates'][1]['height_std_um']:.3g} um" in table[1]
     (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
