@@ -11,18 +11,19 @@ from helio_jax.commands.app import CSV, FIGURE, AsJson, SceneArg, app, say
 from helio_jax.commands.door import Reads
 
 
-def _numbers(option: str, text: str | None) -> list[float]:
-    """Parse numbers separated by commas.
+def _numbers(option: str, text: str | None, whole: bool = False) -> list[float]:
+    """Parse numbers (`whole`: whole ones) separated by commas.
 
     Raises:
-        SceneError: an item is no number.
+        SceneError: an item is no such number.
     """
     from helio_jax.errors import SceneError
 
     try:
-        return [float(item) for item in text.split(",")] if text else []
+        return [int(item) if whole else float(item) for item in text.split(",")] if text else []
     except ValueError:
-        raise SceneError(f"{option} must be numbers separated by commas, got {text!r}") from None
+        kind = "whole numbers" if whole else "numbers"
+        raise SceneError(f"{option} must be {kind} separated by commas, got {text!r}") from None
 
 
 @app.command()
@@ -56,7 +57,7 @@ def plan(
 
     loaded = load_scene(scene)
     stage = measured_timing(timing) if timing else stated_timing(loaded)
-    even = [[360.0 * i / int(n) for i in range(int(n))] for n in _numbers("--views", views)]
+    even = [[360.0 * i / n for i in range(n)] for n in map(int, _numbers("--views", views, whole=True))]
     found = plan_scene(
         loaded,
         dwell_s=_numbers("--dwell", dwell),

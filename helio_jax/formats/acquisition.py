@@ -15,7 +15,7 @@ from helio_jax.errors import InputFileError
 from helio_jax.formats.hdf5 import read_micrographs
 from helio_jax.formats.matlab import describe_matlab
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
-from helio_jax.formats.tables import get_number, get_table
+from helio_jax.formats.tables import describe_value, get_number, get_table
 
 
 @dataclass(frozen=True)
@@ -91,17 +91,14 @@ def _acquisition(where: str, name: str, kind: str, metadata: dict[str, Any]) -> 
     unit = _UNIT_UM[kind]
     ends, pixel = {}, {}
     for direction in ("hori", "vert"):
-        values = scan.get(f"{direction}_range")
-        if not isinstance(values, list) or len(values) != 2:
-            raise InputFileError(f"{where}: meas_list.{direction}_range must be two stage positions, got {values!r}")
-        ends[direction] = sorted(float(v) * unit for v in values)
+        ends[direction] = sorted(v * unit for v in _numbers(where, scan, f"{direction}_range", 2))
         pixel[direction] = get_number(where, scan, f"{direction}_res", low=0.0) * unit
     n = {d: round((high - low) / pixel[d]) + 1 for d, (low, high) in ends.items()}
     fast, slow = ("vert", "hori") if given.get("fast_axis") == "vertical" else ("hori", "vert")
     is_counting = kind == "B-SHeM"
-    period = float(scan.get("sampling_period") or 15.0)
+    period = get_number(where, scan, "sampling_period", low=0.0) if "sampling_period" in scan else 15.0
     dwell = get_number(where, scan, "dwell_time" if is_counting else "N_dwell", low=0.0)
-    orientation = scan.get("sample_orientation")
+    rotation = 0.0 if is_counting else _numbers(where, scan, "sample_orientation", 3)[1]
     named = [axis[1:] for axis in _AXES[kind]]
     signs = [-1.0 if axis[0] == "-" else 1.0 for axis in _AXES[kind]]
     middle = [sign * 0.5 * sum(ends[d]) for sign, d in zip(signs, named, strict=True)]
@@ -111,11 +108,19 @@ def _acquisition(where: str, name: str, kind: str, metadata: dict[str, Any]) -> 
         n_lines=n[slow],
         n_per_line=n[fast],
         dwell=dwell * 1e-3 * (1.0 if is_counting else period),
-        pause=float(given.get("pause") or 0.0),
+        pause=get_number(where, given, "pause") if "pause" in given else 0.0,
         seconds=float(took) if isinstance(took, (int, float)) and took > 0 else None,
         center=(middle[0], middle[1]),
         size=(ends[named[0]][1] - ends[named[0]][0], ends[named[1]][1] - ends[named[1]][0]),
         pixel=(pixel[named[0]], pixel[named[1]]),
-        rotation=math.radians(orientation[1] * 1e-6) if orientation and not is_counting else 0.0,
+        rotation=math.radians(rotation * 1e-6),
         axes=_AXES[kind],
     )
+
+
+def _numbers(where: str, scan: dict[str, Any], name: str, n: int) -> list[float]:
+    """Return a list of n finite numbers."""
+    values = scan.get(name)
+    if not isinstance(values, list) or len(values) != n:
+        raise InputFileError(f"{where}: meas_list.{name} must be {n} numbers, got {describe_value(values)}")
+    return [get_number(where, {name: value}, name) for value in values]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.arrays import border_mask
-from helio_jax.errors import InputFileError, SceneError
+from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.formats.acquisition import read_acquisitions
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
@@ -151,7 +151,7 @@ def plan(
 
     Valid for rasters at one distance, and for surfaces that the fit can express: the errors are those of counting
     noise and of the priors in [reconstruct] and [uncertainty], for the sample of the scene and the cosine law. Depth
-    jumps are taken as known. Heights beyond a change of scans (`seen_by_all` < 1) count as if all scans saw them.
+    jumps are taken as known. Pixels that not all scans see (`seen_by_all` < 1) are left out of `height_std_um`.
 
     Args:
         scene: expected sample, instrument and scan. `scan.atoms_per_pixel` and `noise.background_per_pixel` belong to
@@ -166,8 +166,9 @@ def plan(
         say: called with a message for each combination of views and pixel.
 
     Raises:
-        SceneError: no dwell time, no raster, several distances, rotations at oblique incidence, less than 3 images, a
-            candidate that is not > 0.
+        SceneError: no dwell time, no raster, several distances, rotations at oblique incidence or repeated ones, less
+            than 3 images, a candidate that is not > 0.
+        GuardError: no pixel of the simulation is valid.
 
     Example:
         >>> found = hx.plan(scene, pixel_size_um=(20.0, 30.0), wanted_um=2.0)
@@ -180,11 +181,15 @@ def plan(
         raise SceneError(
             "scan: a plan needs a raster at one distance: set scan.kind = 'raster', no sample_distances_um"
         )
-    for name, values in (("dwell", dwell_s), ("pixel size", pixel_size_um), ("error", [wanted_um or 1.0])):
+    for name, values in (
+        ("dwell", dwell_s),
+        ("pixel size", pixel_size_um),
+        ("error", [] if wanted_um is None else [wanted_um]),
+    ):
         if wrong := [v for v in values if not (math.isfinite(v) and v > 0.0)]:
             raise SceneError(f"every {name} of a plan must be > 0, got {wrong[0]:g}: correct it")
     timing = timing or stated_timing(scene)
-    dwells = sorted(dwell_s) or ([0.25 * base, base, 4.0 * base] if wanted_um else [base])
+    dwells = sorted(dwell_s) or ([0.25 * base, base, 4.0 * base] if wanted_um is not None else [base])
     views = [tuple(v) for v in rotations_deg] or [scan.rotations_deg or (0.0,)]
     pixels = list(pixel_size_um) or [scan.pixel_size_um]
     candidates = []
@@ -236,6 +241,9 @@ def at(scene: SceneFile, rotations_deg: Sequence[float], pixel_size_um: float, d
 
     Rotations of the sample become rotations of the detectors the other way, which is the same at normal incidence but
     for the field that all scans see. Counts scale with the dwell time.
+
+    Raises:
+        SceneError: oblique incidence, repeated rotations, less than 3 images, too many pixels.
     """
     scan, n = scene.scan, len(scene.detector)
     assert isinstance(scan, Raster) and scene.noise.dwell_s is not None  # checked by plan
@@ -244,6 +252,10 @@ def at(scene: SceneFile, rotations_deg: Sequence[float], pixel_size_um: float, d
         raise SceneError(
             f"rotations of the sample need normal incidence, got a beam at {scene.beam.incidence_deg:g} deg: set "
             "scan.rotate = 'detectors' or plan without rotations"
+        )
+    if len({round(a % 360.0, 6) for a in rotations_deg}) < len(rotations_deg):
+        raise SceneError(
+            f"the rotations of the scans must differ, got {list(rotations_deg)} deg: remove the repeated one"
         )
     if n * len(rotations_deg) < MIN_IMAGES:
         raise SceneError(
@@ -267,7 +279,7 @@ def at(scene: SceneFile, rotations_deg: Sequence[float], pixel_size_um: float, d
     atoms = {"atoms_per_pixel": share * scan.atoms_per_pixel, "rotations_deg": (), "rotate": "sample"}
     tables = {
         "detector": tuple(images),
-        "scan": scan.model_copy(update=size | atoms),
+        "scan": scan.changed(**size, **atoms),
         "noise": noise.changed(**per_image, dwell_s=dwell_s),
     }
     return scene.model_copy(update=tables)
@@ -318,13 +330,19 @@ def _substrate_albedo(scene: SceneFile) -> float:
 
 
 def check(scene: SceneFile, draws: int, n_samples: int = N_SAMPLES) -> Check:
-    """Simulate a scene of one scan, draw its noise `draws` times, reconstruct, and compare the errors with `expect`."""
+    """Simulate a scene of one scan, draw its noise `draws` times, reconstruct, and compare the errors with `expect`.
+
+    Raises:
+        GuardError: no pixel is valid in every draw.
+    """
     expected, border = expect(scene, n_samples), border_mask(scene.image_shape, scene.reconstruct.border_fraction)
     clean = pipeline.simulate(scene).only()
     seeds = (scene.noise.model_copy(update={"seed": scene.noise.seed + i, "enabled": True}) for i in range(draws))
     noisy = (pipeline.record(scene.model_copy(update={"noise": n}), clean) for n in seeds)
     recs = [pipeline.reconstruct(stack.only(), "refine", settings=scene.reconstruct) for stack in noisy]
     use = np.logical_and.reduce([~border, *(r.is_valid for r in recs)])
+    if not use.any():
+        raise GuardError(f"no pixel is valid in all {draws} reconstructions of the check: see helio run on this scene")
     errors = np.array([r.height - expected.height for r in recs])[:, use]
     stated = np.concatenate([r.height_samples[:, use] for r in recs if r.height_samples is not None])
     return Check(

@@ -184,6 +184,9 @@ def test_acquisition_of_a_file(scanned):
     assert planning.measured_timing(scanned("a")).move == pytest.approx(0.25)
     with pytest.raises(InputFileError, match="states no duration"):
         planning.measured_timing(scanned("b", scan_time=None))
+    for changes in ({"inputs": np.array(["pause", "x"], object)}, {"hori_range": np.zeros(3)}, {"N_dwell": 0}):
+        with pytest.raises(InputFileError, match="must be"):
+            read_acquisitions(scanned("c", **changes))
 
 
 def test_windows_command(scanned, tmp_path):
@@ -286,6 +289,9 @@ def test_refusals(scene):
         (scene, {}, "3 images or more, got 1 scans of 1 detectors"),
         (oblique, {"rotations_deg": [(0, 120, 240)]}, "normal incidence, got a beam at 30 deg"),
         (scene, {"dwell_s": [0.0]}, "every dwell of a plan must be > 0, got 0"),
+        (scene, {"wanted_um": 0.0}, "every error of a plan must be > 0, got 0"),
+        (scene, {"rotations_deg": [(0, 120, 360)]}, "must differ, got .0, 120, 360. deg"),
+        (scene, {"rotations_deg": [(0, 1, 2)], "pixel_size_um": [0.01]}, "nx \\* ny must be <= 16777216 pixels"),
     )
     for wrong, options, message in cases:
         with pytest.raises(SceneError, match=message):
