@@ -11,6 +11,7 @@ reconstructions of simulated, noisy micrographs, errors of typical heights. Rows
 
 import argparse
 import json
+import math
 import os
 import sys
 import tempfile
@@ -127,9 +128,11 @@ def prediction_rows(
                 continue
             value = (
                 f"{found.ratio:.2f}: {found.predicted_um:.3g} for {found.obtained_um:.3g} um "
-                f"(stated {found.stated_um:.3g}, rms {found.rms_um:.3g})"
+                f"(scatter {found.scatter_um or math.nan:.3g}, stated {found.stated_um:.3g}, rms {found.rms_um:.3g})"
             )
             ratios = {"ratio": found.ratio, "ratio_to_stated": found.predicted_um / found.stated_um}
+            if found.scatter_um:
+                ratios["ratio_to_scatter"] = found.predicted_um / found.scatter_um
             more = vars(found) | member.about | ratios | {"seconds": time.perf_counter() - started}
             what = f"{member.name}, {member.about['kind']}"
             keep(row("4", what, value, "0.8-1.25", 0.8 <= found.ratio <= 1.25, **more))
@@ -162,7 +165,11 @@ def main() -> None:
         print(f"no measured data in {DATA}: rows 1 to 3 are left out")
     per_family = -(-given.members // len(families))
     prediction_rows(per_family, given.draws, given.size, given.seed, families, keep)
-    for key, what in (("ratio", "errors obtained"), ("ratio_to_stated", "s.d. that the reconstructions state")):
+    for key, what in (
+        ("ratio", "errors obtained"),
+        ("ratio_to_scatter", "scatter over the draws"),
+        ("ratio_to_stated", "s.d. that the reconstructions state"),
+    ):
         found = [r[key] for r in rows if key in r]
         if found:
             low, middle, high = np.quantile(found, [0.0, 0.5, 1.0])

@@ -99,6 +99,7 @@ def plan(
         print(
             f"\nsimulated {c.draws} times: predicted {c.predicted_um:.3g} um, obtained {c.obtained_um:.3g} um "
             f"(ratio {c.ratio:.2f}), stated {c.stated_um:.3g} um; {c.compared:.0%} of the pixels"
+            + (f"; scatter of the draws {c.scatter_um:.3g} um" if c.scatter_um is not None else "")
         )
 
 

@@ -75,6 +75,8 @@ class Check:
     Attributes:
         predicted_um: standard deviation of typical heights (`typical`) by `hx.fisher`, of the compared pixels.
         obtained_um: the same of the errors of the reconstructed heights, all draws of the noise together.
+        scatter_um: the same of their deviations from the mean over the draws: without what is wrong in all draws; None
+            with a single draw.
         stated_um: the same of the errors that the reconstructions state.
         rms_um: root mean square of the errors, which a few heights beside walls may dominate.
         compared: share of the pixels that are compared: valid in every draw, off the border.
@@ -83,6 +85,7 @@ class Check:
 
     predicted_um: float
     obtained_um: float
+    scatter_um: float | None
     stated_um: float
     rms_um: float
     compared: float
@@ -348,6 +351,7 @@ def check(scene: SceneFile, draws: int, n_samples: int = N_SAMPLES) -> Check:
     return Check(
         predicted_um=typical(expected.samples[:, use]),
         obtained_um=typical(errors),
+        scatter_um=typical(errors - errors.mean(0)) * math.sqrt(draws / (draws - 1)) if draws > 1 else None,
         stated_um=typical(stated),
         rms_um=float(np.sqrt(np.mean(errors**2))),
         compared=float(use.mean()),
