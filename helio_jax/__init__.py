@@ -5,9 +5,9 @@ Scene -- trace --> MicrographStack -- calibration, alignment --> MicrographStack
                         forward: heights and optics -> expected counts, differentiable; used by inverse
 ```
 
-Imports go downwards only: commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward,
-trace, formats > scene > nouns (tests/test_architecture.py). Frames, units, physics: docs/conventions.md. Public names
-are loaded on first use, so that `import helio_jax` is instant.
+Imports go downwards only: commands > workflows > figures > measure, scores, inverse, calibration, alignment, planning >
+forward, trace, formats > scene > nouns (tests/test_architecture.py). Frames, units, physics: docs/conventions.md.
+Public names are loaded on first use, so that `import helio_jax` is instant.
 
 Where is ... the shadow mask? trace/masks (maps of a simulation), forward/masking (in a reconstruction). The integration
 of slopes? inverse/integrate. A new scattering law? Its table in scene/scattering, its density in trace/lobes, its
@@ -157,6 +157,10 @@ alignment/            rotated scans onto one raster; orientation of arrays
   correlate           normalised cross-correlation with missing data
   resample            images at other positions; several scans on one raster
   orientation         rotated, mirrored and reordered images; what a file leaves open
+planning/             how long an acquisition takes and what it sees: numbers in, numbers out
+  timing              time of an acquisition; overhead of a measured scan
+  coverage            field of view after rotation
+  stage               rotation centre of a stage; windows that keep a region in view
 scores/               errors against something known
   settings            the [truth] table
   metrics             scores of a reconstruction against the true surface
@@ -213,6 +217,7 @@ figures/              pictures
   ripple              a ripple
   spot                the beam's spot
   sweep               scores of a study
+  planning            error against time of a plan
   pick                window for control points
 formats/              the only door to files
   hdf5                reads and writes stacks and reconstructions (HDF5)
@@ -221,6 +226,7 @@ formats/              the only door to files
   safe                checks of outputs, atomic writes
   suffixes            suffixes of files by format
   matlab              imports .mat files
+  acquisition         how a measured scan was acquired: times, stage window
   matlab_reference    the reference simulator's .mat layout
   tables              what the .mat tables hold
   export              writes files of other programs; the suffix selects the format
@@ -267,6 +273,8 @@ workflows/            what joins the stages
   steps               what helio measure --steps prints
   study               sweeps of scene values
   study_file          the study file
+  plan                hx.plan: time and expected errors of acquisitions
+  plan_windows        hx.plan_windows: rotation centre and stage windows
   export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
@@ -284,6 +292,7 @@ commands/             the command line; no logic of its own
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
+  planning            plan, plan-windows
   scenes              scenes, init, validate, schema
   about               doctor, fetch-data, cite
 ```
@@ -318,6 +327,8 @@ _HOME = {
     "measure_profile": "measure.profiles",
     "measure_step_height": "measure.step_height",
     "measure_texture": "measure.texture",
+    "plan": "workflows.plan",
+    "plan_windows": "workflows.plan_windows",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

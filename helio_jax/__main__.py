@@ -11,6 +11,7 @@ try:
         heights,
         looking,
         measured,
+        planning,
         scenes,
         simulating,
     )

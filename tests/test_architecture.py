@@ -1,8 +1,8 @@
 """The structure of the package: who may import whom, and where the one door to each heavy library is.
 
 Each level may import only from levels below; stages of one level are blind to one another:
-commands > workflows > figures > measure, scores, inverse, calibration, alignment > forward, trace, formats > scene >
-nouns > settings, arrays, kernel, block_fit > errors, spelling, validity.
+commands > workflows > figures > measure, scores, inverse, calibration, alignment, planning > forward, trace, formats >
+scene > nouns > settings, arrays, kernel, block_fit > errors, spelling, validity.
 """
 
 import ast
@@ -23,7 +23,7 @@ LEVELS = [
     {"micrograph", "heightmap", "reconstruction"},
     {"scene"},
     {"trace", "forward", "formats"},
-    {"inverse", "calibration", "alignment", "scores", "measure"},
+    {"inverse", "calibration", "alignment", "scores", "measure", "planning"},
     {"figures"},
     {"workflows"},
     {"commands"},

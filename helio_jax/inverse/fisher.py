@@ -53,7 +53,7 @@ def fisher(
     height: Any,
     optics: Optics,
     raster: Raster,
-    dose: float,
+    dose: Any,
     *,
     background: Any = 0.0,
     uncertainty: Uncertainty | None = None,
@@ -68,7 +68,7 @@ def fisher(
         height: assumed heights [y, x], um, or a `Surface` with known slopes.
         optics: beam and apertures.
         raster: beam positions.
-        dose: beam atoms per pixel times detection efficiency; counting noise is Poisson.
+        dose: beam atoms per pixel times detection efficiency, scalar or [detector]; counting noise is Poisson.
         background: counts per pixel that do not come from the sample, scalar or [detector].
         uncertainty: prior standard deviations of the geometry (table [uncertainty]); default: known exactly.
         settings: priors of gain, offset, drift ...; whether the border is flat (table [reconstruct]).
@@ -95,6 +95,7 @@ def fisher(
         elif corrections == "masking":
             corrections = masking_corrections(surface, optics, raster)
         probability = np.asarray(detection_probability(surface, optics, corrections, albedo))
+    dose = np.broadcast_to(dose, len(probability))[:, None, None]
     counts = dose * np.maximum(probability, 0.0) + np.broadcast_to(background, len(probability))[:, None, None]
     variance = np.maximum(counts, 1.0) / dose**2
     problem = FitProblem.of(probability, variance, optics, raster, surface, settings, uncertainty=uncertainty)
@@ -110,6 +111,6 @@ def fisher(
     return Information(posterior.height_std, parameters, posterior)
 
 
-def posterior_std(height: Any, optics: Optics, raster: Raster, dose: float, **options: Any) -> np.ndarray:
+def posterior_std(height: Any, optics: Optics, raster: Raster, dose: Any, **options: Any) -> np.ndarray:
     """Compute the standard deviation [y, x], um, with which an experiment would determine each height (`fisher`)."""
     return fisher(height, optics, raster, dose, **options).height_std

@@ -1,0 +1,137 @@
+"""Commands before a measurement: plan, plan-windows. They only parse, call, print."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from helio_jax.commands.app import CSV, FIGURE, AsJson, SceneArg, app, say
+from helio_jax.commands.door import Reads
+
+
+def _numbers(option: str, text: str | None, whole: bool = False) -> list[float]:
+    """Parse numbers (`whole`: whole ones) separated by commas.
+
+    Raises:
+        SceneError: an item is no such number.
+    """
+    from helio_jax.errors import SceneError
+
+    try:
+        return [int(item) if whole else float(item) for item in text.split(",")] if text else []
+    except ValueError:
+        kind = "whole numbers" if whole else "numbers"
+        raise SceneError(f"{option} must be {kind} separated by commas, got {text!r}") from None
+
+
+@app.command()
+def plan(
+    scene: SceneArg,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Error against time (.png, .pdf, .svg)."), FIGURE
+    ] = None,
+    dwell: Annotated[str | None, typer.Option(help="Counting times of a pixel [s], separated by commas.")] = None,
+    pixel: Annotated[str | None, typer.Option(help="Pixel sizes on the same field [um], separated by commas.")] = None,
+    views: Annotated[str | None, typer.Option(help="Numbers of evenly spaced rotations, separated by commas.")] = None,
+    rotations: Annotated[
+        list[str] | None, typer.Option(help='Rotations of the scans [deg], e.g. "0,90,180" (repeat).')
+    ] = None,
+    error: Annotated[float | None, typer.Option(help="Wanted standard deviation of the heights [um].")] = None,
+    timing: Annotated[
+        Path | None, typer.Option(help="Measured scan (.mat, .h5): pause and time to move are taken from it."), Reads()
+    ] = None,
+    change: Annotated[float, typer.Option(help="Time between two scans, to rotate the sample [s].")] = 0.0,
+    draws: Annotated[
+        int, typer.Option("--check", min=0, help="Simulate and reconstruct the chosen candidate so often.")
+    ] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Plan an acquisition: time, SNR and expected errors of the heights by dwell, pixel and rotations."""
+    from helio_jax.figures.planning import Curve, save_plan
+    from helio_jax.figures.wording import duration
+    from helio_jax.workflows.plan import measured_timing, stated_timing
+    from helio_jax.workflows.plan import plan as plan_scene
+    from helio_jax.workflows.scene_file import load_scene
+
+    loaded = load_scene(scene)
+    stage = measured_timing(timing) if timing else stated_timing(loaded)
+    even = [[360.0 * i / n for i in range(n)] for n in map(int, _numbers("--views", views, whole=True))]
+    found = plan_scene(
+        loaded,
+        dwell_s=_numbers("--dwell", dwell),
+        pixel_size_um=_numbers("--pixel", pixel),
+        rotations_deg=[*even, *(_numbers("--rotations", text) for text in rotations or ())],
+        wanted_um=error,
+        timing=replace(stage, change=change),
+        draws=draws,
+        say=say,
+    )
+    if output:
+        curves = [
+            Curve(f"{c[0].n_images} images, {c[0].pixel_size_um:g} um", [d.seconds / 3600 for d in c], errors)
+            for c in found.curves
+            for errors in [[d.height_std_um for d in c]]
+        ]
+        star = (found.chosen.seconds / 3600, found.chosen.height_std_um) if found.reaching else None
+        save_plan(curves, error, star, f"{found.name}: plan", output)
+    if as_json:
+        print(json.dumps(found.as_dict()))
+        return
+    head = f"{'scans':>5} {'images':>6} {'pixel':>8} {'dwell':>8} {'time':>10} {'SNR':>6} {'heights':>9} {'level':>9}"
+    print(f"{head} {'seen':>6} {'speed-up':>8}")
+
+    def line(c) -> str:
+        return (
+            f"{len(c.rotations_deg):>5} {c.n_images:>6} {c.pixel_size_um:>5g} um {c.dwell_s:>6.3g} s "
+            f"{duration(c.seconds):>10} {c.snr:>6.1f} {c.height_std_um:>6.3g} um {c.level_std_um:>6.3g} um "
+            f"{c.seen_by_all:>6.0%} {c.speed_up:>8.2f}"
+        )
+
+    print("\n".join(map(line, found.candidates)))
+    if found.reaching:
+        print(f"\ns.d. of the heights {error:g} um, the fastest first:\n" + "\n".join(map(line, found.reaching)))
+    elif error is not None:
+        best = min(c.height_std_um for c in found.candidates)
+        say(f"warning: no candidate reaches {error:g} um, the best has {best:.3g} um: add longer dwell times or views")
+    if (c := found.check) is not None:
+        print(
+            f"\nsimulated {c.draws} times: predicted {c.predicted_um:.3g} um, obtained {c.obtained_um:.3g} um "
+            f"(ratio {c.ratio:.2f}), stated {c.stated_um:.3g} um; {c.compared:.0%} of the pixels"
+            + (f"; scatter of the draws {c.scatter_um:.3g} um" if c.scatter_um is not None else "")
+        )
+
+
+@app.command("plan-windows")
+def plan_windows(
+    scans: Annotated[
+        list[Path], typer.Argument(help="Two or more A-SHeM scans of different rotation (.mat, .h5)."), Reads()
+    ],
+    points: Annotated[Path, typer.Option(help="The same points in the scans (CSV: view,point,x_um,y_um)."), Reads()],
+    rotations: Annotated[str, typer.Option(help="Wanted rotations of the sample [deg], separated by commas.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Stage windows (.csv)."), CSV] = None,
+    center: Annotated[
+        tuple[float, float], typer.Option(metavar="X Y", help="Centre of the region in the first scan [um].")
+    ] = (0.0, 0.0),
+    as_json: AsJson = False,
+) -> None:
+    """Find the rotation centre of a stage from two scans, and the windows that keep a region centred."""
+    from helio_jax.formats.points import read_points
+    from helio_jax.workflows.plan_windows import plan_windows as find_windows
+
+    found = find_windows(scans, read_points(points), _numbers("--rotations", rotations), center)
+    if output:
+        found.write(output)
+    if as_json:
+        print(json.dumps(found.as_dict()))
+        return
+    c, signs = found.rotation_center, [-1.0 if axis[0] == "-" else 1.0 for axis in found.axes]
+    place = ", ".join(f"{a[1:]} {s * v:.1f} um" for a, s, v in zip(found.axes, signs, c.center, strict=True))
+    print(f"rotation centre: {place}; s.d. {c.std:.1f} um, {c.n_points} points, residual {c.residual:.1f} um")
+    names = [axis[1:] for axis in found.axes]
+    print(f"{'rotation':>12}" + "".join(f"{f'{n} low':>14}{f'{n} high':>14}" for n in names))
+    for row in found.rows():
+        ends = "".join(f"{row[f'{n}_{e}_um']:>11.1f} um" for n in names for e in ("low", "high"))
+        print(f"{row['rotation_deg']:>8g} deg{ends}")
+    print(f"all windows see {found.seen_by_all:.0%} of the first one")
