@@ -147,7 +147,7 @@ def merged_heights(
     if not found:
         return np.zeros(points.shape[:2])
     is_seen = np.isfinite(found)
-    return fill_gaps(np.where(is_seen, found, 0.0).sum(0) / np.maximum(is_seen.sum(0), 1), is_seen.any(0))
+    return fill_gaps(np.where(is_seen, found, 0.0).sum(0) / np.maximum(is_seen.sum(0), 1), np.any(is_seen, axis=0))
 
 
 def _corrected_motions(

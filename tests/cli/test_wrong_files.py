@@ -44,7 +44,6 @@ def files(tmp_path_factory):
         ("evaluate stack.h5 --truth height.h5", "height map"),
         ("evaluate height.h5 --truth stack.h5", "height map"),
         ("reconstruct height.h5 -o out.h5", "micrographs"),
-        ("reconstruct set.h5 -o out.h5", "set.h5: this step needs one stack"),
         ("calibrate height.h5 -o out.h5", "micrographs"),
         ("measure stack.h5 --roughness", "height map"),
         ("align height.h5 -o out.h5 --auto", "micrographs"),

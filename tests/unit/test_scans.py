@@ -221,5 +221,5 @@ def test_wrong_files_and_uses_say_so(tmp_path):
         with pytest.raises(SceneError, match=message):
             run(tmp_path / "scene.toml", tmp_path / "out")
     scene_of(tmp_path, CAP, ONE + "rotations_deg = [0.0, 90.0]\n")
-    with pytest.raises(InputFileError, match="need rasters of 2 x 2 or more pixels, .* has 1 x 1"):
+    with pytest.raises(InputFileError, match=r"need rasters of 2 x 2 or more pixels, .* has 1 x 1"):
         run(tmp_path / "scene.toml", tmp_path / "out")
