@@ -6,7 +6,6 @@ on the site. Reference pages come from docs/reference.py, the menu from the tabl
 
 import os
 import re
-import shutil
 import sys
 from pathlib import Path
 
@@ -28,12 +27,16 @@ html_theme = "furo"
 html_title = f"helio_jax {version}"
 html_show_sourcelink = False
 html_copy_source = False
-html_static_path = []
 myst_heading_anchors = 6
-myst_enable_extensions = []
+smartquotes = False  # "--option" stays as it is
+toc_object_entries = False
 default_role = "literal"  # docstrings are Markdown: `name`
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+measured = [
+    p for p in sorted((DOCS.parent / "notebooks").glob("*.ipynb")) if '"needs": "measured data"' in p.read_text()
+]
+nb_execution_excludepatterns = [] if "HELIO_DATA" in os.environ else [f"notebooks/{path.name}" for path in measured]
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(DOCS.parent / "helio-out" / "notebooks")
 nb_execution_timeout = 300
@@ -60,7 +63,9 @@ def menu(text):
 
 
 def escape_docstring(app, what, name, obj, options, lines):
-    """Escape what reStructuredText would read as markup outside of `code`."""
+    """Escape what reStructuredText would read as markup outside of `code`, or napoleon as the type of a property."""
+    if what == "property":
+        lines.insert(0, "")
     for i, line in enumerate(lines):
         lines[i] = "`".join(
             part if k % 2 else re.sub(r"([*|_])(?=\W|$)", r"\\\1", part) for k, part in enumerate(line.split("`"))
@@ -78,5 +83,5 @@ def add_index(app, error):
 def setup(app):
     """Connect them."""
     app.connect("source-read", insert)
-    app.connect("autodoc-process-docstring", escape_docstring)
+    app.connect("autodoc-process-docstring", escape_docstring, priority=400)  # before napoleon
     app.connect("build-finished", add_index)

@@ -4,7 +4,6 @@ A line `<!-- insert: NAME -->` of a page is replaced by what the function NAME r
 generated text is stored, so none can be stale.
 """
 
-import importlib
 import inspect
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +13,6 @@ from typer.main import get_command
 import helio_jax
 from helio_jax.__main__ import app
 from helio_jax.formats.nexus import RECONSTRUCTION_FIELDS, STACK_FIELDS, Field
-from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.workflows.scene_file import json_schema
 
 OWN = ("extends", "append", "name", "description")
@@ -55,7 +53,7 @@ def _tables(
         for name in names:
             model = models[name]
             kind = model["properties"].get("kind", {}).get("const")
-            title = f"{head}, kind = \"{kind}\"" if len(names) > 1 else head
+            title = f'{head}, kind = "{kind}"' if len(names) > 1 else head
             depth = level + (len(names) > 1)
             text = _escape(model.get("description", ""))
             yield f"{'#' * depth} {title}\n{text}\n\n{_keys(model['properties'], model.get('required', []))}"
@@ -138,21 +136,13 @@ def _command(name: str, command: Any) -> str:
 
 
 def public_names() -> str:
-    """Document every public name of the package, in the order of what it does."""
-    homes: dict[str, list[str]] = {}
-    for name in helio_jax.__all__:
-        value = getattr(helio_jax, name)
-        homes.setdefault(getattr(value, "__module__", "helio_jax"), []).append(name)
+    """Document every public name of the package, in alphabetical order."""
     parts = []
-    for home, names in homes.items():
-        for name in names:
-            value = getattr(helio_jax, name)
-            if inspect.isclass(value):
-                kind, options = "autoclass", ["   :members:"]
-            else:
-                kind, options = ("autofunction" if callable(value) else "autodata"), []
-            head = f".. {kind}:: helio_jax.{name}"
-            parts.append("\n".join((f"## hx.{name}", f"From `{home}`.", "```{eval-rst}", head, *options, "```")))
+    for name in sorted(helio_jax.__all__, key=str.lower):
+        value = getattr(helio_jax, name)
+        kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+        members = "   :members:\n" if kind == "class" else ""
+        parts.append(f"## hx.{name}\n```{{eval-rst}}\n.. auto{kind}:: helio_jax.{name}\n{members}```")
     return "\n\n".join(parts)
 
 

@@ -26,13 +26,16 @@ def blocks(text: str) -> list[tuple[str, str]]:
 
 
 def run_page(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, small: Mapping[str, str]) -> dict:
-    """Run a page in a folder; return the names of its Python blocks.
+    """Run a page in a folder; each file that a command names by `-o` must be there in the end.
 
     Args:
         text: the page.
         folder: where it runs.
         monkeypatch: of the test.
         small: replacements in scene files before a command reads them, so that it takes less time.
+
+    Returns:
+        The names of its Python blocks.
     """
     monkeypatch.chdir(folder)
     names: dict = {}
@@ -47,6 +50,8 @@ def run_page(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, small: Ma
                 run_helio(line)
         elif language == "sh":
             run_shell(code, folder)
+    outputs = re.findall(r"^helio .*? -o (\S+)", text, re.MULTILINE)
+    assert not (missing := [file for file in outputs if not (folder / file).exists()]), missing
     return names
 
 
@@ -60,13 +65,11 @@ def shrink(folder: Path, small: Mapping[str, str]) -> None:
 
 
 def run_helio(line: str) -> None:
-    """Run one command; it must end with exit code 0 and leave the file that `-o` names."""
+    """Run one command; it must end with exit code 0."""
     words = shlex.split(line, comments=True)
     with pytest.raises(SystemExit) as end:
         main(words[1:])
     assert not end.value.code, line
-    if "-o" in words:
-        assert Path(words[words.index("-o") + 1]).exists(), line
 
 
 def run_shell(code: str, folder: Path) -> None:
