@@ -23,9 +23,8 @@ _CHECK_ORDERS = 64
 """Trial at which the sampler checks whether any diffraction order is open."""
 _NO_ORDER = 1e-9
 """Share of open diffraction orders below which all atoms follow the cosine law."""
-_COSINE, _SPECULAR, _DIFFRACTION, _TABLE = (
-    int(s) for s in (Shape.COSINE, Shape.SPECULAR, Shape.DIFFRACTION, Shape.TABLE)
-)
+_COSINE, _SPECULAR, _UNIFORM, _LOBE = (int(s) for s in (Shape.COSINE, Shape.SPECULAR, Shape.UNIFORM, Shape.LOBE))
+_COSINE_LOBE, _DIFFRACTION, _ROUGH = (int(s) for s in (Shape.COSINE_LOBE, Shape.DIFFRACTION, Shape.ROUGH))
 
 
 @kernel
@@ -64,12 +63,22 @@ def _draw(table, t, d, n, key, stream, pixel, path, event):
         b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
     for trial in range(1, _MAX_TRIALS):
         a, b, c, e = philox(key, stream, pixel, path, event, np.uint64(2 * trial))
-        f, g = 0.0, 0.0
+        is_exact = False
         if shape == _DIFFRACTION and trial == _CHECK_ORDERS and not _has_orders(table, t, d, n):
             return np.nan, np.nan, np.nan, False
-        if shape == _TABLE:
+        if shape == _UNIFORM:
+            is_kept, x, y, z = lobes.try_uniform(n, p, a, b)
+        elif shape == _LOBE:
+            is_kept, x, y, z = lobes.try_lobe(d, n, p, q, a, b, c)
+        elif shape == _COSINE_LOBE:
+            is_kept, x, y, z = lobes.try_cosine_lobe(d, n, a, b)
+        elif shape == _DIFFRACTION:
+            is_kept, x, y, z, is_exact = lobes.try_diffraction(d, n, b1, b2, rows, a, b, c)
+        elif shape == _ROUGH:
+            is_kept, x, y, z = lobes.try_rough(d, n, p, a, b, c, e)
+        else:
             f, g, _, _ = philox(key, stream, pixel, path, event, np.uint64(2 * trial + 1))
-        is_kept, x, y, z, is_exact = lobes.try_direction(shape, d, n, p, q, b1, b2, rows, nodes, a, b, c, e, f, g)
+            is_kept, x, y, z = lobes.try_table(d, n, nodes, a, b, c, e, f, g)
         if is_kept:
             length = np.sqrt(x * x + y * y + z * z)
             return x / length, y / length, z / length, is_exact
@@ -81,10 +90,20 @@ def _density(table, t, d, n, o):
     """Compute the density of one lobe with attenuation (0 for exact directions)."""
     shape, p, q = table.shape[t], table.numbers[t, 0], table.numbers[t, 1]
     rows, nodes = _arrays(table, t)
-    b1, b2 = n, n
-    if shape == _DIFFRACTION:
+    if shape == _UNIFORM:
+        cosine = o[0] * n[0] + o[1] * n[1] + o[2] * n[2]
+        out = 1.0 / (2.0 * np.pi * (1.0 - p)) if cosine >= p else 0.0
+    elif shape == _LOBE:
+        out = lobes.lobe_density(d, n, p, q, nodes, o)
+    elif shape == _COSINE_LOBE:
+        out = lobes.cosine_lobe_density(d, n, o)
+    elif shape == _DIFFRACTION:
         b1, b2 = lobes.lattice_steps(table.lattice[t], table.numbers[t, 1] > 0.0, n)
-    out = lobes.density(shape, d, n, p, q, b1, b2, rows, nodes, o)
+        out = lobes.diffraction_density(d, n, b1, b2, rows, p, nodes, o)
+    elif shape == _ROUGH:
+        out = lobes.rough_density(d, n, p, o)
+    else:
+        out = lobes.table_density(d, n, nodes, o)
     return out * _debye_waller(table, t, d, o[0], o[1], o[2])
 
 

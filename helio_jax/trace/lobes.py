@@ -8,11 +8,8 @@ the surface), n the unit normal, o an outgoing unit direction.
 import numpy as np
 
 from helio_jax.kernel import kernel
-from helio_jax.scene.scattering import Shape
 from helio_jax.trace.lawtable import CUT
 
-_UNIFORM, _LOBE, _COSINE_LOBE = (int(s) for s in (Shape.UNIFORM, Shape.LOBE, Shape.COSINE_LOBE))
-_DIFFRACTION, _ROUGH, _TABLE = (int(s) for s in (Shape.DIFFRACTION, Shape.ROUGH, Shape.TABLE))
 _REJECTED = (False, 0.0, 0.0, 0.0)
 _EON_A = 0.5 - 2.0 / (3.0 * np.pi)
 _EON_B = 2.0 / 3.0 - 28.0 / (15.0 * np.pi)
@@ -65,13 +62,6 @@ def try_uniform(n, cos_edge, a, b):
     r = np.sqrt(max(0.0, 1.0 - z * z))
     x, y, z = rotate_from_z(n[0], n[1], n[2], r * np.cos(angle), r * np.sin(angle), z)
     return True, x, y, z
-
-
-@kernel
-def uniform_density(n, cos_edge, o):
-    """Density of `try_uniform`."""
-    cosine = o[0] * n[0] + o[1] * n[1] + o[2] * n[2]
-    return 1.0 / (2.0 * np.pi * (1.0 - cos_edge)) if cosine >= cos_edge else 0.0
 
 
 @kernel
@@ -311,43 +301,3 @@ def table_density(d, n, nodes, o):
     i, u = _between(incidence, np.arccos(min(1.0, -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2]))))
     out = (1.0 - u) * _bilinear(intensity[i], j, s, k, t)
     return out + (u * _bilinear(intensity[i + 1], j, s, k, t) if u > 0.0 else 0.0)
-
-
-@kernel
-def try_direction(shape, d, n, p, q, b1, b2, rows, nodes, a, b, c, e, f, g):
-    """Draw from the lobe of a shape: (is_accepted, direction, is_exact).
-
-    p, q are its numbers, b1, b2 the `lattice_steps` of a diffraction, a to g uniform numbers (f, g of a table only).
-    """
-    is_kept, x, y, z, is_exact = False, 0.0, 0.0, 0.0, False
-    if shape == _UNIFORM:
-        is_kept, x, y, z = try_uniform(n, p, a, b)
-    elif shape == _LOBE:
-        is_kept, x, y, z = try_lobe(d, n, p, q, a, b, c)
-    elif shape == _COSINE_LOBE:
-        is_kept, x, y, z = try_cosine_lobe(d, n, a, b)
-    elif shape == _DIFFRACTION:
-        is_kept, x, y, z, is_exact = try_diffraction(d, n, b1, b2, rows, a, b, c)
-    elif shape == _ROUGH:
-        is_kept, x, y, z = try_rough(d, n, p, a, b, c, e)
-    elif shape == _TABLE:
-        is_kept, x, y, z = try_table(d, n, nodes, a, b, c, e, f, g)
-    return is_kept, x, y, z, is_exact
-
-
-@kernel
-def density(shape, d, n, p, q, b1, b2, rows, nodes, o):
-    """Compute the density per steradian of `try_direction`, without exact directions."""
-    if shape == _UNIFORM:
-        return uniform_density(n, p, o)
-    if shape == _LOBE:
-        return lobe_density(d, n, p, q, nodes, o)
-    if shape == _COSINE_LOBE:
-        return cosine_lobe_density(d, n, o)
-    if shape == _DIFFRACTION:
-        return diffraction_density(d, n, b1, b2, rows, p, nodes, o)
-    if shape == _ROUGH:
-        return rough_density(d, n, p, o)
-    if shape == _TABLE:
-        return table_density(d, n, nodes, o)
-    return 0.0
