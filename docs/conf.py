@@ -65,7 +65,7 @@ def menu(text):
 def escape_docstring(app, what, name, obj, options, lines):
     """Escape what reStructuredText would read as markup outside of `code`, or napoleon as the type of a property."""
     if what == "property":
-        lines.insert(0, "")
+        lines[:0] = ["..", ""]
     for i, line in enumerate(lines):
         lines[i] = "`".join(
             part if k % 2 else re.sub(r"([*|_])(?=\W|$)", r"\\\1", part) for k, part in enumerate(line.split("`"))
