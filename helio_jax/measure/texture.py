@@ -17,7 +17,7 @@ from helio_jax.errors import GuardError, SceneError
 from helio_jax.heightmap import HeightMap
 from helio_jax.measure.areal_filters import Form, form_surface, gaussian_mean
 from helio_jax.measure.sample_surface import SampleSurface, sample_surface
-from helio_jax.measure.texture_parameters import UNITS, texture_parameters
+from helio_jax.measure.texture_parameters import PARAMETERS, texture_parameters
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.settings import Settings
 
@@ -27,8 +27,6 @@ MIN_NESTING = 3.0
 """Smallest nesting index of the S-filter [pitches], after ISO 25178-3."""
 _DRAWS, _SEED = 32, 25178
 """Draws of errors where there are no posterior samples, and their seed."""
-_GROW_AS_ROOT = {"Sa", "Sq", "Sp", "Sv", "Sz", "Sdq", "Sk", "Spk", "Svk"}
-"""Parameters whose squares, not they themselves, grow in proportion to the variance of the noise."""
 
 
 class TextureSettings(Settings):
@@ -89,9 +87,11 @@ class Texture:
     errors: str
 
     def __getattr__(self, name: str) -> float:
-        if name in UNITS:
+        if name in PARAMETERS:
             return self.parameters[name].value
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; its parameters are {', '.join(UNITS)}")
+        raise AttributeError(
+            f"{type(self).__name__} has no attribute {name!r}; its parameters are {', '.join(PARAMETERS)}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return all as nested dictionaries."""
@@ -165,7 +165,7 @@ def measure_texture(
     known = np.isfinite(surface.height)
     rows, columns = np.nonzero(known)
     return Texture(
-        parameters={name: _parameter(name, measured[name], drawn, how.subtract_noise) for name in UNITS},
+        parameters={name: _parameter(name, measured[name], drawn, how.subtract_noise) for name in PARAMETERS},
         settings=how,
         surface="S-L surface" if how.l_filter_um else "S-F surface",
         n_pixels=n_known,
@@ -235,12 +235,12 @@ def _parameter(name: str, value: float, drawn: list[list[dict[str, float]]], sub
     Source: Cook and Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314 (SIMEX, linear extrapolant).
     """
     if not drawn:
-        return Parameter(value, math.nan, math.nan, UNITS[name])
+        return Parameter(value, math.nan, math.nan, PARAMETERS[name].unit)
     pairs = np.array([[d[name] for d in pair] for pair in drawn])
     # opposite errors change a parameter oppositely to first order: half their difference is the draw without its bias
     std = float(np.sqrt(np.mean((0.5 * (pairs[:, 0] - pairs[:, 1])) ** 2)))
-    if name in _GROW_AS_ROOT:
+    if PARAMETERS[name].grows_as_root:
         clean = math.sqrt(max(2.0 * value**2 - float(np.mean(pairs**2)), 0.0))
     else:
         clean = 2.0 * value - float(np.mean(pairs))
-    return Parameter(clean if subtract else value, std, value - clean, UNITS[name])
+    return Parameter(clean if subtract else value, std, value - clean, PARAMETERS[name].unit)

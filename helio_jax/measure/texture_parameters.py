@@ -4,40 +4,51 @@ Heights [y, x] in um are deviations from their mean, NaN where unknown, on a reg
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from helio_jax.measure.autocorrelation import spatial_parameters
 from helio_jax.measure.material_ratio import material_ratio_parameters
 
-UNITS = {
-    "Sa": "um", "Sq": "um", "Ssk": "", "Sku": "", "Sp": "um", "Sv": "um", "Sz": "um", "Sdq": "", "Sdr": "%",
-    "Sk": "um", "Spk": "um", "Svk": "um", "Smr1": "%", "Smr2": "%", "Sal": "um", "Str": "",
-}  # fmt: skip
-"""Unit of every parameter, in the order in which they are reported."""
-MEANINGS = {
-    "Sa": "arithmetical mean height",
-    "Sq": "root mean square height",
-    "Ssk": "skewness",
-    "Sku": "kurtosis",
-    "Sp": "maximum peak height",
-    "Sv": "maximum pit height",
-    "Sz": "maximum height",
-    "Sdq": "root mean square gradient",
-    "Sdr": "developed interfacial area ratio",
-    "Sk": "core height",
-    "Spk": "reduced peak height",
-    "Svk": "reduced dale height",
-    "Smr1": "material ratio, peaks from core",
-    "Smr2": "material ratio, dales from core",
-    "Sal": "autocorrelation length",
-    "Str": "texture aspect ratio",
+
+class Kind(NamedTuple):
+    """What is known of a parameter before it is measured.
+
+    Attributes:
+        unit: "um", "%" or "".
+        meaning: what it is.
+        grows_as_root: its square, not the parameter itself, grows in proportion to the variance of the noise.
+    """
+
+    unit: str
+    meaning: str
+    grows_as_root: bool = False
+
+
+PARAMETERS = {
+    "Sa": Kind("um", "arithmetical mean height", grows_as_root=True),
+    "Sq": Kind("um", "root mean square height", grows_as_root=True),
+    "Ssk": Kind("", "skewness"),
+    "Sku": Kind("", "kurtosis"),
+    "Sp": Kind("um", "maximum peak height", grows_as_root=True),
+    "Sv": Kind("um", "maximum pit height", grows_as_root=True),
+    "Sz": Kind("um", "maximum height", grows_as_root=True),
+    "Sdq": Kind("", "root mean square gradient", grows_as_root=True),
+    "Sdr": Kind("%", "developed interfacial area ratio"),
+    "Sk": Kind("um", "core height", grows_as_root=True),
+    "Spk": Kind("um", "reduced peak height", grows_as_root=True),
+    "Svk": Kind("um", "reduced dale height", grows_as_root=True),
+    "Smr1": Kind("%", "material ratio, peaks from core"),
+    "Smr2": Kind("%", "material ratio, dales from core"),
+    "Sal": Kind("um", "autocorrelation length"),
+    "Str": Kind("", "texture aspect ratio"),
 }
-"""What each parameter is."""
+"""Every parameter, in the order in which they are reported."""
 
 
 def texture_parameters(z: np.ndarray, steps: tuple[float, float]) -> dict[str, float]:
-    """Compute the parameters named in `UNITS`; NaN where one is not defined.
+    """Compute all `PARAMETERS`; NaN where one is not defined.
 
     Args:
         z: deviations from their mean [y, x], um; NaN: unknown.
@@ -57,7 +68,7 @@ def texture_parameters(z: np.ndarray, steps: tuple[float, float]) -> dict[str, f
         "Sz": float(np.ptp(v)),
     }
     found |= hybrid_parameters(z, steps) | material_ratio_parameters(v) | spatial_parameters(z, steps)
-    return {name: found[name] for name in UNITS}
+    return {name: found[name] for name in PARAMETERS}
 
 
 def hybrid_parameters(z: np.ndarray, steps: tuple[float, float]) -> dict[str, float]:

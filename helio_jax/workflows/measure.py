@@ -27,7 +27,7 @@ from helio_jax.measure.ripple import compare_with_images, height_ripple, image_s
 from helio_jax.measure.spectrum import RippleSettings
 from helio_jax.measure.step_height import StepHeight, measure_step, measure_step_height
 from helio_jax.measure.texture import Texture, TextureSettings, measure_texture
-from helio_jax.measure.texture_parameters import MEANINGS
+from helio_jax.measure.texture_parameters import PARAMETERS
 from helio_jax.measure.walls import WallSettings, find_walls
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
@@ -232,7 +232,7 @@ def _texture_lines(texture: Texture) -> list[str]:
     ]
     for name, p in texture.parameters.items():
         numbers = "".join(f"{v:>12.5g}" if np.isfinite(v) else f"{'-':>12}" for v in (p.value, p.std, p.noise_bias))
-        lines.append(f"  {name:<6}{numbers} {p.unit:<3} {MEANINGS[name]}")
+        lines.append(f"  {name:<6}{numbers} {p.unit:<3} {PARAMETERS[name].meaning}")
     if np.isfinite(texture.Sal) and not np.isfinite(texture.Str):
         lines.append("  Str: the autocorrelation does not fall to 0.2 within half the field in some direction")
     return lines

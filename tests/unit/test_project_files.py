@@ -59,9 +59,9 @@ def test_gate_runs_the_readmes_test_command():
     """Catches a gate that tests something else than a contributor does."""
     run, test = fresh_machine_commands()
     assert run == "helio run scenes/sphere_a.toml" and test == "python -m pytest -n 2 --dist worksteal"
-    assert f".ci-venv/bin/{test}\n" in GATE and "-c constraints.txt -e '.[test]'" in GATE
+    assert f".ci-venv/bin/{test}\n" in GATE and "-c constraints.txt -e '.[test,docs]'" in GATE
     assert GATE.rstrip().endswith(test)  # pytest's closing line is the last thing that is printed
-    for tool in ("ruff format --check", "ruff check", "pyright"):
+    for tool in ("ruff format --check", "ruff check", "pyright", "sphinx-build -W"):
         assert f".ci-venv/bin/{tool}" in GATE
 
 
@@ -73,7 +73,7 @@ def test_gate_is_portable():
 
 
 def test_constraints_pin_versions_of_everything():
-    """Each line is name==version; all dependencies, and those for the tests, are named, at an allowed version.
+    """Each line is name==version; all dependencies, and those for tests and docs, are named, at an allowed version.
 
     Catches hashes, URLs and editable lines, and a dependency added to the project but not to the file.
     """
@@ -81,7 +81,8 @@ def test_constraints_pin_versions_of_everything():
     pins = [Requirement(line) for line in lines]
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+!]+", line) for line in lines)
     pinned = {canonicalize_name(r.name): next(iter(r.specifier)).version for r in pins}
-    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["test"]:
+    extras = PROJECT["optional-dependencies"]
+    for text in PROJECT["dependencies"] + extras["test"] + extras["docs"]:
         wanted = Requirement(text)
         assert wanted.specifier.contains(pinned[canonicalize_name(wanted.name)]), text
 

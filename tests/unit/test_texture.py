@@ -12,7 +12,7 @@ from helio_jax.errors import GuardError, SceneError
 from helio_jax.measure.autocorrelation import autocorrelation, decay_lengths
 from helio_jax.measure.material_ratio import material_ratio_parameters
 from helio_jax.measure.sample_surface import FLAGS, sample_surface
-from helio_jax.measure.texture_parameters import MEANINGS, UNITS, texture_parameters
+from helio_jax.measure.texture_parameters import PARAMETERS, texture_parameters
 from tests.height_maps import make_rec
 
 EXACT = 1e-3
@@ -305,5 +305,5 @@ def test_refusals():
     with pytest.raises(SceneError, match="has its grid already"):
         hx.measure_texture(height_map(np.zeros((30, 30))), grid_um=2.0)
     with pytest.raises(AttributeError, match="its parameters are Sa, Sq"):
-        hx.measure_texture(rec).Sxp  # noqa: B018
-    assert UNITS.keys() == MEANINGS.keys() == hx.measure_texture(rec).as_dict()["parameters"].keys()
+        hx.measure_texture(rec).Sxx  # noqa: B018
+    assert PARAMETERS.keys() == hx.measure_texture(rec).as_dict()["parameters"].keys()
