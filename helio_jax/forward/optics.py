@@ -159,7 +159,7 @@ class Optics(eqx.Module):
     def of_raster(self) -> "Optics":
         """Return optics of one beam, that of the raster: each aperture as seen from the substrate by its own beam.
 
-        From other heights h the apertures of other beams are seen up to h |difference of the beam shifts| / D off.
+        Seen from a height h, the apertures of another beam stand h times the difference of the beam shifts elsewhere.
         """
         if self.beam_shifts is None:
             return self
