@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 CPU_SECONDS = 5.0
-WALL_SECONDS = 60.0
+WALL_SECONDS = 300.0
 """Silence of the worker after which it hangs; much more than its CPU time, for machines that are busy."""
 MEMORY_BYTES = 2**30
 UNDAMAGED = -1
