@@ -154,10 +154,9 @@ def reconstruct_scans(
     work = _Reconstructing(chosen, workers)
     if is_oblique and chosen.method == "refine":
         if all(s.shape[0] >= MIN_IMAGES for s in scans.stacks):  # each fitted alone shows depth jumps, too
-            joined = joined.on(scans, merged_heights(scans, joined.motions, lambda s: work.fit(s, report)), 0)
-        for number in range(1, MAX_FITS):
-            height = work.fit(joined.stack, report).height
-            joined = joined.on(scans, height, number)
+            joined = joined.on(merged_heights(joined.scans, joined.motions, lambda s: work.fit(s, report)))
+        for _ in range(1, MAX_FITS):
+            joined = joined.on(work.fit(joined.stack, report).height)
             if joined.change < FITTED:
                 break
     rec = work.finish(joined.stack, report)

@@ -45,32 +45,44 @@ class JoinedScans:
     """Several scans on one raster of the sample frame.
 
     Attributes:
-        stack: their images; the detectors of all scans one after the other.
+        scans: the scans, of one dose and with names of their own.
+        stack: their images on the raster; the detectors of all scans one after the other.
         motions: of each scan, from the common frame.
         motion_std: standard deviation of a pixel's place by each motion [um]; 0 where the stage is taken at its word.
-        turns: how often heights and places were found.
-        change: of the places in the last turn, root mean square [pixels].
+        change: of the places in the last turn between heights and places, root mean square [pixels].
+        motion_change: of the places by the last correction of fitted motions [pixels]; 0 where they are not fitted.
     """
 
+    scans: MicrographSet
     stack: MicrographStack
     motions: tuple[Rigid, ...]
     motion_std: tuple[float, ...]
-    turns: int
-    change: float
+    change: float = 0.0
+    motion_change: float = 0.0
 
-    def on(self, scans: MicrographSet, height: np.ndarray, turns: int) -> "JoinedScans":
-        """Read the images anew on other heights [y, x], um, found in so many turns."""
-        stack = resample(scans, self.motions, "reference", self.motion_std, height)
-        return replace(self, stack=stack, turns=turns, change=_moved(scans, height - self.stack.parallax_height))
+    @classmethod
+    def at(
+        cls, scans: MicrographSet, motions: tuple[Rigid, ...], std: tuple[float, ...], height: np.ndarray | None
+    ) -> "JoinedScans":
+        """Read the images of scans at heights of the common raster [y, x], um; None: heights move no pixel."""
+        return cls(scans, resample(scans, motions, "reference", std, height), motions, std)
+
+    def on(self, height: np.ndarray) -> "JoinedScans":
+        """Read the images anew on other heights [y, x], um."""
+        assert self.stack.parallax_height is not None  # of oblique beams
+        change = _moved(self.scans, height - self.stack.parallax_height)
+        joined = JoinedScans.at(self.scans, self.motions, self.motion_std, height)
+        return replace(joined, change=change, motion_change=self.motion_change)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to know before heights of the stack are trusted."""
-        if self.change < UNSETTLED:
-            return ()
-        return (
-            f"the scans' places on the surface have not settled in {self.turns} turns: the last one moved them by "
-            f"{self.change:.2f} pixels (limit {UNSETTLED:g})",
+        changes = {"the scans' places on the surface": self.change, "the fitted motions": self.motion_change}
+        return tuple(
+            f"{what} have not settled: the last turn moved places in the images by {change:.2f} pixels (limit "
+            f"{UNSETTLED:g})"
+            for what, change in changes.items()
+            if change >= UNSETTLED
         )
 
 
@@ -101,25 +113,26 @@ def join_scans(
     _check(scans)
     scans = _comparable(scans)
     found = stage_motions(scans) if isinstance(motions, str) else motions
-    std = (0.0,) * len(found)
+    known = std = (0.0,) * len(found)
     is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
     if not is_oblique and motions != "fitted":
-        return JoinedScans(resample(scans, found, "reference"), found, std, 1, 0.0)
+        return JoinedScans.at(scans, found, std, None)
     quick = (settings or ReconstructSettings()).changed(method="nearfield", samples=0)
     height = merged_heights(scans, found, lambda scan: reconstruct_stack(scan, quick))
+    joined, moved = JoinedScans.at(scans, found, std, height), 0.0
     for turn in range(1, MAX_TURNS + 1):
-        moved = 0.0
+        smoothing = LAST_SMOOTHING
         if motions == "fitted":
-            joined = resample(scans, found, "reference", height=height)
             smoothing = max(LAST_SMOOTHING, FIRST_SMOOTHING * FALL ** (turn - 1))
-            found, std, moved = _corrected_motions(scans, joined, found, height, smoothing)
-        before, joined = height, resample(scans, found, "reference", std, height)
-        height = before + DAMPING * (reconstruct_stack(joined, quick).height - before)
-        change = float(np.hypot(moved, _moved(scans, height - before)))
-        say(f"turn {turn}: places on the surface changed by {change:.2f} pixels")
-        if change < SETTLED and (motions != "fitted" or smoothing == LAST_SMOOTHING):
+            # the motions' own uncertainty, in the data's variance, would hide the edges that determine them
+            found, std, moved = _corrected_motions(JoinedScans.at(scans, found, known, height), height, smoothing)
+            joined = replace(JoinedScans.at(scans, found, std, height), motion_change=moved)
+        height = height + DAMPING * (reconstruct_stack(joined.stack, quick).height - height)
+        joined = joined.on(height)
+        say(f"turn {turn}: places on the surface changed by {max(joined.change, moved):.2f} pixels")
+        if max(joined.change, moved) < SETTLED and smoothing == LAST_SMOOTHING:
             break
-    return JoinedScans(resample(scans, found, "reference", std, height), found, std, turn, change)
+    return joined
 
 
 def _moved(scans: MicrographSet, change: np.ndarray) -> float:
@@ -151,11 +164,7 @@ def merged_heights(
 
 
 def _corrected_motions(
-    scans: MicrographSet,
-    joined: MicrographStack,
-    motions: tuple[Rigid, ...],
-    height: np.ndarray,
-    smoothing: float,
+    joined: JoinedScans, height: np.ndarray, smoothing: float
 ) -> tuple[tuple[Rigid, ...], tuple[float, ...], float]:
     """Correct every motion by what the other scans predict (all, where others have too few images).
 
@@ -165,22 +174,23 @@ def _corrected_motions(
         The motions, the standard deviation of a pixel's place by each [um], and by how much the largest correction
         moves places [pixels].
     """
-    signal, variance = signal_of(joined)
-    phi = form_factor(Optics.of(joined.instrument), height)
-    number = np.repeat(np.arange(len(scans.stacks)), [s.shape[0] for s in scans.stacks])
+    stack, scans = joined.stack, joined.scans.stacks
+    signal, variance = signal_of(stack)
+    phi = form_factor(Optics.of(stack.instrument), height)
+    number = np.repeat(np.arange(len(scans)), [s.shape[0] for s in scans])
     corrections, std, moved = [], [], 0.0
-    for scan in range(len(scans.stacks)):
+    for scan in range(len(scans)):
         own = number == scan
         used = ~own if np.sum(~own) >= MIN_IMAGES else np.ones(len(own), bool)
         solution = solve_linear(signal[used], variance[used], phi[used])
         predicted = single_scattering(phi[own], np.moveaxis(solution.albedo[..., None] * solution.normals, -1, 0))
-        is_known = joined.is_observed[own] & (joined.is_observed[used].sum(0) >= MIN_IMAGES) & np.isfinite(predicted)
-        correction, shift, place = correct_motion(signal[own], predicted, is_known, joined.x, joined.y, smoothing)
+        is_known = stack.is_observed[own] & (stack.is_observed[used].sum(0) >= MIN_IMAGES) & np.isfinite(predicted)
+        correction, shift, place = correct_motion(signal[own], predicted, is_known, stack.x, stack.y, smoothing)
         corrections.append(correction)
         std.append(place)
-        moved = max(moved, shift / pitch(joined.x))
+        moved = max(moved, shift / pitch(stack.x))
     frame = corrections[0].inverse()
-    found = tuple(m.after(c.after(frame)) for m, c in zip(motions, corrections, strict=True))
+    found = tuple(m.after(c.after(frame)) for m, c in zip(joined.motions, corrections, strict=True))
     return found, tuple(std), moved
 
 
@@ -203,11 +213,11 @@ def _check(scans: MicrographSet) -> None:
     """Refuse scans that one surface below one plate cannot explain."""
     first = scans.stacks[0]
     for stack in scans.stacks:
+        if stack.positions is not None:
+            raise InputFileError(f"{stack.name}: heights need rasters, this scan is a list of positions: leave it out")
         if min(stack.shape[1:]) < 2:
             size = " x ".join(map(str, stack.shape[1:]))
             raise InputFileError(f"heights need rasters of 2 x 2 or more pixels, scan {stack.name!r} has {size}")
-        if stack.positions is not None:
-            raise InputFileError(f"{stack.name}: heights need rasters, this scan is a list of positions: leave it out")
         for name in ("sample_distance", "working_distance"):
             a, b = getattr(first.instrument, name), getattr(stack.instrument, name)
             if not np.isclose(a, b):
