@@ -195,12 +195,19 @@ def _corrected_motions(
 
 
 def _comparable(scans: MicrographSet) -> MicrographSet:
-    """Bring the counts of all scans to the first one's number of beam atoms, where it is known; give each a name."""
+    """Bring the counts of all scans to the first one's number of beam atoms, where it is known; give each a name.
+
+    The names are those of the scans, without the name of the scene that views have in common.
+    """
     dose, names = scans.stacks[0].n_rays, [s.name for s in scans.stacks]
+    parts = [name.partition(", ") for name in names]
+    if len({scene for scene, _, _ in parts}) == 1 and all(view for _, _, view in parts):
+        names = [view for _, _, view in parts]
+    if len(set(names)) < len(names):
+        names = [f"{number} {name}" for number, name in enumerate(names, 1)]
     out = []
-    for number, s in enumerate(scans.stacks, 1):
-        if len(set(names)) < len(names):
-            s = s.replace(name=f"{number} {s.name}")
+    for s, name in zip(scans.stacks, names, strict=True):
+        s = s.replace(name=name)
         factor = dose / s.n_rays if dose and s.n_rays else 1.0
         background = None if s.background is None else factor * s.background
         variance = None if s.variance is None else factor**2 * s.variance
