@@ -73,7 +73,7 @@ def run_test(folder: Path, place: str, name: str) -> None:
 def test_a_law_is_added_by_the_recipe(tmp_path):
     """Catches a recipe that has aged, and a further place that a new law would need.
 
-    The new kind is in the schema and in the reference; a scene with it is traced; the recipe's closed form holds.
+    The new kind is in the reference, a scene takes it, and the recipe's own test of draws and density passes.
     """
     follow("A scattering law", LAW, tmp_path)
     run_test(tmp_path, "tests/physics/test_laws.py", "cosine_power")
@@ -81,11 +81,8 @@ def test_a_law_is_added_by_the_recipe(tmp_path):
 import sys; sys.path.insert(0, "docs")
 import helio_jax as hx, reference
 assert 'kind = "cosine_power"' in reference.scene_keys()
-def counts(n):
-    law = {"material.m": {"kind": "cosine_power", "exponent": n}, "sample": {"kind": "flat", "material": "m"}}
-    return hx.simulate(hx.load_scene("step", law | {"scan.nx": 3, "scan.ny": 3}), rays=64).counts.sum()
-ratio = counts(40.0) / counts(1.0)  # apertures at 30 deg: 41/2 cos^39(30 deg) = 0.08, less for their far rims
-assert 0.05 < ratio < 0.3, ratio
+law = {"material.m": {"kind": "cosine_power", "exponent": 9.0}, "sample": {"kind": "flat", "material": "m"}}
+assert hx.load_scene("step", law).material["m"].terms()[0].share == 1.0
 """
     run(tmp_path, "-c", script)
 
