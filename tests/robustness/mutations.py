@@ -13,11 +13,11 @@ import contextlib
 import json
 import re
 import resource
-import selectors
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -339,19 +339,19 @@ def _with_one_worker(originals: Path, jobs: list[tuple[str, int]], found: Found)
     command = [sys.executable, __file__, "work", str(originals)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as worker:
         assert worker.stdin and worker.stdout
-        lines = selectors.DefaultSelector()
-        lines.register(worker.stdout, selectors.EVENT_READ)
         assert worker.stdout.readline() == "ready\n"
         for i, (name, seed) in enumerate(jobs):
             worker.stdin.write(f"{name} {seed}\n")
-            stage, line = "stage parent", "stage"
+            stage, line, has_hung = "stage parent", "stage", threading.Event()
+            watchdog = threading.Timer(WALL_SECONDS, lambda hung=has_hung: (hung.set(), worker.kill()))
+            watchdog.start()
             while line.startswith("stage"):
                 stage = line if line != "stage" else stage
-                if not lines.select(WALL_SECONDS):
-                    worker.kill()
-                    found.faults.append(f"{name} {seed}: hangs")
-                    return i + 1
                 line = worker.stdout.readline().strip()
+            watchdog.cancel()
+            if has_hung.is_set():
+                found.faults.append(f"{name} {seed}: hangs")
+                return i + 1
             if not line:
                 code = worker.wait()
                 if stage == "stage child" and code < 0:
