@@ -54,6 +54,7 @@ from helio_jax.scene.surfaces import surface_body  # noqa: E402
 from helio_jax.trace.run import make_experiment, trace_pixels  # noqa: E402
 from helio_jax.trace.settings import TraceSettings  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
+from helio_jax.workflows.calibrate_rotated import calibrate_rotated  # noqa: E402
 from helio_jax.workflows.measure import reconstructed_area  # noqa: E402
 from helio_jax.workflows.scene_file import load_instrument  # noqa: E402
 
@@ -158,7 +159,7 @@ def calibrated(known: Recorded, stage: str, method: str) -> MicrographStack:
     motions = find_motions(known.scans).motions if stage == "full" else known.motions
     stack = resample(known.scans, motions, "reference")
     if stage in ("full", "motions"):
-        return pipeline.calibrate_rotated(stack, keeps_multiple=method == "refine")
+        return calibrate_rotated(stack, keeps_multiple=method == "refine")
     polar = math.degrees(math.atan2(3120.0, 3000.0))
     found = SelfCalibration(np.array(GAINS), np.full(5, SHARE), np.array(DRIFTS), polar, 0.0, 1.0, 0.0, 0.0)
     instrument = effective_instrument(stack.instrument, found.polar_deg)
@@ -242,7 +243,7 @@ def measured(shared: Path, method: str) -> MicrographStack:
     instrument = load_instrument(INSTRUMENT)
     scans = MicrographSet(tuple(import_micrographs(shared / "data" / f"{name}.mat", instrument) for name in SCANS))
     found = find_motions(scans, read_points(POINTS))
-    return pipeline.calibrate_rotated(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
+    return calibrate_rotated(resample(scans, found.motions, "reference"), keeps_multiple=method == "refine")
 
 
 def main() -> None:
