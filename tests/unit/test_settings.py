@@ -11,8 +11,8 @@ from helio_jax.measure.spectrum import RippleSettings
 from helio_jax.micrograph import Calibration
 from helio_jax.spelling import did_you_mean
 from helio_jax.workflows.calibrate_rotated import _JUMPS
-from helio_jax.workflows.measure import Wanted, _settings
 from helio_jax.workflows.heights import _with_priors
+from helio_jax.workflows.measure import Wanted, _settings
 
 
 def test_what_nobody_set_stays_open():
