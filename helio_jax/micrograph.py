@@ -227,6 +227,11 @@ class MicrographSet(Drawable):
         names = ", ".join(s.name for s in self.stacks[:3]) + (", ..." if len(self.stacks) > 3 else "")
         return f"of {len(self.stacks)} scans: {names}"
 
+    @property
+    def is_oblique(self) -> bool:
+        """Whether the beam of a scan is oblique, so that heights move pixels from scan to scan."""
+        return any(s.instrument.beam.incidence_deg for s in self.stacks)
+
     def only(self, error: type[HelioError] = InputFileError) -> MicrographStack:
         """Return the only stack; several scans must be aligned first."""
         if len(self.stacks) != 1:

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import robust_std
+from helio_jax.errors import GuardError
 from helio_jax.robust import cauchy_weight
 
 ROBUST_LIMIT = 2.0
@@ -35,6 +36,9 @@ def correct_motion(
         The correction c: the scan's motion m becomes m after c. Then, where the images have structure (root mean
         square, weighted by the squared gradient): by how much it moves a pixel's place, and the standard deviation of
         that, by residuals that are independent over the smoothing's area [um].
+
+    Raises:
+        GuardError: the images determine no motion: nothing is known of them, or they show no structure.
     """
     (grid_x, grid_y), number = np.meshgrid(x, y), len(images)
     scale = 0.5 * max(np.ptp(x), np.ptp(y))
@@ -53,6 +57,11 @@ def correct_motion(
         rows.append(np.stack([along, down, turned, *gain], -1)[is_used])
         right.append((wanted - seen)[is_used])
     design, misfit = np.concatenate(rows), np.concatenate(right)
+    if np.linalg.matrix_rank(design) < design.shape[1]:
+        raise GuardError(
+            f"no motion can be fitted: {len(misfit)} pixels of the scan and of what the others predict show no "
+            "structure that tells it: take the stage's motions (--motions stage)"
+        )
     weight = np.ones(len(misfit))
     for _ in range(5):
         found = np.linalg.lstsq(design * weight[:, None], misfit * weight, rcond=None)[0]

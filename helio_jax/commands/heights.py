@@ -56,11 +56,10 @@ def reconstruct_files(
     from helio_jax import MicrographSet, write
     from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_micrographs
-    from helio_jax.inverse.settings import ReconstructSettings
     from helio_jax.workflows.heights import reconstruct, reconstruct_scans
     from helio_jax.workflows.scene_file import load_scene
 
-    given = load_scene(settings).reconstruct if settings else ReconstructSettings()
+    given = load_scene(settings).reconstruct if settings else None
     scans = [scan for path in stack for scan in read_micrographs(path).stacks]
     if write_instrument:
         from helio_jax.formats import toml
@@ -68,12 +67,11 @@ def reconstruct_files(
         toml.check_uncertain(scans[0].instrument, write_instrument)
     joined = None
     with Bar("reconstructing") as bar:
+        how: dict[str, Any] = {"settings": given, "report": bar, **given_options(border=border)}
         if len(scans) == 1:
-            result = reconstruct(scans[0], method, settings=given, report=bar, **given_options(border=border))
+            result = reconstruct(scans[0], method, **how)
         else:
-            chosen = given.changed(**given_options(method=method, border=border))
-            several = MicrographSet(tuple(scans))
-            result, joined = reconstruct_scans(several, settings=chosen, motions=motions, report=bar)
+            result, joined = reconstruct_scans(MicrographSet(tuple(scans)), method, motions=motions, **how)
     write(result, output)
     if write_joined:
         write(scans[0] if joined is None else joined.stack, write_joined)

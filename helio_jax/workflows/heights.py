@@ -93,12 +93,11 @@ def reconstruct(
         GuardError: too few images; the linear method, where the beams of several scans are oblique.
         InputFileError: a list of positions; scans that must be aligned or calibrated first.
     """
+    if len(stack.stacks) > 1:
+        how: dict[str, Any] = {"settings": settings, "motions": motions, "report": report, "workers": workers}
+        return reconstruct_scans(MicrographSet(stack.stacks), method, **how, **changes)[0]
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()
-    if len(stack.stacks) > 1:
-        chosen = settings.changed(**_with_priors(settings, stack.stacks[0], wanted))
-        scans = MicrographSet(stack.stacks)
-        return reconstruct_scans(scans, settings=chosen, motions=motions, report=report, workers=workers)[0]
     one = stack.only()
     if one.positions is not None:
         raise InputFileError(
@@ -113,11 +112,13 @@ def reconstruct(
 
 def reconstruct_scans(
     scans: MicrographSet,
+    method: str | None = None,
     *,
     settings: ReconstructSettings | None = None,
     motions: Motions = "stage",
     report: Report | None = None,
     workers: int | None = None,
+    **changes: Any,
 ) -> tuple[Reconstruction, JoinedScans]:
     """Make one surface of several scans of a sample, rotated between them: what one beam does not see others do.
 
@@ -125,8 +126,8 @@ def reconstruct_scans(
     beams images are read anew on every fitted surface until their places stay (`join_scans`).
 
     Args:
-        scans: two or more, of one plate at one distance; simulated or calibrated.
-        settings, motions, report, workers: as in `reconstruct`.
+        scans: two or more, of one plate at one distance; simulated or calibrated, then with priors of one kind.
+        method, settings, motions, report, workers, changes: as in `reconstruct`.
 
     Returns:
         The heights, and the scans as they were joined at the end; `stack` holds the images that the heights explain.
@@ -135,14 +136,15 @@ def reconstruct_scans(
         GuardError: too few images; the linear method, where beams are oblique.
         InputFileError: measured scans that are not aligned (normal incidence) or not calibrated; other distances.
     """
-    chosen = settings or ReconstructSettings()
-    is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
+    wanted = changes | ({"method": method} if method else {})
+    settings = settings or ReconstructSettings()
+    chosen = settings.changed(**_with_priors(settings, scans.stacks[0], wanted))
     for scan in scans.stacks:
-        if scan.noise == "measured" and not is_oblique:
+        if scan.noise == "measured" and not scans.is_oblique:
             scans.only()  # says that they must be aligned
         if scan.noise == "measured" and scan.n_rays is None:
             raise InputFileError(f"{scan.name}: calibrate measured scans before they are joined (helio calibrate)")
-    if is_oblique and chosen.method == "linear":
+    if scans.is_oblique and chosen.method == "linear":
         tilt = max(s.instrument.beam.incidence_deg for s in scans.stacks)
         raise GuardError(
             "method 'linear' takes a pixel for one point of the sample in all images, which holds for rotations about "
@@ -152,7 +154,7 @@ def reconstruct_scans(
     say = (lambda text: report(0, MAX_FITS, text)) if report else (lambda text: None)
     joined = join_scans(scans, chosen, motions=motions, say=say)
     work = _Reconstructing(chosen, workers)
-    if is_oblique and chosen.method == "refine":
+    if scans.is_oblique and chosen.method == "refine":
         if all(s.shape[0] >= MIN_IMAGES for s in scans.stacks):  # each fitted alone shows depth jumps, too
             joined = joined.on(merged_heights(joined.scans, joined.motions, lambda s: work.fit(s, report)))
         for _ in range(1, MAX_FITS):

@@ -16,7 +16,7 @@ from helio_jax.errors import GuardError, InputFileError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack
 from helio_jax.workflows import several_scans
 from helio_jax.workflows.scene_file import load_instrument, load_scene
 from helio_jax.workflows.truth import true_surface
@@ -114,6 +114,15 @@ def test_correction_finds_a_rigid_motion():
     assert 3.0 < moved < 6.0 and std < 0.2
 
 
+def test_correction_without_structure_is_refused():
+    """Images of a level surface tell no motion: our error, not that of a singular matrix."""
+    x = 10.0 * np.arange(20)
+    level = np.ones((1, 20, 20))
+    for known in (level > 0.0, level < 0.0):
+        with pytest.raises(GuardError, match=r"no motion can be fitted: .* take the stage's motions"):
+            correct_motion(level, level, known, x, x, 1.0)
+
+
 @pytest.fixture(scope="module")
 def crystal(tmp_path_factory) -> tuple[MicrographSet, np.ndarray]:
     """Five scans of a low pyramid by one detector at 45 degrees, and its true heights seen straight down."""
@@ -161,6 +170,22 @@ def test_fitted_motions_return_to_the_true_ones(crystal, monkeypatch):
     off = [np.hypot(*np.subtract(m.shift, t.shift)) for m, t in zip(joined.motions, true, strict=True)]
     assert max(off) < 12.0 < np.hypot(*errors.T).max()
     assert relative_rms(joined.stack.parallax_height, truth) < 0.025
+
+
+def test_priors_of_a_calibration_reach_the_heights(crystal):
+    """Joined scans are as uncertain as their calibration says, from the command's function and from hx.reconstruct.
+
+    Catches heights of calibrated scans with the error bars of simulated ones.
+    """
+    scans, _ = crystal
+    calibration = Calibration("border", {"gain_std": 0.123})
+    calibrated = MicrographSet(tuple(s.replace(calibration=calibration) for s in scans.stacks))
+    how = {"samples": 0, "corrections": 0}
+    for rec in (
+        hx.reconstruct(calibrated, "nearfield", **how),
+        hx.reconstruct_scans(calibrated, "nearfield", **how)[0],
+    ):
+        assert rec.provenance["reconstruct"]["refine"]["gain_std"] == 0.123
 
 
 def test_command_joins_the_scans_of_several_files(crystal, tmp_path):
