@@ -204,11 +204,11 @@ def resample(
             splines = SplineImage.of(finer, known, stack.x, stack.y)
             value, is_seen = splines.at(places)
             is_seen &= is_reached
-            step = (
-                0.5 * pitch(stack.x) / max(float(np.hypot(*shift)), 1e-9)
-            )  # um of height that move a place half a pixel
-            ahead, behind = (splines.at(places + sign * step * shift)[0] for sign in (1.0, -1.0))
-            parallax.append(np.where(is_seen, (ahead - behind) / (2.0 * step), 0.0))
+            if height is not None:
+                # um of height that move a place half a pixel
+                step = 0.5 * pitch(stack.x) / max(float(np.hypot(*shift)), 1e-9)
+                ahead, behind = (splines.at(places + sign * step * shift)[0] for sign in (1.0, -1.0))
+                parallax.append(np.where(is_seen, (ahead - behind) / (2.0 * step), 0.0))
             counts.append(np.where(is_seen, value, np.nan))
             observed.append(is_seen)
             if has_variance:

@@ -47,6 +47,11 @@ class PhotometricSolution:
     residuals: np.ndarray
 
 
+def _unit_of(stack: MicrographStack) -> float:
+    """Return the counts that are one beam: its atoms, or the mean signal where they are not known."""
+    return stack.n_rays or float(np.nanmean(np.abs(np.where(stack.is_observed, stack.signal, np.nan))))
+
+
 def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
     """Compute background-subtracted signal and its variance in units of the beam (counts / n_rays) [detector, y, x].
 
@@ -54,7 +59,7 @@ def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
     a known variance every datum gets the same one: 1 % of the mean signal, squared.
     """
     counts = np.where(stack.is_observed, stack.signal, np.nan)
-    unit = stack.n_rays or float(np.nanmean(np.abs(counts)))
+    unit = _unit_of(stack)
     if stack.variance is not None:
         variance = np.where(stack.is_observed, stack.variance, np.nan)
         variance = np.maximum(variance, 1e-9 * np.nanmean(counts**2))
@@ -71,8 +76,7 @@ def parallax_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray] | None:
     """
     if stack.parallax is None or stack.parallax_height is None:
         return None
-    unit = stack.n_rays or float(np.mean(np.abs(stack.signal[stack.is_observed])))
-    return np.where(stack.is_observed, stack.parallax, 0.0) / unit, stack.parallax_height
+    return np.where(stack.is_observed, stack.parallax, 0.0) / _unit_of(stack), stack.parallax_height
 
 
 def _weighted_solve(phi: np.ndarray, signal: np.ndarray, weight: np.ndarray) -> np.ndarray:

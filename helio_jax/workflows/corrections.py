@@ -94,6 +94,7 @@ def make_predictor(
         )
     dx, dy = pitch(stack.x), pitch(stack.y)
     half = max(np.abs(stack.x).max(), np.abs(stack.y).max())
+    n_beams = len(stack.instrument.by_beam())
 
     @lru_cache(maxsize=1)
     def prepared(given: str) -> tuple[Optics, list[tuple[_Raster, list[int]]]]:
@@ -117,20 +118,20 @@ def make_predictor(
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
         smooth = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
-        found = [by_beam(raster, smooth, surface, normals, optics, albedo, len(rasters)) for raster, _ in rasters]
+        found = [trace_beam(raster, *smooth, surface, normals, optics, albedo) for raster, _ in rasters]
         return found[0] if len(found) == 1 else _joined(found, [of_beam for _, of_beam in rasters])
 
-    def by_beam(
+    def trace_beam(
         raster: _Raster,
-        denoised: tuple[np.ndarray, np.ndarray],
+        smooth: np.ndarray,
+        smooth_normals: np.ndarray,
         surface: Surface,
         normals: np.ndarray,
         optics: Optics,
         albedo: np.ndarray | None,
-        n_beams: int,
     ) -> Corrections:
         """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
-        (smooth, smooth_normals), height = denoised, surface.height
+        height = surface.height
         either_way = [raster.sides(smooth, smooth_normals, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)

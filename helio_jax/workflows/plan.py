@@ -22,6 +22,7 @@ from helio_jax.forward.optics import Optics
 from helio_jax.forward.optics import Raster as BeamPositions
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.fisher import fisher
+from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.planning.coverage import scans_per_pixel, shifts_about
 from helio_jax.planning.timing import Timing, measure_move, seconds_per_height
 from helio_jax.scene.scan import Raster
@@ -32,8 +33,6 @@ from helio_jax.workflows.truth import true_surface
 
 N_SAMPLES = 128
 """Samples of the posterior: each standard deviation is known to 6 %, their root mean square to less."""
-MIN_IMAGES = 3
-"""Images that heights need."""
 
 
 @dataclass(frozen=True)

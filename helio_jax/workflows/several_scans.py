@@ -2,12 +2,12 @@
 
 The surface is a height for every x, y of the sample frame, seen straight down. Each scan's images are read where its
 own beam meets the current surface, so that a point's place in oblique scans tells its height, too; what one beam
-shadows another one sees. Heights and places are found in turn. At normal incidence heights move no pixel: one turn.
+shadows another one sees. Heights and places are found by iteration. At normal incidence heights move no pixel.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import ndimage
@@ -27,16 +27,16 @@ from helio_jax.measure.sample_grid import resample_heights
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
-MAX_TURNS = 30
-"""Largest number of turns between heights and places."""
+MAX_ITERATIONS = 30
+"""Largest number of iterations between heights and places."""
 SETTLED = 0.05
-"""The turns end where places change by less than this, root mean square [pixels]."""
+"""They end where places change by less than this, root mean square [pixels]."""
 FIRST_SMOOTHING, LAST_SMOOTHING, FALL = 3.0, 1.0, 0.8
-"""Fitted motions: smoothing of the images in the first turn, the least one [pixels], its factor from turn to turn."""
+"""Fitted motions: smoothing of the images in the first iteration, the least one [pixels], its factor per iteration."""
 UNSETTLED = 0.2
-"""A larger change in the last turn is warned of [pixels]."""
+"""A larger change in the last iteration is warned of [pixels]."""
 DAMPING = 0.6
-"""Share of the way to the new heights: on steep flanks undamped turns oscillate."""
+"""Share of the way to the new heights: on steep flanks undamped iterations oscillate."""
 Motions = Literal["stage", "fitted"]
 
 
@@ -49,7 +49,7 @@ class JoinedScans:
         stack: their images on the raster; the detectors of all scans one after the other.
         motions: of each scan, from the common frame.
         motion_std: standard deviation of a pixel's place by each motion [um]; 0 where the stage is taken at its word.
-        change: of the places in the last turn between heights and places, root mean square [pixels].
+        change: of the places in the last iteration, root mean square [pixels].
         motion_change: of the places by the last correction of fitted motions [pixels]; 0 where they are not fitted.
     """
 
@@ -79,7 +79,7 @@ class JoinedScans:
         """What to know before heights of the stack are trusted."""
         changes = {"the scans' places on the surface": self.change, "the fitted motions": self.motion_change}
         return tuple(
-            f"{what} have not settled: the last turn moved places in the images by {change:.2f} pixels (limit "
+            f"{what} have not converged: the last iteration moved places in the images by {change:.2f} pixels (limit "
             f"{UNSETTLED:g})"
             for what, change in changes.items()
             if change >= UNSETTLED
@@ -113,23 +113,22 @@ def join_scans(
     _check(scans)
     scans = _comparable(scans)
     found = stage_motions(scans) if isinstance(motions, str) else motions
-    known = std = (0.0,) * len(found)
-    is_oblique = any(s.instrument.beam.incidence_deg for s in scans.stacks)
-    if not is_oblique and motions != "fitted":
+    exact = std = (0.0,) * len(found)
+    if not scans.is_oblique and motions != "fitted":
         return JoinedScans.at(scans, found, std, None)
     quick = (settings or ReconstructSettings()).changed(method="nearfield", samples=0)
     height = merged_heights(scans, found, lambda scan: reconstruct_stack(scan, quick))
     joined, moved = JoinedScans.at(scans, found, std, height), 0.0
-    for turn in range(1, MAX_TURNS + 1):
+    for number in range(MAX_ITERATIONS):
         smoothing = LAST_SMOOTHING
         if motions == "fitted":
-            smoothing = max(LAST_SMOOTHING, FIRST_SMOOTHING * FALL ** (turn - 1))
+            smoothing = max(LAST_SMOOTHING, FIRST_SMOOTHING * FALL**number)
             # the motions' own uncertainty, in the data's variance, would hide the edges that determine them
-            found, std, moved = _corrected_motions(JoinedScans.at(scans, found, known, height), height, smoothing)
+            found, std, moved = _corrected_motions(JoinedScans.at(scans, found, exact, height), height, smoothing)
             joined = replace(JoinedScans.at(scans, found, std, height), motion_change=moved)
         height = height + DAMPING * (reconstruct_stack(joined.stack, quick).height - height)
         joined = joined.on(height)
-        say(f"turn {turn}: places on the surface changed by {max(joined.change, moved):.2f} pixels")
+        say(f"iteration {number + 1}: places on the surface changed by {max(joined.change, moved):.2f} pixels")
         if max(joined.change, moved) < SETTLED and smoothing == LAST_SMOOTHING:
             break
     return joined
@@ -207,12 +206,13 @@ def _comparable(scans: MicrographSet) -> MicrographSet:
         names = [f"{number} {name}" for number, name in enumerate(names, 1)]
     out = []
     for s, name in zip(scans.stacks, names, strict=True):
-        s = s.replace(name=name)
-        factor = dose / s.n_rays if dose and s.n_rays else 1.0
-        background = None if s.background is None else factor * s.background
-        variance = None if s.variance is None else factor**2 * s.variance
-        scaled = s.replace(counts=factor * s.counts, variance=variance, background=background, n_rays=dose)
-        out.append(s if factor == 1.0 else scaled)
+        changes: dict[str, Any] = {"name": name}
+        if dose and s.n_rays and s.n_rays != dose:
+            factor = dose / s.n_rays
+            changes |= {"counts": factor * s.counts, "n_rays": dose}
+            changes |= {"variance": None if s.variance is None else factor**2 * s.variance}
+            changes |= {"background": None if s.background is None else factor * s.background}
+        out.append(s.replace(**changes))
     return MicrographSet(tuple(out))
 
 

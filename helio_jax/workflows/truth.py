@@ -26,9 +26,9 @@ def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
 
     Along the beam, or along the direction from which the raster of several scans sees the sample.
     """
-    seen = rec.instrument.beam
-    beam = scene.beam.changed(incidence_deg=seen.incidence_deg, azimuth_deg=seen.azimuth_deg)
-    return true_surface(scene, rec.raster_x, rec.raster_y, beam if rec.instrument.has_several_beams else None)
+    return true_surface(
+        scene, rec.raster_x, rec.raster_y, rec.instrument.beam if rec.instrument.has_several_beams else None
+    )
 
 
 def true_surface(scene: SceneFile, x: np.ndarray, y: np.ndarray, beam: Beam | None = None) -> Truth:
