@@ -13,9 +13,8 @@ import helio_jax.__main__  # noqa: F401 (registers the commands)
 from benchmarks.plan import times_and_speed_ups, windows_row
 from helio_jax.commands.app import app
 from helio_jax.errors import GuardError, InputFileError, SceneError
-from helio_jax.formats import safe
+from helio_jax.formats import matlab
 from helio_jax.formats.acquisition import read_acquisitions
-from helio_jax.formats.matlab import load_tree
 from helio_jax.planning.coverage import rotation_matrices, scans_per_pixel, shifts_about
 from helio_jax.planning.stage import find_rotation_center
 from helio_jax.planning.timing import Timing, measure_move, scans_needed, seconds_per_height
@@ -145,7 +144,7 @@ def test_error_of_the_rotation_center():
 @pytest.fixture
 def without_child(monkeypatch):
     """Read .mat files in this process, which is fast."""
-    monkeypatch.setattr(safe, "call_in_child", lambda name, path, **_: load_tree(path))
+    monkeypatch.setattr(matlab, "call_in_child", lambda name, path, **_: matlab.load_tree(path))
 
 
 @pytest.fixture
