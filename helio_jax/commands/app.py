@@ -71,7 +71,7 @@ PICTURE = ".show.png"
 H5WithPicture = Annotated[
     Path,
     typer.Option("--output", "-o", help="File to write (.h5); a picture goes beside it."),
-    Writes("HDF5", HDF5_SUFFIXES, beside=(PICTURE,)),
+    Writes("HDF5", HDF5_SUFFIXES, picture=PICTURE),
 ]
 Picture = Annotated[bool, typer.Option("--picture/--no-picture", help="Write FILE.show.png beside the file.")]
 H5File = Annotated[Path, typer.Option("--output", "-o", help="File to write (.h5)."), HDF5]

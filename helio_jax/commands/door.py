@@ -43,6 +43,7 @@ class Writes:
         what: what it is written as, for messages.
         suffixes: that it may have, lower case; none: any.
         beside: suffixes of further files that are written beside it.
+        picture: suffix of a picture of it that is drawn beside it and replaces an earlier one.
         within: names of the files that are written in it: it is a folder.
         keeps: the command adds to what is there, or checks itself whether it is its own.
     """
@@ -50,6 +51,7 @@ class Writes:
     what: str = "a file"
     suffixes: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
+    picture: str = ""
     within: tuple[str, ...] | None = None
     keeps: bool = False
 
@@ -67,7 +69,15 @@ class Writes:
 
         if self.within is not None:
             return files_within(label, path, self.within)
-        return [(label, path), *((f"{label}: the {s} beside it", path.with_suffix(s)) for s in self.beside)]
+        beside = (*self.beside, self.picture) if self.picture else self.beside
+        return [(label, path), *((f"{label}: the {s} beside it", path.with_suffix(s)) for s in beside)]
+
+    def kept(self, label: str, path: Path) -> list[tuple[str, Path]]:
+        """List those of them that are not replaced without --force."""
+        if self.keeps:
+            return []
+        picture = path.with_suffix(self.picture) if self.picture else None
+        return [(name, file) for name, file in self.files(label, path) if file != picture]
 
 
 def marks_of(function: Any) -> dict[str, Reads | Writes]:
@@ -152,8 +162,8 @@ class Command(TyperCommand):
         marks = marks_of(self.callback)
         for label, mark, path in self._given(ctx, marks, Writes):
             mark.check_suffix(label, path)
-        written = [(mark, mark.files(label, path)) for label, mark, path in self._given(ctx, marks, Writes)]
-        outputs = [file for _, files in written for file in files]
+        written = list(self._given(ctx, marks, Writes))
+        outputs = [file for label, mark, path in written for file in mark.files(label, path)]
         if outputs:
             from helio_jax.formats.safe import check_outputs
             from helio_jax.workflows.scene_file import files_read
@@ -164,7 +174,7 @@ class Command(TyperCommand):
                 inputs += files_read(path, label) if has_files else [(label, path)]
             check_outputs(inputs, outputs)
             if not ctx.params.get("force"):
-                keep_existing(file for mark, files in written if not mark.keeps for file in files)
+                keep_existing(file for label, mark, path in written for file in mark.kept(label, path))
         token = is_quiet.set(bool(ctx.params.get("quiet")))
         try:
             with logged(ctx.params.get("log")):
