@@ -46,6 +46,11 @@ def reconstruct_files(
         Path | None, typer.Option(help="Also several scans as joined on the surface, for reports (.h5)."), HDF5
     ] = None,
     border: Annotated[str | None, typer.Option(help="flat: the image's border is the substrate; free.")] = None,
+    anchors: Annotated[
+        Path | None,
+        typer.Option(help="Known heights, steps, masks (.csv, columns as [[reconstruct.anchor]]).", metavar="FILE.csv"),
+        Reads(),
+    ] = None,
     write_instrument: Annotated[
         Path | None, typer.Option(help="Also the instrument as fitted, for other scans (.toml)."), TOML
     ] = None,
@@ -54,12 +59,14 @@ def reconstruct_files(
 ) -> None:
     """Reconstruct a height map from three or more micrographs, of one scan or of several of one sample."""
     from helio_jax import MicrographSet, write
-    from helio_jax.figures.trust import trust_lines
+    from helio_jax.figures.trust import anchor_lines, trust_lines
+    from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.hdf5 import read_micrographs
     from helio_jax.workflows.heights import reconstruct, reconstruct_scans
     from helio_jax.workflows.scene_file import load_scene
 
     given = load_scene(settings).reconstruct if settings else None
+    known = read_anchors(anchors) if anchors else None
     scans = [scan for path in stack for scan in read_micrographs(path).stacks]
     if write_instrument:
         from helio_jax.formats import toml
@@ -67,7 +74,7 @@ def reconstruct_files(
         toml.check_uncertain(scans[0].instrument, write_instrument)
     joined = None
     with Bar("reconstructing") as bar:
-        how: dict[str, Any] = {"settings": given, "report": bar, **given_options(border=border)}
+        how: dict[str, Any] = {"settings": given, "report": bar, **given_options(border=border, anchor=known)}
         if len(scans) == 1:
             result = reconstruct(scans[0], method, **how)
         else:
@@ -82,7 +89,7 @@ def reconstruct_files(
         print(json.dumps(describe(output) | about))
     else:
         print(f"{output}: {result.method}, {result.status}")
-        print("\n".join(trust_lines(result.trust)))
+        print("\n".join(trust_lines(result.trust) + anchor_lines(result)))
         for name, factor in result.provenance.get("sensitivity", {}).items():
             print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name.removeprefix('log_')}")
         _print_instrument(result.provenance.get("instrument", {}))

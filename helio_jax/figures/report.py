@@ -23,7 +23,18 @@ from helio_jax.figures.interactive import Picture
 from helio_jax.figures.plot_data import is_checkable, profiles
 from helio_jax.figures.report_page import PAGE, SCRIPT, STYLE
 from helio_jax.figures.summary import summarise
-from helio_jax.figures.trust import BAD, CARE, GOOD, error_sources, limits, numbers, table, verdict
+from helio_jax.figures.trust import (
+    ANCHOR_TITLES,
+    BAD,
+    CARE,
+    GOOD,
+    anchor_rows,
+    error_sources,
+    limits,
+    numbers,
+    table,
+    verdict,
+)
 from helio_jax.formats.safe import atomic_path
 from helio_jax.measure.facets import Facets
 from helio_jax.micrograph import MicrographStack
@@ -140,6 +151,7 @@ def sections(
         _profiles(rec, truth, level),
         *([] if error is None else [_errors(rec, error, scores, step)]),
         _uncertainty(rec, step),
+        *_anchors(rec),
         Section("Validity and causes", "Why pixels are not valid.", words.causes(rec), [draw.validity_map(rec, step)]),
         _residuals(rec, residuals, step),
         _facets(measured.facets, rec),
@@ -235,6 +247,12 @@ def _uncertainty(rec: Reconstruction, step: int) -> Section:
         names, values = zip(*sources, strict=True)
         pictures.append(draw.bar_plot("share in the s.d. of the highest point", names, values, "um"))
     return Section("Uncertainty", f"One standard deviation of each height.{_thinned(step)}", notes, pictures)
+
+
+def _anchors(rec: Reconstruction) -> list[Section]:
+    rows = anchor_rows(rec)
+    note = "What was stated of the heights, and what the data, the priors and the other anchors say without it."
+    return [Section("Anchors", note, words.as_table(rows, ANCHOR_TITLES, "anchors"))] if rows else []
 
 
 def _residuals(rec: Reconstruction, residuals: np.ndarray | None, step: int) -> Section:

@@ -85,6 +85,34 @@ def error_sources(rec: Reconstruction) -> list[tuple[str, float]]:
     return sorted(found, key=lambda item: -item[1])
 
 
+ANCHOR_TITLES = "anchor", "stated (um)", "in the map (um)", "without it (um)", "difference (s.d.)", ""
+"""Of the columns of `anchor_rows`."""
+
+
+def anchor_rows(rec: Reconstruction) -> list[tuple[str, ...]]:
+    """Write what each anchor stated, what the map has there, and what all else says (of `check_anchors`)."""
+    found = table(rec.provenance).get("anchors")
+    rows = []
+    for one in found if isinstance(found, list) else []:
+        value, about = numbers(one), table(one)
+        if value.keys() >= {"stated", "stated_std", "fitted", "without", "without_std", "pull"}:
+            stated = f"{value['stated']:.5g} +- {value['stated_std']:.2g}"
+            without = f"{value['without']:.5g} +- {value['without_std']:.2g}"
+            agrees = "" if about.get("agrees") else "contradicts the rest"
+            name = f"{about.get('name')} ({about.get('kind')})"
+            rows.append((name, stated, f"{value['fitted']:.5g}", without, f"{value['pull']:+.1f}", agrees))
+    return rows
+
+
+def anchor_lines(rec: Reconstruction) -> list[str]:
+    """Write the same as lines for the terminal."""
+    return [
+        f"  {name}: stated {stated} um, in the map {fitted}, without it {without}, {pull} s.d. apart"
+        + (f"; {agrees}" if agrees else "")
+        for name, stated, fitted, without, pull, agrees in anchor_rows(rec)
+    ]
+
+
 def _std(values: Any) -> float:
     """Return the standard deviation in a record (value, s.d., prior s.d., unit); 0 if it is none."""
     is_record = isinstance(values, (list, tuple)) and len(values) == 4 and isinstance(values[1], (int, float))

@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from helio_jax.child import MIB, check_size
@@ -15,11 +15,17 @@ HEADER = ["view", "point", "x_um", "y_um"]
 MAX_FILE_BYTES = 4 * MIB
 
 
-def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, float]]]:
-    """Read control points: {view: {point: (x, y) [um]}}. Lines that begin with # are ignored.
+def read_rows(path: str | os.PathLike, titles: Sequence[str]) -> list[tuple[int, list[str]]]:
+    """Read the lines of a CSV table, with their numbers, the line of titles first; all have as many columns as that.
+
+    Blank lines and lines that begin with # are ignored, and so are spaces around a cell.
+
+    Args:
+        path: of the file.
+        titles: of the columns, for messages.
 
     Raises:
-        InputFileError: missing, too large, not UTF-8, another header, a bad number, or a repeated point.
+        InputFileError: missing, too large, not UTF-8, empty, or a line with another number of columns.
     """
     check_size(path, MAX_FILE_BYTES)
     try:
@@ -27,24 +33,35 @@ def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, flo
     except UnicodeDecodeError as e:
         raise InputFileError(f"{path}: is not UTF-8 text ({e.reason} at byte {e.start}): save it as UTF-8") from None
     try:
-        lines = [(n, r) for n, r in enumerate(csv.reader(io.StringIO(text)), 1) if r and not r[0].startswith("#")]
+        rows = [(n, r) for n, r in enumerate(csv.reader(io.StringIO(text)), 1) if r and not r[0].startswith("#")]
     except csv.Error as e:
         raise InputFileError(f"{path}: is not a CSV table: {e}") from None
-    if not lines or [name.strip() for name in lines[0][1]] != HEADER:
-        found = ",".join(lines[0][1]) if lines else "an empty file"
-        raise InputFileError(f"{path}: the first line must be {','.join(HEADER)}, got {found[:200]}")
+    if not rows:
+        raise InputFileError(f"{path}: the first line must name columns ({','.join(titles)}), got an empty file")
+    for number, row in rows:
+        if len(row) != len(rows[0][1]):
+            raise InputFileError(f"{path}, line {number}: must have {len(rows[0][1])} columns, got {len(row)}")
+    return [(number, [cell.strip() for cell in row]) for number, row in rows]
+
+
+def read_points(path: str | os.PathLike) -> dict[str, dict[str, tuple[float, float]]]:
+    """Read control points: {view: {point: (x, y) [um]}}. Lines that begin with # are ignored.
+
+    Raises:
+        InputFileError: as `read_rows`; another header, a bad number, or a repeated point.
+    """
+    (_, titles), *lines = read_rows(path, HEADER)
+    if titles != HEADER:
+        raise InputFileError(f"{path}: the first line must be {','.join(HEADER)}, got {','.join(titles)[:200]}")
     picks: dict[str, dict[str, tuple[float, float]]] = {}
-    for number, row in lines[1:]:
-        if len(row) != len(HEADER):
-            raise InputFileError(f"{path}, line {number}: must have {len(HEADER)} columns, got {len(row)}")
-        view, point = row[0].strip(), row[1].strip()
+    for number, (view, point, *place) in lines:
         try:
-            x, y = float(row[2]), float(row[3])
+            x, y = map(float, place)
         except ValueError:
             x = y = math.nan
         if not (math.isfinite(x) and math.isfinite(y)):
             raise InputFileError(
-                f"{path}, line {number}: x_um and y_um must be finite numbers, got {row[2]!r}, {row[3]!r}"
+                f"{path}, line {number}: x_um and y_um must be finite numbers, got {place[0]!r}, {place[1]!r}"
             )
         if point in picks.setdefault(view, {}):
             raise InputFileError(f"{path}, line {number}: point {point!r} of view {view!r} is given twice: remove one")

@@ -1,4 +1,4 @@
-"""What is known of many heights together: levels of regions, a held mean height."""
+"""What is known of many heights together: levels of regions, a held mean height, what the user states."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from helio_jax.inverse.levels import grown
 
 @dataclass(frozen=True)
 class Anchors:
-    """Sums of weights times heights that are known (levels of regions, a held mean height).
+    """Sums of weights times heights that are known.
 
     Attributes:
         weight: over the standard deviation [anchor, y, x], 1/um.
@@ -56,11 +56,10 @@ class Anchors:
         return Anchors(np.pad(self.weight, ((0, n), (0, 0), (0, 0))), np.pad(self.value, (0, n)))
 
     def thinned(self, thin: tuple[slice, ...]) -> "Anchors":
-        """Keep some rows and columns; the others' shares of positive and negative weights go to those that are left."""
-        out = np.zeros_like(self.weight[:, *thin])
-        for sign in (-1.0, 1.0):
-            part = np.maximum(sign * self.weight, 0.0)
-            kept = part[:, *thin]
-            total, left = part.sum((1, 2)), kept.sum((1, 2))
-            out += (sign * np.where(left > 0, total / np.where(left > 0, left, 1.0), 0.0))[:, None, None] * kept
+        """Keep some rows and columns; the others' weights go to the nearest of them."""
+        out = self.weight
+        for axis, (part, n) in enumerate(zip(thin, self.weight.shape[1:], strict=True), 1):
+            kept = np.arange(n)[part]
+            nearest = np.abs(np.arange(n)[:, None] - kept).argmin(1)
+            out = np.moveaxis(np.moveaxis(out, axis, -1) @ (nearest[:, None] == np.arange(kept.size)), -1, axis)
         return Anchors(out, self.value)

@@ -102,7 +102,10 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
-    found = sample_posterior(linearise(unknowns, fixed), n_samples, error=error, edge_error=edge_error)
+    n_all, n_known = len(part.all_anchors.value), len(part.user_anchors.value)
+    of_user = slice(n_all - n_known, n_all) if n_known else None
+    linear = linearise(unknowns, fixed)
+    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, anchors=of_user)
     planes = part.priors.tilt * part.position
     found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)

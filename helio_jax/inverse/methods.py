@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from helio_jax.errors import GuardError
-from helio_jax.forward.optics import Raster
+from helio_jax.forward.optics import Optics, Raster
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.convergence import has_converged
@@ -95,6 +95,9 @@ def reconstruct_stack(
         test = lambda rec: _tested(stack, partial(misfit_of_map, stack, rec, patches, trace), rec)  # noqa: E731
     result = photometric_heights(stack, settings, predict, test)
     _check_finite(result)
+    if settings.anchor:
+        unused = f"the {len(settings.anchor)} anchors were not used: method {settings.method!r} takes none, refine does"
+        result = result.replace(warnings=(unused, *result.warnings))
     return result
 
 
@@ -154,14 +157,17 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
 
 def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
     """Reconstruct by the fit; return what computes its misfit from a trace, too."""
+    from helio_jax.inverse.anchor_check import as_records, check_anchors
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.fit import with_posterior
     from helio_jax.inverse.instrument_report import describe_instrument
+    from helio_jax.inverse.known_heights import check_places
 
     if make_predict is None:
         raise GuardError(
             "method 'refine' needs a prediction of masks and multiple scattering: use helio_jax.reconstruct"
         )
+    check_places(settings.anchor, Raster.of(stack), Optics.of(stack.instrument), stack.instrument.detector_names)
     found = explain(stack, settings, make_predict, report, start)
     fit, is_floating = with_posterior(found.fit), found.is_undecided
     posterior, raster = fit.posterior, Raster.of(stack)
@@ -176,6 +182,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
+    anchors = check_anchors(fit)
     assumed = f"assumed: {found.assumed}" if found.assumed else ""
     rec = Reconstruction(
         height=fit.surface.height,
@@ -194,7 +201,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         offset=fit.offset,
         border=settings.border,
         status="; ".join(filter(None, (fit.status, assumed))),
-        warnings=warnings_of(fit),
+        warnings=(*(a.sentence() for a in anchors if not a.agrees), *warnings_of(fit)),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),
@@ -204,6 +211,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
             "instrument": describe_instrument(fit, settings.refine),
             "chi_square": fit.chi_square,
             "assumed": found.assumed,
+            "anchors": as_records(anchors),
         },
     )
     return rec, partial(misfit_of_state, fit.problem, fit.state)

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from helio_jax.inverse.anchor_settings import AnchorSettings
 from helio_jax.settings import Settings
 
 PATHS_PER_PIXEL, LEAST_PATHS = 100, 1_500_000
@@ -131,4 +132,6 @@ class ReconstructSettings(Settings):
     """`nearfield`: how often predicted masking and multiple scattering are subtracted from the data; 0: never."""
     samples: int = Field(default=16, ge=0, le=10_000)
     """`linear`, `nearfield`: how often noise and calibration are drawn for the error bars; 0: no error bars."""
+    anchor: tuple[AnchorSettings, ...] = Field(default=(), max_length=200)
+    """`refine`: what is known of the heights: places, steps, masks, the highest point."""
     refine: RefineSettings = RefineSettings()

@@ -1,0 +1,200 @@
+"""What users know of heights: pixels of places, masks, leaving anchors out, a fit with right and wrong ones."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helio_jax.errors import InputFileError, SceneError
+from helio_jax.formats.anchors import read_anchors
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.surface import Surface
+from helio_jax.instrument import Uncertainty
+from helio_jax.inverse.anchor_check import LIMIT, leave_out, pulls_of
+from helio_jax.inverse.anchor_settings import AnchorSettings
+from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.known_heights import anchors_of, check_places
+from helio_jax.inverse.posterior import linearise, sample_posterior
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.workflows.scene_file import load_instrument
+from tests.gradients.test_model import make_problem
+
+RASTER = Raster.regular((21, 31), 10.0, 20.0)
+
+
+def surface(height: np.ndarray | float) -> Surface:
+    """A surface on the raster, its slopes not used."""
+    return Surface(np.broadcast_to(height, RASTER.shape) + np.zeros(RASTER.shape), *np.zeros((2, *RASTER.shape)))
+
+
+def anchor(**keys) -> tuple[AnchorSettings, ...]:
+    """One anchor, of 2 um by default."""
+    return (AnchorSettings(**{"std_um": 2.0} | keys),)
+
+
+@pytest.mark.parametrize(("name", "height"), [("bshem_wd3", 0.0), ("ashem_45", 60.0)])
+def test_place_is_seen_by_the_pixel_whose_beam_meets_it(name, height):
+    """A point (x, y) at height h is seen at x + h tan t: rejects places taken for beam positions, and swapped axes."""
+    optics = Optics.of(load_instrument(name))
+    found = anchors_of(anchor(at_um=(-40.0, 60.0), height_um=50.0), RASTER, optics, surface(height))
+    row, column = np.argwhere(found.weight[0])[0]
+    place = np.array([-40.0, 60.0]) + height * np.asarray(optics.beam_shift)
+    assert abs(RASTER.x[column] - place[0]) <= 5.0 and abs(RASTER.y[row] - place[1]) <= 10.0
+    assert found.weight.sum() == pytest.approx(0.5) and found.value == pytest.approx(25.0)
+
+
+def test_sums_of_places():
+    """Means within a radius, steps, and the highest point of a cone, on a plane 0.1 x - 0.2 y and off it."""
+    plane = 0.1 * RASTER.x + -0.2 * RASTER.y[:, None]
+    optics = Optics.of(load_instrument("ashem_normal"))
+    step = anchor(kind="step", at_um=(50.0, 20.0), from_um=(-30.0, -40.0), height_um=0.0, radius_um=25.0)
+    found = anchors_of(step, RASTER, optics, surface(plane))
+    assert np.sum(found.weight * plane) * 2.0 == pytest.approx(0.1 * 80.0 - 0.2 * 60.0)
+    assert (found.weight > 0).sum() > 5
+    cone = 100.0 - np.hypot(RASTER.x - 70.0, RASTER.y[:, None] + 60.0)
+    (top,) = anchors_of(anchor(kind="highest", height_um=90.0), RASTER, optics, surface(cone)).weight
+    assert np.sum(top * cone) * 2.0 == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("name", ["bshem_wd3", "ashem_45"])
+def test_height_of_a_mask(name):
+    """A plateau of height h with an edge at right angles to the detector's direction, its mask measured by rays.
+
+    The end of the mask: where the ray to the centre of the aperture just clears the edge, in the plane through both.
+    The length in the micrograph is from there to where the beam meets the edge. Rejects the beam left out (45 deg), far
+    field (aperture 20 % off), and the standard deviation of the length taken for that of the height.
+    """
+    instrument, height = load_instrument(name), 80.0
+    optics, detector = Optics.of(instrument), instrument.detector_names[0]
+    shift, center = np.asarray(optics.beam_shift), np.asarray(optics.center)[0]
+    low = np.array([float(v) for v in optics.spot(np.zeros(()))])
+    way = (center - low)[:2] / np.hypot(*(center - low)[:2])
+    # the stage brings every point under the beam, where the substrate's lie at `low`: the aperture is seen from there
+    distance = height * np.hypot(*(center - low)[:2]) / (center - low)[2]
+    end = np.array([-20.0, 10.0])
+    edge_seen = end + way * distance + height * shift
+    length = float((edge_seen - end) @ way)
+    inside = (RASTER.x[None, :] - edge_seen[0]) * way[0] + (RASTER.y[:, None] - edge_seen[1]) * way[1] > 0
+    plateau = surface(np.where(inside, height, 0.0))
+    known = anchor(kind="mask", at_um=tuple(end), length_um=length, std_um=1.0, detector=detector)
+    found = anchors_of(known, RASTER, optics, plateau, instrument.detector_names)
+    std = 1.0 / np.maximum(found.weight, 0.0).sum()
+    assert found.value[0] * std == pytest.approx(height, rel=1e-6)
+    assert std == pytest.approx(height / length)
+    assert np.sum(found.weight * plateau.height) * std == pytest.approx(height)
+
+
+def test_thinning_keeps_every_anchor():
+    """Weights of dropped pixels go to the nearest kept: none is lost, and places move by half a pitch at most."""
+    weight = np.zeros((2, 9, 12))
+    weight[0, 3, 5], weight[1, 8, 11], weight[1, 0, 0] = 1.0, 1.0, -1.0
+    thin = slice(None, None, 4), slice(None, None, 4)
+    thinned = Anchors(weight, np.zeros(2)).thinned(thin)
+    y, x = np.mgrid[:9, :12]
+    np.testing.assert_allclose(thinned.weight.sum((1, 2)), [1.0, 0.0])
+    np.testing.assert_allclose(np.sum(thinned.weight * x[thin], (1, 2)), [4.0, 8.0])
+    np.testing.assert_allclose(np.sum(thinned.weight * y[thin], (1, 2)), [4.0, 8.0])
+
+
+def test_leaving_out_is_fitting_without():
+    """Estimates without some data by the closed form, and by least squares without their rows."""
+    rng = np.random.default_rng(5)
+    rows, data = rng.standard_normal((12, 4)), rng.standard_normal(12)
+    own, out = [8, 9, 10, 11], [0, 2]
+
+    def estimate(kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        fitted = np.linalg.lstsq(rows[kept], data[kept], rcond=None)[0]
+        return rows[own] @ np.linalg.inv(rows[kept].T @ rows[kept]) @ rows[own].T, rows[own] @ fitted - data[own]
+
+    full = estimate(list(range(12)))
+    wanted = estimate([i for i in range(12) if i not in (own[0], own[2])])
+    for found, value in zip(leave_out(*full, out), wanted, strict=True):
+        np.testing.assert_allclose(found, value, rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_only_the_wrong_anchor_is_named(share):
+    """Of 4 anchors of one height, one is 8 combined deviations off: it is named, the 3 right ones are not.
+
+    `share`: of the weight that is the data's. 200 draws; right ones are named by chance 1 in 2000 each: more than 4
+    named ones of 600 have a probability of 2e-5. Rejects pulls against an estimate that contains the wrong anchor.
+    """
+    rng = np.random.default_rng(8)
+    named = np.zeros(4)
+    for _ in range(200):
+        weight = share / (1.0 - share)  # of the data, the anchors' being 1
+        off = rng.standard_normal(4) + [0, 0, 8.0 * math.hypot(1.0, 1.0 / math.sqrt(3.0 + weight)), 0]
+        data = rng.standard_normal() / math.sqrt(weight)
+        estimate = (off.sum() + weight * data) / (4.0 + weight)
+        pull = pulls_of(np.full((4, 4), 1.0 / (4.0 + weight)), estimate - off, np.ones(4))[2]
+        named += np.abs(pull) > LIMIT
+    assert named[2] == 200 and named.sum() - 200 <= 4
+
+
+def test_columns_of_a_table(tmp_path):
+    """A CSV file says what the tables of a scene say; wrong cells are named by line."""
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "# known\nname, kind, x_um, y_um, from_x_um, from_y_um, height_um, std_um\n"
+        "T, step, 1, 2, 3, 4, 5, 0.5\n,,7,8,,,9,0.25\n"
+    )
+    first = {"name": "T", "kind": "step", "at_um": (1.0, 2.0), "from_um": (3.0, 4.0), "height_um": 5.0, "std_um": 0.5}
+    assert read_anchors(path) == [first, {"at_um": (7.0, 8.0), "height_um": 9.0, "std_um": 0.25}]
+    settings = ReconstructSettings().changed(anchor=read_anchors(path))
+    assert [a.kind for a in settings.anchor] == ["step", "height"]
+    for text, told in (
+        ("nam,x_um\n", "line 1: there is no column 'nam': did you mean 'name'"),
+        ("x_um,x_um\n", "line 1: a column is given twice"),
+        ("x_um,y_um\n1,2\n3\n", "line 3: must have 2 columns, got 1"),
+        ("x_um,std_um\n1,2\n", "line 2: a place needs x_um and y_um, got x_um alone"),
+        ("height_um\nabout 5\n", "line 2: height_um must be a finite number, got 'about 5'"),
+        ("\n", "empty file"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputFileError, match=told):
+            read_anchors(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"at_um": [0, 0]}, "an anchor of kind 'height' needs height_um"),
+        ({"kind": "highest", "height_um": 1.0, "at_um": [0, 0]}, "takes no at_um"),
+        ({"at_um": [0, 0], "height_um": 1.0, "std_um": 0.0}, "std_um"),
+    ],
+)
+def test_incomplete_anchors_are_refused(keys, told):
+    """Each kind states what it needs, and nothing that would be ignored."""
+    with pytest.raises(SceneError, match=told):
+        ReconstructSettings().changed(anchor=[{"std_um": 1.0} | keys])
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"at_um": (900.0, 0.0), "height_um": 1.0}, "'anchor 1': at_um: x = 900 um lies outside of the image"),
+        ({"kind": "step", "at_um": (0, 0), "from_um": (1, 1), "height_um": 1.0}, "move them apart"),
+        ({"kind": "mask", "at_um": (0, 0), "length_um": 9.0, "detector": "x"}, "there is no detector 'x'"),
+    ],
+)
+def test_anchors_that_the_image_cannot_show(keys, told):
+    """Places outside, a step within one pixel, a detector that is not there."""
+    with pytest.raises(SceneError, match=told):
+        check_places(anchor(**keys), RASTER, Optics.of(load_instrument("bshem_wd3")), ("a",))
+
+
+def test_leverage_is_that_of_the_dense_inverse(bshem):
+    """Covariance of what anchors measure, with a tilted substrate and all of the instrument unknown: J (J'J)^-1 J'.
+
+    Catches the change of a height above a tilted substrate that is left out.
+    """
+    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0)
+    linear = linearise(*make_problem(bshem.model_copy(update={"uncertainty": sure}), law_std=0.1))
+    found = sample_posterior(linear, 2, anchors=slice(0, 2))
+    both = np.hstack([linear.surface.toarray() + linear.common @ linear.weights.T, linear.instrument])
+    end = len(both) - len(linear.names)
+    rows = both[end - linear.n_anchors : end][:2]
+    wanted = rows @ np.linalg.solve(both.T @ both, rows.T)
+    assert found.anchor_leverage is not None and wanted[0, 0] > 1e-3
+    np.testing.assert_allclose(found.anchor_leverage, wanted, rtol=1e-6)
+    np.testing.assert_allclose(found.anchor_inflation, 1.0)
