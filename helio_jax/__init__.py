@@ -132,7 +132,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   anchors             what is known of many heights together
   anchor_settings     what a user knows of the heights: tables [[reconstruct.anchor]]
   known_heights       the same, as sums of heights
-  anchor_check        whether each agrees with all else that is known
+  anchoring           brings a fit to them; whether each agrees with all else
   verdict             whether the data support a height map
   misfit_errors       errors of a photometric height map that its misfit shows
   instrument_report   what a fit found out about the instrument

@@ -7,6 +7,7 @@ robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is con
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,12 @@ import numpy as np
 
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
+from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
-from helio_jax.inverse.posterior import MAX_PIXELS, Posterior, linearise, sample_posterior
+from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
@@ -91,8 +93,11 @@ class Fit:
         return (total / np.maximum(np.sum(self.weight**2, axis=(1, 2)), 1e-300)).tolist()
 
 
-def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Posterior:
-    """Compute the posterior at a state, on a thinned raster where the full one is too large."""
+def posterior_at(problem: FitProblem, state: FitState, n_samples: int, sums: Anchors | None = None) -> Posterior:
+    """Compute the posterior at a state, on a thinned raster where the full one is too large.
+
+    `sums` of heights above the substrate, which may be tilted: their covariance with all else is computed, too.
+    """
     s, shape = problem.settings, problem.signal.shape[1:]
     stride = thinning(shape, MAX_PIXELS)
     length = s.error_reach * float(np.ptp(state.surface.height))
@@ -102,13 +107,23 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int) -> Poster
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
-    n_all, n_known = len(part.all_anchors.value), len(part.user_anchors.value)
-    of_user = slice(n_all - n_known, n_all) if n_known else None
-    linear = linearise(unknowns, fixed)
-    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, anchors=of_user)
-    planes = part.priors.tilt * part.position
+    linear, planes = linearise(unknowns, fixed), part.priors.tilt * part.position
+    thin = (slice(None, None, stride),) * 2
+    of_sums = None if sums is None else derivative_of_sums(sums.thinned(thin), planes, linear)
+    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, sums=of_sums)
     found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
+
+
+def derivative_of_sums(sums: Anchors, planes: np.ndarray, linear: Linearised) -> np.ndarray:
+    """Compute the derivative of sums of heights above the substrate [3 * pixel + parameter, sum]."""
+    n, n_pixels = len(sums.value), sums.weight[0].size
+    out = np.zeros((3 * n_pixels + len(linear.names), n))
+    out[: 3 * n_pixels : 3] = sums.weight.reshape(n, n_pixels).T
+    for axis in (0, 1):
+        if (name := f"tilt[{axis}]") in linear.names:
+            out[3 * n_pixels + linear.names.index(name)] = -np.einsum("ayx,yx->a", sums.weight, planes[axis])
+    return out
 
 
 def misfit_of(problem: FitProblem, state: FitState, predict: Predict) -> float:
@@ -188,13 +203,35 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     return _finish(problem, state, changes, is_interrupted, remaining, found.status)
 
 
-def with_posterior(fit: Fit) -> Fit:
-    """Compute the error bars of a fit, if it was not interrupted and its settings ask for them."""
+def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
+    """Compute the error bars of a fit, if it was not interrupted and its settings ask for them; `sums`: see above."""
     n_samples = fit.problem.settings.samples
     if fit.is_interrupted or not n_samples:
         return fit
-    posterior = posterior_at(fit.problem, fit.state, n_samples).with_common_mode(fit.remaining)
+    posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
     return replace(fit, posterior=posterior)
+
+
+def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:
+    """Move a fit to another state nearby: what follows from surface and parameters is computed anew."""
+    return replace(fit, **_shown(fit.problem, state), posterior=posterior)
+
+
+def _shown(problem: FitProblem, state: FitState) -> dict[str, Any]:
+    """Compute the fields of a `Fit` that follow from its state."""
+    s, parameters, surface = problem.settings, state.parameters, levelled(problem, state)
+    with jax.enable_x64(True):
+        smooth = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
+    return {
+        "state": state,
+        "surface": surface,
+        "normals": surface.normals(problem.shift),
+        "albedo": smooth * problem.patches_at(parameters).albedo,
+        "gain": np.exp(s.gain_std * parameters.log_gain),
+        "offset": problem.priors.offset * parameters.offset,
+        "instrument": problem.fitted_instrument(parameters),
+        "parameters": parameters,
+    }
 
 
 def _occlusion_edges(problem: FitProblem, state: FitState) -> tuple[np.ndarray, np.ndarray] | None:
@@ -213,22 +250,12 @@ def _finish(
     remaining: np.ndarray,
     optimiser: str,
 ) -> Fit:
-    s, priors, parameters = problem.settings, problem.priors, state.parameters
-    surface = levelled(problem, state)
+    s, priors = problem.settings, problem.priors
     limit, cut = s.robust_limits[-1], s.jump_limits[-1]
     edges_x, edges_y = edges_of(problem, state.surface, cut)
-    with jax.enable_x64(True):
-        smooth = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
     return Fit(
         problem=problem,
-        state=state,
-        surface=surface,
-        normals=surface.normals(problem.shift),
-        albedo=smooth * problem.patches_at(parameters).albedo,
-        gain=np.exp(s.gain_std * parameters.log_gain),
-        offset=priors.offset * parameters.offset,
-        instrument=problem.fitted_instrument(parameters),
-        parameters=parameters,
+        **_shown(problem, state),
         distance_std=float(priors.distance),
         residuals=state.residuals,
         weight=cauchy_weight(state.residuals, limit),

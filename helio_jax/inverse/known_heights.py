@@ -110,7 +110,7 @@ class _Places:
         from there, whose half lies above the edge where half of the signal is back.
         """
         assert anchor.at_um is not None and anchor.length_um is not None  # the settings have checked it
-        if anchor.detector not in detectors:
+        if anchor.detector is None or anchor.detector not in detectors:
             known = ", ".join(detectors) or "none"
             raise SceneError(f"{self.name}: there is no detector {anchor.detector!r}: detectors are {known}")
         if self.optics.beam_shifts is not None:

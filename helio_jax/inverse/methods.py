@@ -47,6 +47,9 @@ GEOMETRY_WARNING = (
 )
 """Warning of a fit whose aperture angles or distance are unknown."""
 
+UNUSED = "the anchors, {n} in number, were not used: {why}"
+"""Warning of a height map that was not moved to what the user knows."""
+
 if TYPE_CHECKING:
     from helio_jax.inverse.fit import Fit, Report
     from helio_jax.inverse.state import Predict
@@ -96,8 +99,8 @@ def reconstruct_stack(
     result = photometric_heights(stack, settings, predict, test)
     _check_finite(result)
     if settings.anchor:
-        unused = f"the {len(settings.anchor)} anchors were not used: method {settings.method!r} takes none, refine does"
-        result = result.replace(warnings=(unused, *result.warnings))
+        why = f"method {settings.method!r} takes none, refine does"
+        result = result.replace(warnings=(UNUSED.format(n=len(settings.anchor), why=why), *result.warnings))
     return result
 
 
@@ -157,9 +160,8 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
 
 def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
     """Reconstruct by the fit; return what computes its misfit from a trace, too."""
-    from helio_jax.inverse.anchor_check import as_records, check_anchors
+    from helio_jax.inverse.anchoring import as_records, with_anchors
     from helio_jax.inverse.explanations import explain
-    from helio_jax.inverse.fit import with_posterior
     from helio_jax.inverse.instrument_report import describe_instrument
     from helio_jax.inverse.known_heights import check_places
 
@@ -169,7 +171,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         )
     check_places(settings.anchor, Raster.of(stack), Optics.of(stack.instrument), stack.instrument.detector_names)
     found = explain(stack, settings, make_predict, report, start)
-    fit, is_floating = with_posterior(found.fit), found.is_undecided
+    (fit, anchors), is_floating = with_anchors(found.fit), found.is_undecided
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:
         region = regions(fit.joined_x, fit.joined_y)
@@ -182,7 +184,9 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
-    anchors = check_anchors(fit)
+    told = [a.sentence() for a in anchors if not a.agrees]
+    if settings.anchor and not anchors:
+        told = [UNUSED.format(n=len(settings.anchor), why="the fit has no error bars (interrupted, or samples = 0)")]
     assumed = f"assumed: {found.assumed}" if found.assumed else ""
     rec = Reconstruction(
         height=fit.surface.height,
@@ -201,7 +205,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         offset=fit.offset,
         border=settings.border,
         status="; ".join(filter(None, (fit.status, assumed))),
-        warnings=(*(a.sentence() for a in anchors if not a.agrees), *warnings_of(fit)),
+        warnings=(*told, *warnings_of(fit)),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),

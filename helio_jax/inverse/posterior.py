@@ -31,7 +31,6 @@ from helio_jax.inverse.residuals import (
     FixedTerms,
     Parameters,
     Unknowns,
-    anchor_residuals,
     border_residuals,
     data_residuals,
     edge_residuals,
@@ -57,7 +56,6 @@ class Linearised:
         weights: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
         shape: of the raster (y, x).
-        n_anchors: number of anchors, which precede the last common one.
     """
 
     surface: sparse.csr_matrix
@@ -66,16 +64,6 @@ class Linearised:
     weights: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
-    n_anchors: int = 0
-
-    def anchors(self, part: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative of some anchors, in deviations.
-
-        With respect to the surface [3 * pixel, anchor] and the instrument parameters [parameter, anchor].
-        """
-        end = len(self.instrument) - len(self.names)
-        by_instrument = self.instrument[end - self.n_anchors : end][part]
-        return self.weights[:, -1 - self.n_anchors : -1][:, part], by_instrument.T
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
@@ -103,6 +91,23 @@ class Linearised:
 
 
 @dataclass(frozen=True)
+class SumsPosterior:
+    """Covariance of sums of heights with all else, where all errors are independent.
+
+    Attributes:
+        surface: with height [um], slope x and slope y of every pixel [sum, field, y, x].
+        instrument: with the instrument parameters, in prior deviations [sum, parameter].
+        own: with one another [sum, sum].
+        inflation: variance of each that correlated errors give, over that one [sum].
+    """
+
+    surface: np.ndarray
+    instrument: np.ndarray
+    own: np.ndarray
+    inflation: np.ndarray
+
+
+@dataclass(frozen=True)
 class Posterior:
     """What the data leave open.
 
@@ -116,9 +121,7 @@ class Posterior:
         inflation: factor by which all standard deviations were inflated, for the instrument contradicts what is stated.
         common_modes: fully correlated errors that were added for the same reason, or for a fit that has not converged,
             one standard deviation of each [error, y, x], um.
-        anchor_leverage: covariance of what the anchors of the user measure, in their standard deviations, if all errors
-            are independent [anchor, anchor]; None: not computed.
-        anchor_inflation: variance that correlated errors give them, over that one [anchor].
+        sums: of the sums that were asked for, neither inflated nor with common modes.
     """
 
     samples: np.ndarray
@@ -129,8 +132,7 @@ class Posterior:
     stride: int = 1
     inflation: float = 1.0
     common_modes: np.ndarray | None = None
-    anchor_leverage: np.ndarray | None = None
-    anchor_inflation: np.ndarray | None = None
+    sums: SumsPosterior | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -198,9 +200,9 @@ class Posterior:
             return self
         full = partial(on_raster, shape=shape, stride=stride)
         modes = None if self.common_modes is None else full(self.common_modes)
-        return replace(
-            self, samples=full(self.samples), response=full(self.response), stride=stride, common_modes=modes
-        )
+        sums = self.sums and replace(self.sums, surface=full(self.sums.surface))
+        samples, response = full(self.samples), full(self.response)
+        return replace(self, samples=samples, response=response, stride=stride, common_modes=modes, sums=sums)
 
 
 class _Rows:
@@ -232,8 +234,8 @@ class _Rows:
 def _derivatives(unknowns: Unknowns, fixed: FixedTerms):
     """Compute the blocks of the Jacobian.
 
-    In this order: data by surface field, data, edges, border and anchors by parameter, edges by mean height; and the
-    factor of the edges' weights.
+    In this order: data by surface field, data, edges and border by parameter, edges by mean height; and the factor of
+    the edges' weights.
     """
     surface, at = surface_of(unknowns, fixed), unknowns.parameters
     names = ("height", "slope_x", "slope_y")
@@ -243,12 +245,12 @@ def _derivatives(unknowns: Unknowns, fixed: FixedTerms):
     still = eqx.tree_at(lambda f: f.modes.amplitude, still, jnp.zeros_like(fixed.modes.amplitude))
     data = [jax.jvp(lambda s: data_residuals(s, at, still), (surface,), (d,))[1] for d in directions]
     free = {name: getattr(at, name) for name in at.free()}
-    data_by, edges_by, border_by, anchors_by = (
+    data_by, edges_by, border_by = (
         jax.jacfwd(lambda values, f=f: f(surface, at.replaced(**values), fixed))(free)
-        for f in (data_residuals, edge_residuals, border_residuals, anchor_residuals)
+        for f in (data_residuals, edge_residuals, border_residuals)
     )
     raised = jax.jvp(lambda s: edge_residuals(s, at, fixed), (surface,), (directions[0],))[1]
-    return data, data_by, (*edges_by, border_by), anchors_by, raised, edge_scale(surface, at, fixed)
+    return data, data_by, (*edges_by, border_by), raised, edge_scale(surface, at, fixed)
 
 
 def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
@@ -260,7 +262,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     pixel = np.arange(fixed.border.size).reshape(shape)
     with jax.enable_x64(True):
         found = jax.tree.map(np.asarray, _derivatives(unknowns, fixed))
-    data, data_by, others_by, anchors_by, raised, scale = found
+    data, data_by, others_by, raised, scale = found
     free = unknowns.parameters.free()
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
@@ -293,7 +295,6 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     matrix = rows.stack(n_more=n_anchors + len(names))
     by_instrument = np.zeros((n_rows + n_anchors + len(names), len(names)))
     by_instrument[: len(columns)] = columns
-    by_instrument[n_rows : n_rows + n_anchors] = by_parameter(anchors_by, n_anchors)
     by_instrument[-len(names) :] = np.eye(len(names))
     is_used = np.any(np.asarray(fixed.modes.weights) != 0.0, axis=(1, 2))
     weights = np.asarray(fixed.modes.weights)[is_used]
@@ -306,7 +307,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     common[n_rows : n_rows + n_anchors, n_modes:-1], of_surface[::3, n_modes:-1] = np.eye(n_anchors), anchors.T
     by_height = np.concatenate([part.ravel() for part in raised])
     common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
-    return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape, n_anchors)
+    return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
 
 
 def sample_posterior(
@@ -315,7 +316,7 @@ def sample_posterior(
     seed: int = 0,
     error: ModelError | None = None,
     edge_error: EdgeError | None = None,
-    anchors: slice | None = None,
+    sums: np.ndarray | None = None,
 ) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
@@ -328,7 +329,8 @@ def sample_posterior(
         seed: of the noise.
         error: what is assumed of the predicted data.
         edge_error: what is assumed of the edges between pixels.
-        anchors: those of which leverage and inflation are computed; default: none.
+        sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
+            instrument [3 * pixel + parameter, sum].
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
@@ -349,19 +351,25 @@ def sample_posterior(
             errors.append((assumed, rows))
 
     def covariance(influence: np.ndarray) -> np.ndarray:
-        of_counts = influence[n_done:].T @ influence[n_done:]
-        return sum((assumed.covariance(influence[rows]) for assumed, rows in errors), of_counts)
+        of_all = np.zeros((influence.shape[1],) * 2)
+        for assumed, rows in errors:
+            of_all = of_all + assumed.covariance(influence[rows])
+        return of_all + influence[n_done:].T @ influence[n_done:]
 
     instrument = influence.T @ noise
     surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
     found = Posterior(to_height(surface), instrument.T, -to_height(answer), covariance(influence), linear.names)
-    if anchors is None:
+    if sums is None:
         return found
-    of_surface, of_instrument = linear.anchors(anchors)
-    of_sums = linear.apply(solve(of_surface)) + influence @ (of_instrument - answer.T @ of_surface)
-    leverage = of_sums.T @ of_sums
-    return replace(found, anchor_leverage=leverage, anchor_inflation=np.diag(covariance(of_sums)) / np.diag(leverage))
+    free = solve(sums[: len(answer)])
+    of_instrument = own @ (sums[len(answer) :] - answer.T @ sums[: len(answer)])
+    of_surface = free - answer @ of_instrument
+    together = linear.apply(of_surface) + jc @ of_instrument
+    naive = together.T @ together
+    fields = np.moveaxis(of_surface.T.reshape(-1, *linear.shape, 3), -1, 1)
+    inflation = np.diag(covariance(together)) / np.diag(naive)
+    return replace(found, sums=SumsPosterior(fields, of_instrument.T, naive, inflation))
 
 
 def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:

@@ -18,7 +18,6 @@ from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.known_heights import anchors_of
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.residuals import Parameters, Priors, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
@@ -42,8 +41,7 @@ class FitProblem:
         order: in which the pixels were recorded.
         is_level_held, is_level_free: whether the mean height is held, or unknown; a flat border does neither.
         held_level: mean height that is held, over its standard deviation.
-        anchors: what the images show of the heights of regions.
-        user_anchors: what the user knows of the heights.
+        anchors: what is known of the heights.
         region: number of the plateau of every pixel, whose masks are to follow their levels, 0: none [y, x].
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
         median_signal: of every detector, 1 without data [detector].
@@ -67,7 +65,6 @@ class FitProblem:
     is_level_free: bool
     held_level: float
     anchors: Anchors
-    user_anchors: Anchors
     region: np.ndarray
     drift_modes: np.ndarray
     median_signal: np.ndarray
@@ -107,12 +104,10 @@ class FitProblem:
         modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
         observed = [d[np.isfinite(d)] for d in signal]
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
-        names = () if given is None else given.detector_names
-        known = anchors_of(settings.anchor, raster, optics, start, names)
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
             signal, variance, optics, stated, raster, settings, order, is_held,
-            is_free and not is_held, 0.0, anchors or Anchors.none(shape), known,
+            is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
             patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))), given,
         )  # fmt: skip
@@ -151,10 +146,9 @@ class FitProblem:
 
     @property
     def all_anchors(self) -> Anchors:
-        """Those of the user at the end, before them those of regions and the held mean height."""
-        both = self.anchors.and_also(self.user_anchors)
+        """The anchors, with the held mean height."""
         held = Anchors(self.level_weight[None], np.array([self.held_level]))
-        return held.and_also(both) if self.is_level_held else both
+        return held.and_also(self.anchors) if self.is_level_held else self.anchors
 
     @property
     def border(self) -> np.ndarray:
@@ -247,7 +241,6 @@ class FitProblem:
             raster=Raster.regular(self.signal[0][thin].shape, self.raster.dx * stride, self.raster.dy * stride),
             order=self.order.thinned(thin),
             anchors=self.anchors.thinned(thin),
-            user_anchors=self.user_anchors.thinned(thin),
             region=self.region[thin],
             patches=self.patches.thinned(thin),
             drift_modes=self.drift_modes[:, :, *thin],

@@ -375,21 +375,12 @@ def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) 
     return gap_x * e.inverse_std_x * scale, gap_y * e.inverse_std_y * scale
 
 
-def _levelled(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
-    """Compute the heights above the substrate, which may be tilted [y, x], um."""
-    if not parameters.tilt.size:
-        return surface.height
-    return surface.height - jnp.tensordot(fixed.priors.tilt * parameters.tilt, fixed.position, 1)
-
-
 def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
-    """Compute the heights above the substrate by their prior weight [y, x]."""
-    return _levelled(surface, parameters, fixed) * fixed.border
-
-
-def anchor_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
-    """Compute the deviations of sums of heights above the substrate from what is known of them [anchor]."""
-    return jnp.einsum("ayx,yx->a", fixed.anchor_weight, _levelled(surface, parameters, fixed)) - fixed.anchored
+    """Compute the heights above the substrate, which may be tilted, by their prior weight [y, x]."""
+    height = surface.height
+    if parameters.tilt.size:
+        height = height - jnp.tensordot(fixed.priors.tilt * parameters.tilt, fixed.position, 1)
+    return height * fixed.border
 
 
 def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:
@@ -401,7 +392,7 @@ def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:
         "edge_x": edge_x,
         "edge_y": edge_y,
         "border": border_residuals(surface, parameters, fixed),
-        "anchors": anchor_residuals(surface, parameters, fixed),
+        "anchors": jnp.einsum("ayx,yx->a", fixed.anchor_weight, surface.height) - fixed.anchored,
         "slope_x": surface.slope_x / SLOPE_STD,
         "slope_y": surface.slope_y / SLOPE_STD,
         **{name: getattr(parameters, name) for name in NAMES},

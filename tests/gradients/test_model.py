@@ -13,7 +13,6 @@ from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
-from helio_jax.inverse.anchor_settings import AnchorSettings
 from helio_jax.inverse.posterior import linearise
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import NAMES, Unknowns, residuals, surface_of
@@ -23,10 +22,6 @@ from helio_jax.inverse.steps import freeze
 from tests.derivatives import adjoint_products, taylor_remainders
 
 SHAPE, PITCH = (9, 11), 30.0
-ANCHORS = (
-    AnchorSettings(kind="step", at_um=(0.0, 60.0), from_um=(-100.0, -60.0), height_um=20.0, std_um=3.0, radius_um=40.0),
-    AnchorSettings(at_um=(-50.0, 0.0), height_um=10.0, std_um=5.0),
-)
 
 
 def make_problem(instrument, order=ScanOrder(1), border="flat", **settings):
@@ -44,8 +39,7 @@ def make_problem(instrument, order=ScanOrder(1), border="flat", **settings):
     phi = form_factor(optics, height)
     signal = phi[:, 2] * rng.uniform(0.7, 1.1, (3, *SHAPE))
     signal[1, 2, 3] = np.nan
-    refine = RefineSettings(albedo_std=0.05, albedo_modes=3, **settings)
-    chosen = ReconstructSettings(border=border, refine=refine, anchor=ANCHORS)
+    chosen = ReconstructSettings(border=border, refine=RefineSettings(albedo_std=0.05, albedo_modes=3, **settings))
     surface = Surface(height, *slopes)
     variance = (0.03 * np.nan_to_num(signal, nan=1.0)) ** 2
     region = np.zeros(SHAPE, int)

@@ -1,6 +1,8 @@
 """What users know of heights: pixels of places, masks, leaving anchors out, a fit with right and wrong ones."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,16 +12,39 @@ from helio_jax.formats.anchors import read_anchors
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
-from helio_jax.inverse.anchor_check import LIMIT, leave_out, pulls_of
 from helio_jax.inverse.anchor_settings import AnchorSettings
+from helio_jax.inverse.anchoring import LIMIT, leave_out, pulls_of, with_anchors
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.explanations import explain
+from helio_jax.inverse.fit import derivative_of_sums
 from helio_jax.inverse.known_heights import anchors_of, check_places
 from helio_jax.inverse.posterior import linearise, sample_posterior
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.workflows.corrections import make_predictor
+from helio_jax.workflows.heights import reconstruct
+from helio_jax.workflows.pipeline import simulate_file
 from helio_jax.workflows.scene_file import load_instrument
+from helio_jax.workflows.truth import load_truth
 from tests.gradients.test_model import make_problem
 
+ROOT = Path(__file__).resolve().parents[2]
 RASTER = Raster.regular((21, 31), 10.0, 20.0)
+
+SCENE = """
+extends = "{instrument}"
+name = "hills"
+[sample]
+kind = "height_map"
+file = "hills.npz"
+unit = "um"
+[scan]
+nx = 21
+ny = 21
+pixel_size_um = 50.0
+atoms_per_pixel = 1e6
+[noise]
+enabled = true
+"""
 
 
 def surface(height: np.ndarray | float) -> Surface:
@@ -126,7 +151,7 @@ def test_only_the_wrong_anchor_is_named(share):
         off = rng.standard_normal(4) + [0, 0, 8.0 * math.hypot(1.0, 1.0 / math.sqrt(3.0 + weight)), 0]
         data = rng.standard_normal() / math.sqrt(weight)
         estimate = (off.sum() + weight * data) / (4.0 + weight)
-        pull = pulls_of(np.full((4, 4), 1.0 / (4.0 + weight)), estimate - off, np.ones(4))[2]
+        pull = pulls_of(np.full((4, 4), 1.0 / (4.0 + weight)), estimate - off)[2]
         named += np.abs(pull) > LIMIT
     assert named[2] == 200 and named.sum() - 200 <= 4
 
@@ -183,18 +208,82 @@ def test_anchors_that_the_image_cannot_show(keys, told):
         check_places(anchor(**keys), RASTER, Optics.of(load_instrument("bshem_wd3")), ("a",))
 
 
-def test_leverage_is_that_of_the_dense_inverse(bshem):
-    """Covariance of what anchors measure, with a tilted substrate and all of the instrument unknown: J (J'J)^-1 J'.
+def test_sums_covary_as_in_the_dense_inverse(bshem):
+    """Covariance of known sums with heights, slopes and instrument, above a tilted substrate: (J'J)^-1 of all unknowns.
 
-    Catches the change of a height above a tilted substrate that is left out.
+    Catches the change of a height above a tilted substrate that is left out, and mixed up fields.
     """
     sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0)
     linear = linearise(*make_problem(bshem.model_copy(update={"uncertainty": sure}), law_std=0.1))
-    found = sample_posterior(linear, 2, anchors=slice(0, 2))
+    n_pixels = math.prod(linear.shape)
+    weight = np.random.default_rng(2).standard_normal((2, *linear.shape))
+    sums = derivative_of_sums(Anchors(weight, np.zeros(2)), np.ones((2, *linear.shape)), linear)
+    tilts = [3 * n_pixels + linear.names.index(f"tilt[{axis}]") for axis in (0, 1)]
+    np.testing.assert_allclose(sums[tilts], -np.repeat(weight.sum((1, 2))[None], 2, 0))
+    found = sample_posterior(linear, 2, sums=sums).sums
     both = np.hstack([linear.surface.toarray() + linear.common @ linear.weights.T, linear.instrument])
-    end = len(both) - len(linear.names)
-    rows = both[end - linear.n_anchors : end][:2]
-    wanted = rows @ np.linalg.solve(both.T @ both, rows.T)
-    assert found.anchor_leverage is not None and wanted[0, 0] > 1e-3
-    np.testing.assert_allclose(found.anchor_leverage, wanted, rtol=1e-6)
-    np.testing.assert_allclose(found.anchor_inflation, 1.0)
+    wanted = np.linalg.solve(both.T @ both, sums)
+    scale = np.abs(wanted).max()
+    np.testing.assert_allclose(found.surface[:, 1].reshape(2, -1).T, wanted[1 : 3 * n_pixels : 3], atol=1e-7 * scale)
+    np.testing.assert_allclose(found.surface[:, 0].reshape(2, -1).T, wanted[: 3 * n_pixels : 3], atol=1e-7 * scale)
+    np.testing.assert_allclose(found.instrument.T, wanted[3 * n_pixels :], atol=1e-7 * scale)
+    np.testing.assert_allclose(found.own, sums.T @ wanted, rtol=1e-6)
+    np.testing.assert_allclose(found.inflation, 1.0)
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory):
+    """A hill and a hollow with a free border, 21 x 21 pixels of a million atoms: fit, micrographs, true heights."""
+    folder = tmp_path_factory.mktemp("hills")
+    at = np.arange(-2500.0, 2501.0, 25.0)
+    x, y = np.meshgrid(at, at)
+    hill = np.exp(-((x - 150) ** 2 + (y + 100) ** 2) / 2 / 300**2)
+    hollow = np.exp(-((x + 200) ** 2 + (y - 200) ** 2) / 2 / 200**2)
+    np.savez(folder / "hills.npz", x=at, y=at, height=100.0 + 150.0 * hill - 80.0 * hollow)
+    (folder / "hills.toml").write_text(SCENE.format(instrument=ROOT / "scenes/instruments/bshem_wd3.toml"))
+    found = simulate_file(folder / "hills.toml", folder / "hills.h5")
+    assert found is not None
+    stack = found.only().replace(instrument=found.only().instrument.model_copy(update={"uncertainty": Uncertainty()}))
+    fast = {"bias_pairs": 0, "photometric_rounds": 2, "albedo_patches": False, "objects": False, "rays": 100_000}
+    settings = ReconstructSettings().changed(border="free", refine=fast)
+    fit = explain(stack, settings, lambda n: make_predictor(stack, n, None, border="free"), None).fit
+    seen = reconstruct(stack, "nearfield", border="free", samples=0, rounds=1, corrections=0)
+    return fit, stack, load_truth(folder / "hills.toml", seen).height
+
+
+def test_right_anchors_sharpen_and_a_wrong_one_is_named(hills):
+    """A right step and a right height of hills with a free border; then, beside them, a height that is 30 um off.
+
+    Right ones agree, and the step and the level are then known better than data (level: to some um) or anchors (1 um)
+    know them alone. The wrong one is named and widens all error bars. Catches anchors without effect, error bars that
+    do not follow, and a comparison with heights that contain the wrong anchor.
+    """
+    fit, stack, true = hills
+    top, low = (np.unravel_index(k, true.shape) for k in (true.argmax(), true.argmin()))
+
+    def place(pixel):
+        tx, ty = stack.instrument.beam_shift
+        return float(stack.x[pixel[1]] - tx * true[pixel]), float(stack.y[pixel[0]] - ty * true[pixel])
+
+    def moved(anchors):
+        settings = fit.problem.reconstruct_settings.changed(anchor=anchors)
+        return with_anchors(replace(fit, problem=replace(fit.problem, reconstruct_settings=settings)))
+
+    step = {"name": "step", "kind": "step", "at_um": place(top), "from_um": place(low), "std_um": 1.0}
+    right = [step | {"height_um": float(true[top] - true[low])}]
+    right += [{"name": "place", "at_um": place((4, 16)), "height_um": float(true[4, 16]), "std_um": 1.0}]
+    wrong = {"name": "wrong", "at_um": place((15, 15)), "height_um": float(true[15, 15]) + 30.0, "std_um": 1.0}
+    (alone, none), (better, checks), (worse, named) = moved([]), moved(right), moved([*right, wrong])
+    assert none == () and all(one.agrees for one in checks) and checks[1].without_std > 3.0
+    assert [one.name for one in named if not one.agrees] == ["wrong"] and "contradicts" in named[2].sentence()
+
+    def spread(fit, number):
+        return np.sqrt(np.mean([number(sample) ** 2 for sample in fit.posterior.samples]))
+
+    def height_of_step(height):
+        return height[top] - height[low]
+
+    assert spread(better, height_of_step) < min(1.0, spread(alone, height_of_step))
+    assert abs(height_of_step(better.surface.height - true)) < 3.0
+    assert spread(better, np.mean) < 0.5 * spread(alone, np.mean)
+    assert np.median(worse.posterior.height_std) > 2.0 * np.median(better.posterior.height_std)

@@ -1,0 +1,220 @@
+"""Bring a fit to what the user knows of the heights, and compare each anchor with all else that is known.
+
+The joint posterior of a fit says how heights and instrument go with a sum of heights: known sums move all of them, as
+in a Kalman filter, and shrink their errors. Unlike a fit to data and anchors together this needs no gains that are free
+where they are better held (`explanations`), and one fit tells what the heights would be without each anchor. Valid to
+first order: the data are tested on the heights as moved (`verdict`).
+"""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.fit import Fit, at_state, with_posterior
+from helio_jax.inverse.known_heights import anchor_name, anchors_of
+from helio_jax.inverse.quality import regions
+from helio_jax.inverse.solver import free_parameters
+
+LIMIT = 3.5
+"""Deviation from everything else at which an anchor is said to contradict it [standard deviations]: 1 in 2000 of right
+ones does."""
+MAX_PLACINGS = 3
+"""An oblique beam sees a place elsewhere on the heights as moved: how often the pixels of the anchors are found."""
+_ISLAND = 2, 4
+"""Pixels of an anchored region that is an island at most: a factor of those anchored, and more."""
+
+
+@dataclass(frozen=True)
+class AnchorCheck:
+    """What an anchor did; heights in um, of the sum of heights that it is about.
+
+    Attributes:
+        name, kind: as stated; name: its number by default.
+        stated, stated_std: height and standard deviation that were stated, or follow from the length of the mask.
+        fitted: height of the map.
+        without, without_std: what data, priors and the other anchors say, those left out that contradict them.
+        pull: (stated - without) / standard deviation of that difference.
+        agrees: whether the pull is below `LIMIT` and depth jumps do not part the place from all around it.
+    """
+
+    name: str
+    kind: str
+    stated: float
+    stated_std: float
+    fitted: float
+    without: float
+    without_std: float
+    pull: float
+    agrees: bool
+
+    def sentence(self) -> str:
+        """Write what to know of one that does not agree."""
+        about = f"anchor {self.name!r} ({self.kind} {self.stated:.4g} +- {self.stated_std:.2g} um)"
+        if abs(self.pull) <= LIMIT:
+            return f"{about} is at pixels that depth jumps part from all around them: it says little of the rest"
+        return (
+            f"{about} contradicts all else that is known by {abs(self.pull):.1f} standard deviations: without it "
+            f"{self.without:.4g} +- {self.without_std:.2g} um; check it, or leave it out"
+        )
+
+
+def leave_out(leverage: np.ndarray, residual: np.ndarray, out: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Leave data out of a linear least-squares estimate.
+
+    Args:
+        leverage: posterior covariance of what the data measure, in their standard deviations [datum, datum].
+        residual: (estimate - datum) / standard deviation [datum].
+        out: numbers of those that are left out.
+
+    Returns:
+        Leverage and residual without them.
+
+    Source: Cook and Weisberg, Residuals and Influence in Regression (1982), sec. 2.2.
+    """
+    if not out:
+        return leverage, residual
+    by = leverage[:, out] @ np.linalg.inv(np.eye(len(out)) - leverage[np.ix_(out, out)])
+    return leverage + by @ leverage[out], residual + by @ residual[out]
+
+
+def pulls_of(leverage: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Compare every anchor with all else; those that contradict it most count no more for the others.
+
+    Args:
+        leverage, residual: as in `leave_out`.
+
+    Returns:
+        Estimate without the anchor minus the anchor, standard deviation of that estimate, and pull, all in standard
+        deviations of the anchors [3, anchor].
+    """
+    n, wrong = len(residual), []
+    while True:
+        found = np.zeros((3, n))
+        for i in range(n):
+            rest, off = leave_out(leverage, residual, [*(k for k in wrong if k != i), i])
+            std = np.sqrt(max(rest[i, i], 0.0))
+            found[:, i] = off[i], std, -off[i] / np.hypot(1.0, std)
+        left = [i for i in range(n) if i not in wrong and abs(found[2, i]) > LIMIT]
+        if not left:
+            return found
+        wrong.append(max(left, key=lambda i: abs(found[2, i])))
+
+
+def with_anchors(fit: Fit) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+    """Compute the error bars of a fit (`with_posterior`), and bring it to what the user knows, if anything.
+
+    Without error bars (interrupted, or `samples = 0`) anchors are not used.
+
+    Raises:
+        SceneError: as `anchors_of`.
+    """
+    stated, problem = fit.problem.reconstruct_settings.anchor, fit.problem
+    if not stated:
+        return with_posterior(fit), ()
+    names = () if problem.instrument is None else problem.instrument.detector_names
+    here = fit
+    for _ in range(MAX_PLACINGS):
+        anchors = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
+        before = with_posterior(fit, anchors)
+        if before.posterior is None:
+            return before, ()
+        here, found = _moved(before, anchors)
+        after = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
+        if np.array_equal(after.weight, anchors.weight):
+            break
+    return here, found
+
+
+def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+    """Move a fit with error bars to anchors. Where one contradicts all else, what they changed is an error of its own.
+
+    Source: Kalman, J. Basic Eng. 82 (1960) 35; samples: Hoffman and Ribak, Astrophys. J. 380 (1991) L5.
+    """
+    posterior = fit.posterior
+    assert posterior is not None and posterior.sums is not None
+    sums, shape = posterior.sums, fit.surface.height.shape
+    weight, n = anchors.weight.reshape(len(anchors.value), -1), len(anchors.value)
+    factor = float(sums.inflation.max()) * posterior.inflation**2
+    modes = np.zeros((0, *shape)) if posterior.common_modes is None else posterior.common_modes
+    by_modes = weight @ modes.reshape(len(modes), -1).T
+    surface, instrument = factor * sums.surface, factor * sums.instrument
+    surface[:, 0] += np.einsum("ae,eyx->ayx", by_modes, modes)
+    heights = _levelled(fit, surface[:, 0], instrument).reshape(n, -1)
+    known = factor * sums.own + by_modes @ by_modes.T
+    inverse = np.linalg.inv(known + np.eye(n))
+    off = weight @ fit.surface.height.ravel() - anchors.value
+    answer = inverse @ off
+
+    state = fit.state
+    height, slope_x, slope_y = -np.tensordot(answer, surface, 1)
+    flat, restore = free_parameters(state.parameters)
+    parameters = restore(np.asarray(flat) - answer @ instrument)
+    moved = replace(
+        state,
+        surface=Surface(
+            state.surface.height + height, state.surface.slope_x + slope_x, state.surface.slope_y + slope_y
+        ),
+        parameters=type(parameters)(**{k: np.asarray(v) for k, v in vars(parameters).items()}),
+    )
+    drawn = posterior.samples.reshape(len(posterior.samples), -1)
+    drawn_off = drawn @ weight.T + np.random.default_rng(0).standard_normal((len(drawn), n))
+    of_instrument, ways = np.linalg.eigh(posterior.instrument_covariance - instrument.T @ inverse @ instrument)
+    conditioned = replace(
+        posterior,
+        samples=(drawn - drawn_off @ inverse @ heights).reshape(posterior.samples.shape),
+        instrument_samples=posterior.instrument_samples - drawn_off @ inverse @ instrument,
+        instrument_covariance=(ways * np.maximum(of_instrument, 1e-6)) @ ways.T,
+        common_modes=modes - np.einsum("ae,ab,byx->eyx", by_modes, inverse, heights.reshape(n, *shape)),
+    )
+    found = _checks(fit, anchors, known - known @ inverse @ known, answer)
+    if any(abs(one.pull) > LIMIT for one in found):  # either the anchor is wrong, or all else
+        conditioned = conditioned.with_common_mode((answer @ heights).reshape(shape))
+    return at_state(fit, moved, conditioned), found
+
+
+def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:
+    """Return changes of heights above the substrate, which may tilt with the instrument [sum, y, x], um."""
+    assert fit.posterior is not None
+    names, planes, out = fit.posterior.names, fit.problem.priors.tilt * fit.problem.position, height.copy()
+    for axis in (0, 1):
+        if (name := f"tilt[{axis}]") in names:
+            out -= instrument[:, names.index(name), None, None] * planes[axis]
+    return out
+
+
+def _checks(fit: Fit, anchors: Anchors, leverage: np.ndarray, residual: np.ndarray) -> tuple[AnchorCheck, ...]:
+    """Compare every anchor with all else; arguments as in `leave_out`."""
+    off, std, pull = pulls_of(leverage, residual)
+    region, out = regions(fit.joined_x, fit.joined_y), []
+    for i, anchor in enumerate(fit.problem.reconstruct_settings.anchor):
+        unit = 1.0 / float(np.maximum(anchors.weight[i], 0.0).sum())
+        value = float(anchors.value[i]) * unit
+        out.append(
+            AnchorCheck(
+                name=anchor_name(i, anchor),
+                kind=anchor.kind,
+                stated=value,
+                stated_std=unit,
+                fitted=value + float(residual[i]) * unit,
+                without=value + float(off[i]) * unit,
+                without_std=float(std[i]) * unit,
+                pull=float(pull[i]),
+                agrees=bool(abs(pull[i]) <= LIMIT and not _is_island(region, anchors.weight[i])),
+            )
+        )
+    return tuple(out)
+
+
+def _is_island(region: np.ndarray, weight: np.ndarray) -> bool:
+    """Whether depth jumps part the pixels of an anchor, above or below, from all around them."""
+    factor, more = _ISLAND
+    parts = (weight > 0, weight < 0)
+    return any(np.isin(region, region[p]).sum() <= factor * p.sum() + more for p in parts if p.any())
+
+
+def as_records(found: tuple[AnchorCheck, ...]) -> list[dict[str, Any]]:
+    """Make JSON-compatible records."""
+    return [asdict(one) for one in found]
