@@ -248,6 +248,7 @@ formats/              the only door to files
   write_x3p           X3P (ISO 25178-72)
   columns             tables of columns (.csv, .npz)
   points              control points (.csv)
+  anchors             known heights (.csv)
   toml                writes instrument files
   fetch               downloads public data
 workflows/            what joins the stages

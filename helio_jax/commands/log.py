@@ -14,8 +14,9 @@ NAME = "helio_jax"
 
 def log(text: str, is_warning: bool = False) -> None:
     """Add a message to the log file of the running command, if it has one."""
-    if (logging := sys.modules.get("logging")) is not None:
-        logging.getLogger(NAME).log(logging.WARNING if is_warning else logging.INFO, text)
+    if (logging := sys.modules.get("logging")) is not None and (logger := logging.getLogger(NAME)).handlers:
+        # without a handler, logging would print warnings to stderr by itself
+        logger.log(logging.WARNING if is_warning else logging.INFO, text)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ def read_anchors(path: str | os.PathLike) -> list[dict[str, Any]]:
     """Read what is known of heights, as tables `[[reconstruct.anchor]]`. Lines that begin with # are ignored.
 
     Raises:
-        InputFileError: missing, too large, not UTF-8, an unknown or repeated column, a bad number, half of a place.
+        InputFileError: as `read_rows`; an unknown or repeated column, no anchor, a bad number, half of a place.
     """
     (_, titles), *lines = read_rows(path, COLUMNS)
     for title in titles:
@@ -29,6 +29,8 @@ def read_anchors(path: str | os.PathLike) -> list[dict[str, Any]]:
             raise InputFileError(f"{path}, line 1: there is no column {title!r}: {remedy}")
     if len(set(titles)) < len(titles):
         raise InputFileError(f"{path}, line 1: a column is given twice, got {','.join(titles)}: remove one")
+    if not lines:
+        raise InputFileError(f"{path}: has titles, but no anchor: add one per line")
     return [_anchor(f"{path}, line {number}", dict(zip(titles, row, strict=True))) for number, row in lines]
 
 

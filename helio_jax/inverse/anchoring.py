@@ -54,7 +54,7 @@ class AnchorCheck:
         """Write what to know of one that does not agree."""
         about = f"anchor {self.name!r} ({self.kind} {self.stated:.4g} +- {self.stated_std:.2g} um)"
         if abs(self.pull) <= LIMIT:
-            return f"{about} is at pixels that depth jumps part from all around them: it says little of the rest"
+            return f"{about} is at pixels that depth jumps part from all around them: it determines little of the rest"
         return (
             f"{about} contradicts all else that is known by {abs(self.pull):.1f} standard deviations: without it "
             f"{self.without:.4g} +- {self.without_std:.2g} um; check it, or leave it out"

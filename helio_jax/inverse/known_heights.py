@@ -32,7 +32,7 @@ def anchors_of(
         stated: what is known.
         raster: of the heights.
         optics: of the scan.
-        surface: near the one sought: it says which pixel an oblique beam sees at a place, and where the top is.
+        surface: near the one sought: it determines which pixel shows a place to an oblique beam, and where the top is.
         detectors: names of the images, in their order.
 
     Raises:

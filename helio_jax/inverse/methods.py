@@ -184,9 +184,11 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
     informative = n_informative(fit.model_share, stack.is_observed)
     is_explained = (worst >= TRUSTED) & ~ill_explained(fit.residuals, stack.is_observed)
     reason = reasons_from_fit(reasons_from_data(stack, FACET_IMAGES), is_explained, informative, *jumps, is_floating)
-    told = [a.sentence() for a in anchors if not a.agrees]
+    about_anchors = [a.sentence() for a in anchors if not a.agrees]
     if settings.anchor and not anchors:
-        told = [UNUSED.format(n=len(settings.anchor), why="the fit has no error bars (interrupted, or samples = 0)")]
+        about_anchors = [
+            UNUSED.format(n=len(settings.anchor), why="the fit has no error bars (interrupted, or samples = 0)")
+        ]
     assumed = f"assumed: {found.assumed}" if found.assumed else ""
     rec = Reconstruction(
         height=fit.surface.height,
@@ -205,7 +207,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         offset=fit.offset,
         border=settings.border,
         status="; ".join(filter(None, (fit.status, assumed))),
-        warnings=(*told, *warnings_of(fit)),
+        warnings=(*about_anchors, *warnings_of(fit)),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),

@@ -1,6 +1,7 @@
 """Habits of a command line: --quiet (results, warnings and errors stay), --json, completion of words by the shell."""
 
 import json
+import logging
 import os
 import re
 import signal
@@ -74,8 +75,12 @@ def test_messages_go_and_results_stay(tmp_path):
     assert texts["quiet"] == "" and "tracing" in texts["loud"] and "tracing" in texts["again"]
 
 
-def test_warnings_and_errors_stay(capsys):
-    """Catches a warning that is lost, which would hide that data contradict a height map."""
+def test_warnings_and_errors_stay(capsys, monkeypatch):
+    """Catches a warning that is lost, which would hide that data contradict a height map, and one that is said twice.
+
+    Without pytest's handlers, logging prints warnings that nobody handles.
+    """
+    monkeypatch.setattr(logging.getLogger("helio_jax"), "propagate", False)
     token = is_quiet.set(True)
     try:
         say("warning: do not trust it")

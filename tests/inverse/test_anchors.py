@@ -174,6 +174,7 @@ def test_columns_of_a_table(tmp_path):
         ("x_um,std_um\n1,2\n", "line 2: a place needs x_um and y_um, got x_um alone"),
         ("height_um\nabout 5\n", "line 2: height_um must be a finite number, got 'about 5'"),
         ("\n", "empty file"),
+        ("x_um,y_um\n", "has titles, but no anchor"),
     ):
         path.write_text(text)
         with pytest.raises(InputFileError, match=told):
