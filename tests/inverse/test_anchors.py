@@ -54,7 +54,7 @@ def surface(height: np.ndarray | float) -> Surface:
 
 def anchor(**keys) -> tuple[AnchorSettings, ...]:
     """One anchor, of 2 um by default."""
-    return (AnchorSettings(**{"std_um": 2.0} | keys),)
+    return (AnchorSettings.model_validate({"std_um": 2.0} | keys),)
 
 
 @pytest.mark.parametrize(("name", "height"), [("bshem_wd3", 0.0), ("ashem_45", 60.0)])
