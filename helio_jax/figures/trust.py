@@ -90,7 +90,7 @@ ANCHOR_TITLES = "anchor", "stated (um)", "in the map (um)", "without it (um)", "
 
 
 def anchor_rows(rec: Reconstruction) -> list[tuple[str, ...]]:
-    """Write what each anchor stated, what the map has there, and what all else says (of `check_anchors`)."""
+    """Write what each anchor stated, what the map has there, and what all else says (records of `AnchorCheck`)."""
     found = table(rec.provenance).get("anchors")
     rows = []
     for one in found if isinstance(found, list) else []:
@@ -98,7 +98,7 @@ def anchor_rows(rec: Reconstruction) -> list[tuple[str, ...]]:
         if value.keys() >= {"stated", "stated_std", "fitted", "without", "without_std", "pull"}:
             stated = f"{value['stated']:.5g} +- {value['stated_std']:.2g}"
             without = f"{value['without']:.5g} +- {value['without_std']:.2g}"
-            agrees = "" if about.get("agrees") else "contradicts the rest"
+            agrees = "" if about.get("agrees") else "does not agree, see the warning"
             name = f"{about.get('name')} ({about.get('kind')})"
             rows.append((name, stated, f"{value['fitted']:.5g}", without, f"{value['pull']:+.1f}", agrees))
     return rows

@@ -22,13 +22,13 @@ def read_anchors(path: str | os.PathLike) -> list[dict[str, Any]]:
     Raises:
         InputFileError: as `read_rows`; an unknown or repeated column, no anchor, a bad number, half of a place.
     """
-    (_, titles), *lines = read_rows(path, COLUMNS)
+    (first, titles), *lines = read_rows(path, COLUMNS)
     for title in titles:
         if title not in COLUMNS:
             remedy = did_you_mean(title, COLUMNS) or f"known are {', '.join(COLUMNS)}"
-            raise InputFileError(f"{path}, line 1: there is no column {title!r}: {remedy}")
+            raise InputFileError(f"{path}, line {first}: there is no column {title!r}: {remedy}")
     if len(set(titles)) < len(titles):
-        raise InputFileError(f"{path}, line 1: a column is given twice, got {','.join(titles)}: remove one")
+        raise InputFileError(f"{path}, line {first}: a column is given twice, got {','.join(titles)}: remove one")
     if not lines:
         raise InputFileError(f"{path}: has titles, but no anchor: add one per line")
     return [_anchor(f"{path}, line {number}", dict(zip(titles, row, strict=True))) for number, row in lines]

@@ -9,12 +9,14 @@ first order: the data are tested on the heights as moved (`verdict`).
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, at_state, with_posterior
 from helio_jax.inverse.known_heights import anchor_name, anchors_of
+from helio_jax.inverse.posterior import tilts_of
 from helio_jax.inverse.quality import regions
 from helio_jax.inverse.solver import free_parameters
 
@@ -115,16 +117,16 @@ def with_anchors(fit: Fit) -> tuple[Fit, tuple[AnchorCheck, ...]]:
     if not stated:
         return with_posterior(fit), ()
     names = () if problem.instrument is None else problem.instrument.detector_names
-    here = fit
+    here, found, anchors = fit, (), None
     for _ in range(MAX_PLACINGS):
-        anchors = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
+        placed = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
+        if anchors is not None and np.array_equal(placed.weight, anchors.weight):
+            break
+        anchors = placed
         before = with_posterior(fit, anchors)
         if before.posterior is None:
             return before, ()
         here, found = _moved(before, anchors)
-        after = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
-        if np.array_equal(after.weight, anchors.weight):
-            break
     return here, found
 
 
@@ -150,17 +152,19 @@ def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
 
     state = fit.state
     height, slope_x, slope_y = -np.tensordot(answer, surface, 1)
-    flat, restore = free_parameters(state.parameters)
-    parameters = restore(np.asarray(flat) - answer @ instrument)
+    with jax.enable_x64(True):
+        flat, restore = free_parameters(state.parameters)
+        parameters = jax.tree.map(np.asarray, restore(flat - answer @ instrument))
     moved = replace(
         state,
         surface=Surface(
             state.surface.height + height, state.surface.slope_x + slope_x, state.surface.slope_y + slope_y
         ),
-        parameters=type(parameters)(**{k: np.asarray(v) for k, v in vars(parameters).items()}),
+        parameters=parameters,
     )
     drawn = posterior.samples.reshape(len(posterior.samples), -1)
-    drawn_off = drawn @ weight.T + np.random.default_rng(0).standard_normal((len(drawn), n))
+    # other numbers than those of the posterior (seed 0) and of its common modes (1, 2, ...)
+    drawn_off = drawn @ weight.T + np.random.default_rng([0, 1]).standard_normal((len(drawn), n))
     of_instrument, ways = np.linalg.eigh(posterior.instrument_covariance - instrument.T @ inverse @ instrument)
     conditioned = replace(
         posterior,
@@ -178,11 +182,8 @@ def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
 def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:
     """Return changes of heights above the substrate, which may tilt with the instrument [sum, y, x], um."""
     assert fit.posterior is not None
-    names, planes, out = fit.posterior.names, fit.problem.priors.tilt * fit.problem.position, height.copy()
-    for axis in (0, 1):
-        if (name := f"tilt[{axis}]") in names:
-            out -= instrument[:, names.index(name), None, None] * planes[axis]
-    return out
+    tilts, planes = tilts_of(fit.posterior.names), fit.problem.priors.tilt * fit.problem.position
+    return height - np.einsum("at,tyx->ayx", instrument[:, tilts], planes[: len(tilts)])
 
 
 def _checks(fit: Fit, anchors: Anchors, leverage: np.ndarray, residual: np.ndarray) -> tuple[AnchorCheck, ...]:

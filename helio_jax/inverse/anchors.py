@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from helio_jax.inverse.levels import grown
+from helio_jax.inverse.samples import nearest_kept
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,13 @@ class Anchors:
         return Anchors(np.pad(self.weight, ((0, n), (0, 0), (0, 0))), np.pad(self.value, (0, n)))
 
     def thinned(self, thin: tuple[slice, ...]) -> "Anchors":
-        """Keep some rows and columns; the others' weights go to the nearest of them."""
+        """Keep some rows and columns; the others' weights go to the nearest of them.
+
+        The transpose of `samples.on_raster`: sums of what that resamples are sums of the thinned heights.
+        """
         out = self.weight
-        for axis, (part, n) in enumerate(zip(thin, self.weight.shape[1:], strict=True), 1):
-            kept = np.arange(n)[part]
-            nearest = np.abs(np.arange(n)[:, None] - kept).argmin(1)
-            out = np.moveaxis(np.moveaxis(out, axis, -1) @ (nearest[:, None] == np.arange(kept.size)), -1, axis)
+        for axis, part in enumerate(thin, 1):
+            nearest = nearest_kept(out.shape[axis], part.step or 1)
+            is_nearest = nearest[:, None] == np.arange(nearest.max() + 1)
+            out = np.moveaxis(np.moveaxis(out, axis, -1) @ is_nearest, -1, axis)
         return Anchors(out, self.value)

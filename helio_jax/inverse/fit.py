@@ -20,13 +20,13 @@ from helio_jax.inverse.convergence import aitken, contraction_of, remaining_erro
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
-from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior
+from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import Parameters, smooth_albedo
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
-from helio_jax.inverse.steps import edges_of, freeze, levelled, model_share, pixel_terms, step
+from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
@@ -120,9 +120,8 @@ def derivative_of_sums(sums: Anchors, planes: np.ndarray, linear: Linearised) ->
     n, n_pixels = len(sums.value), sums.weight[0].size
     out = np.zeros((3 * n_pixels + len(linear.names), n))
     out[: 3 * n_pixels : 3] = sums.weight.reshape(n, n_pixels).T
-    for axis in (0, 1):
-        if (name := f"tilt[{axis}]") in linear.names:
-            out[3 * n_pixels + linear.names.index(name)] = -np.einsum("ayx,yx->a", sums.weight, planes[axis])
+    for tilt, plane in zip(tilts_of(linear.names), planes, strict=False):
+        out[3 * n_pixels + tilt] = -np.einsum("ayx,yx->a", sums.weight, plane)
     return out
 
 
@@ -213,8 +212,15 @@ def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
 
 
 def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:
-    """Move a fit to another state nearby: what follows from surface and parameters is computed anew."""
-    return replace(fit, **_shown(fit.problem, state), posterior=posterior)
+    """Move a fit to another state nearby: what follows from surface and parameters, residuals too, is computed anew.
+
+    Predicted masks and multiple scattering stay as they are.
+    """
+    problem = fit.problem
+    residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
+    weight = cauchy_weight(residuals, problem.settings.robust_limits[-1])
+    state = replace(state, residuals=residuals)
+    return replace(fit, **_shown(problem, state), residuals=residuals, weight=weight, posterior=posterior)
 
 
 def _shown(problem: FitProblem, state: FitState) -> dict[str, Any]:

@@ -150,7 +150,7 @@ class Posterior:
         Args:
             planes: heights of the substrate for one prior standard deviation of each [2, y, x], um.
         """
-        tilts = [self.names.index(name) for name in ("tilt[0]", "tilt[1]") if name in self.names]
+        tilts = tilts_of(self.names)
         if not tilts:
             return self
         response = self.response.copy()
@@ -370,6 +370,11 @@ def sample_posterior(
     fields = np.moveaxis(of_surface.T.reshape(-1, *linear.shape, 3), -1, 1)
     inflation = np.diag(covariance(together)) / np.diag(naive)
     return replace(found, sums=SumsPosterior(fields, of_instrument.T, naive, inflation))
+
+
+def tilts_of(names: tuple[str, ...]) -> list[int]:
+    """Return the places of the substrate's tilts, along x and y, among parameters; none if it is not tilted."""
+    return [names.index(name) for name in ("tilt[0]", "tilt[1]") if name in names]
 
 
 def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:

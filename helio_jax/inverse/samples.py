@@ -13,12 +13,14 @@ def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
     return stride
 
 
+def nearest_kept(n: int, stride: int) -> np.ndarray:
+    """Return the nearest of every `stride`-th pixel, for each of `n` pixels in a row."""
+    return np.minimum(np.rint(np.arange(n) / stride).astype(int), -(-n // stride) - 1)
+
+
 def on_raster(fields: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
     """Resample fields [..., y, x] of every `stride`-th pixel to the full raster, by the nearest pixel."""
-    row, column = (
-        np.minimum(np.rint(np.arange(n) / stride).astype(int), m - 1)
-        for n, m in zip(shape, fields.shape[-2:], strict=True)
-    )
+    row, column = (nearest_kept(n, stride) for n in shape)
     return fields[..., row[:, None], column]
 
 
