@@ -19,6 +19,7 @@ from helio_jax.inverse.explanations import explain
 from helio_jax.inverse.fit import derivative_of_sums
 from helio_jax.inverse.known_heights import anchors_of, check_places
 from helio_jax.inverse.posterior import linearise, sample_posterior
+from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.heights import reconstruct
@@ -119,6 +120,12 @@ def test_thinning_keeps_every_anchor():
     np.testing.assert_allclose(thinned.weight.sum((1, 2)), [1.0, 0.0])
     np.testing.assert_allclose(np.sum(thinned.weight * x[thin], (1, 2)), [4.0, 8.0])
     np.testing.assert_allclose(np.sum(thinned.weight * y[thin], (1, 2)), [4.0, 8.0])
+    field, weight = (
+        np.random.default_rng(1).standard_normal((3, 3)),
+        np.random.default_rng(2).standard_normal((2, 9, 12)),
+    )
+    sums = np.sum(Anchors(weight, np.zeros(2)).thinned(thin).weight * field, (1, 2))
+    np.testing.assert_allclose(sums, np.sum(weight * on_raster(field, (9, 12), 4), (1, 2)))  # also where pixels tie
 
 
 def test_leaving_out_is_fitting_without():
@@ -287,4 +294,5 @@ def test_right_anchors_sharpen_and_a_wrong_one_is_named(hills):
     assert spread(better, height_of_step) < min(1.0, spread(alone, height_of_step))
     assert abs(height_of_step(better.surface.height - true)) < 3.0
     assert spread(better, np.mean) < 0.5 * spread(alone, np.mean)
+    assert np.abs(worse.residuals - fit.residuals).max() > 0.1  # those of the heights as moved
     assert np.median(worse.posterior.height_std) > 2.0 * np.median(better.posterior.height_std)
