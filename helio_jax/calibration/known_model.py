@@ -21,6 +21,7 @@ from helio_jax.forward.surface import unit_normal
 
 RADIOSITY_PIXELS = 25
 """Pixels along the longer side of the raster on which the derivative of the multiple scattering is computed, about."""
+_LEAST_SHARE = 1e-15
 
 
 class Multiple(eqx.Module):
@@ -81,14 +82,41 @@ class ScanModel(eqx.Module):
             place = o["object x"] * jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)])
         return PlacedShape(shape, place, azimuth, tilt)
 
+    def parts(self, unknowns: Any, multiple: Multiple, width: Any) -> tuple[jax.Array, jax.Array]:
+        """Compute what each part of the scene would give in every pixel, and the logarithm of its share.
+
+        Args:
+            unknowns: of the scan [unknown].
+            multiple: multiple scattering.
+            width: of the outlines between the parts (`forward.known_shapes.Flat.parts`) [um].
+
+        Returns:
+            Detection probability per beam atom [part, detector, y, x]; logarithm of the share [part, y, x].
+        """
+        optics, shape, o = self.moved_optics(unknowns), self.shape_of(unknowns), self.object_of(unknowns)
+        again = jnp.exp(o["log multiple scattering"]) * multiple.of(unknowns)
+        values, shares = [], []
+        for share, surface, is_object in shape.parts(self.raster, optics.beam_shift, width):
+            albedo = jnp.exp(o["log albedo ratio"]) if is_object else 1.0
+            corrections = Corrections(masked_by_shape(shape, optics, self.raster, surface, is_object), albedo * again)
+            values.append(detection_probability(surface, optics, corrections, albedo, o["exponent"]))
+            shares.append(jnp.log(share + _LEAST_SHARE))
+        return jnp.stack(values), jnp.stack(shares)
+
     def probability(self, unknowns: Any, multiple: Multiple) -> jax.Array:
         """Compute the detection probability per beam atom [detector, y, x]."""
-        optics, shape, o = self.moved_optics(unknowns), self.shape_of(unknowns), self.object_of(unknowns)
-        surface, is_object = shape.seen(self.raster, optics.beam_shift)
-        albedo = jnp.where(is_object, jnp.exp(o["log albedo ratio"]), 1.0)
-        more = albedo * jnp.exp(o["log multiple scattering"]) * multiple.of(unknowns)
-        corrections = Corrections(masked_by_shape(shape, optics, self.raster), more)
-        return detection_probability(surface, optics, corrections, albedo, o["exponent"])
+        value, log_share = self.parts(unknowns, multiple, 0.0)
+        return jnp.sum(jnp.exp(log_share)[:, None] * value, 0)
+
+    def fitted(self, unknowns: Any, multiple: Multiple, width: Any, member: Any) -> tuple[jax.Array, jax.Array]:
+        """Compute what is compared with the data: detection probability [detector, y, x], and the outline [y, x].
+
+        The outline is a residual: its square is twice the negative logarithm of the likelihood that the pixels lie on
+        the parts of which they are `member` [part, y, x].
+        """
+        value, log_share = self.parts(unknowns, multiple, width)
+        misfit = jnp.maximum(-jnp.sum(member * log_share, 0), 0.0)
+        return jnp.sum(member[:, None] * value, 0), jnp.sqrt(2.0 * misfit + _LEAST_SHARE)
 
     def scattered_again(self, unknowns: Any, plan: Any) -> jax.Array:
         """Compute the multiple scattering by radiosity [detector, y, x], without the albedo of the own pixel."""
@@ -117,13 +145,16 @@ class Seen(NamedTuple):
 def _geometry(model: ScanModel, unknowns: Any) -> Any:
     optics, shape = model.moved_optics(unknowns), model.shape_of(unknowns)
     surface, is_object = shape.seen(model.raster, optics.beam_shift)
-    masked = masked_by_shape(shape, optics, model.raster)
+    is_masked = jnp.zeros((optics.n_detectors, *model.raster.shape), bool)
+    for share, part, of_object in shape.parts(model.raster, optics.beam_shift):
+        masked = masked_by_shape(shape, optics, model.raster, part, of_object)
+        is_masked |= (share > 0.5) & (jnp.sum(masked**2, 1) > 0.0)
     x, y = jnp.meshgrid(model.raster.x, model.raster.y)
     dx = x - surface.height * optics.beam_shift[0] - shape.place[0]
     dy = y - surface.height * optics.beam_shift[1] - shape.place[1]
     cos, sin = jnp.cos(shape.azimuth), jnp.sin(shape.azimuth)
     distance = jnp.hypot(dx, dy) if model.kind == "ball" else dx * cos + dy * sin
-    return surface, is_object, jnp.sum(masked**2, 1) > 0.0, distance, optics
+    return surface, is_object, is_masked, distance, optics
 
 
 def see(model: ScanModel, unknowns: np.ndarray) -> Seen:
@@ -133,34 +164,16 @@ def see(model: ScanModel, unknowns: np.ndarray) -> Seen:
         return Seen(np.asarray(surface.height), *map(np.asarray, rest))
 
 
-@eqx.filter_jit
-def _lies_on_object(model: ScanModel, unknowns: Any) -> Any:
-    return model.shape_of(unknowns).seen(model.raster, model.moved_optics(unknowns).beam_shift)[1]
-
-
-def straddles_outline(model: ScanModel, unknowns: np.ndarray, margin: float) -> np.ndarray:
-    """Find the pixels that a shift of the object by `margin` [um] puts from object to substrate or back [y, x].
-
-    The model's derivatives do not know of such changes.
-    """
-    with jax.enable_x64(True):
-        at = jnp.asarray(unknowns)
-        moved = [
-            ScanModel(model.optics, Raster(model.raster.x + margin * a, model.raster.y + margin * b), model.kind)
-            for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
-        ]
-        found = np.stack([np.asarray(_lies_on_object(m, at)) for m in moved])
-    return np.any(found != found[0], 0)
+_value = eqx.filter_jit(lambda model, *about: model.probability(*about))
+_parts = eqx.filter_jit(lambda model, *about: model.parts(*about))
+_fitted = eqx.filter_jit(lambda model, *about: model.fitted(*about))
 
 
 @eqx.filter_jit
-def _value_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple) -> tuple[Any, Any]:
-    value, push = jax.linearize(lambda u: model.probability(u, multiple), unknowns)
-    ways = jnp.eye(len(unknowns), dtype=value.dtype)[multiple.free]
+def _fitted_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple, width: Any, member: Any) -> Any:
+    value, push = jax.linearize(lambda u: model.fitted(u, multiple, width, member), unknowns)
+    ways = jnp.eye(len(unknowns), dtype=value[0].dtype)[multiple.free]
     return value, jax.lax.map(push, ways)
-
-
-_value = eqx.filter_jit(lambda model, unknowns, multiple: model.probability(unknowns, multiple))
 
 
 def probability(model: ScanModel, unknowns: np.ndarray, multiple: Multiple) -> np.ndarray:
@@ -169,13 +182,30 @@ def probability(model: ScanModel, unknowns: np.ndarray, multiple: Multiple) -> n
         return np.asarray(_value(model, jnp.asarray(unknowns), multiple))
 
 
-def probability_and_derivative(
-    model: ScanModel, unknowns: np.ndarray, multiple: Multiple
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the detection probability [detector, y, x] and its derivatives [free unknown, detector, y, x], NumPy."""
+def parts(model: ScanModel, unknowns: np.ndarray, multiple: Multiple, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute `ScanModel.parts`, NumPy, float64."""
     with jax.enable_x64(True):
-        value, slopes = _value_and_derivative(model, jnp.asarray(unknowns), multiple)
-        return np.asarray(value), np.asarray(slopes)
+        value, log_share = _parts(model, jnp.asarray(unknowns), multiple, jnp.asarray(width, float))
+        return np.asarray(value), np.asarray(log_share)
+
+
+def fitted(
+    model: ScanModel, unknowns: np.ndarray, multiple: Multiple, width: float, member: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute `ScanModel.fitted`, NumPy, float64."""
+    with jax.enable_x64(True):
+        value, outline = _fitted(model, jnp.asarray(unknowns), multiple, jnp.asarray(width, float), member)
+        return np.asarray(value), np.asarray(outline)
+
+
+def fitted_and_derivative(
+    model: ScanModel, unknowns: np.ndarray, multiple: Multiple, width: float, member: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Compute `ScanModel.fitted` and its derivatives [free unknown, ...], NumPy, float64."""
+    with jax.enable_x64(True):
+        about = model, jnp.asarray(unknowns), multiple, jnp.asarray(width, float), member
+        value, slopes = _fitted_and_derivative(*about)
+        return jax.tree.map(np.asarray, (value, slopes))
 
 
 @eqx.filter_jit

@@ -18,11 +18,12 @@ from helio_jax.calibration.known_model import (
     ScanModel,
     Seen,
     expand_multiple,
+    fitted,
+    fitted_and_derivative,
     no_multiple,
+    parts,
     probability,
-    probability_and_derivative,
     see,
-    straddles_outline,
 )
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.noise_model import estimate_noise, find_spikes
@@ -40,10 +41,9 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
 
-OUTLINE = 0.75, 0.5, 0.25
-"""Pixels that are nearer to the object's outline than this share of the pitch are left out, in the first rounds and all
-later ones: the model's derivatives do not know that a pixel may change sides. The outline is found anew when it has
-moved by half of that."""
+OUTLINE = 0.6, 0.3, 0.15
+"""Scale of the logistic function by which a pixel changes from object to substrate, over the pitch: in the first rounds
+and all later ones. A wide outline finds the object from farther away, a narrow one places it better."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
 CONVERGED = 0.1
@@ -56,8 +56,6 @@ _STEPS = 20
 _SEARCH_PIXELS = 31
 _SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
 """First search: pixels of the thinned raster, reach over the width of the image, points along each axis."""
-_LATER_REACH, _LATER_SIDES, _LATER_ROUNDS = 0.8, (5, 5), (1, 2, 3)
-"""Searches about the place that a round has found: reach in pitches, points, before which rounds."""
 Trace = Callable[[int, Instrument, dict[str, float]], np.ndarray]
 """Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object
 by their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
@@ -250,19 +248,15 @@ def _find_place(
     base: np.ndarray,
     multiple: Multiple,
     reach: np.ndarray,
-    sides: tuple[int, ...],
     settings: KnownShapeSettings,
 ) -> tuple[np.ndarray, float]:
     """Find where the object lies by a search about the place in `base`, read-out fitted, all else of `base` held.
-
-    Unlike a fit by derivatives it sees which pixels lie on the object.
 
     Args:
         scan: the data.
         base: unknowns of the scan.
         multiple: multiple scattering.
         reach: of the search along x and y, um; 0: not searched.
-        sides: points along each axis in every stage, each 0.4 times as wide as the one before.
         settings: priors of the read-out.
 
     Returns:
@@ -281,7 +275,7 @@ def _find_place(
 
     place = base[index : index + 2].copy()
     best = misfit(place)
-    for stage, side in enumerate(sides):
+    for stage, side in enumerate(_SEARCH_SIDES):
         steps, width = np.linspace(-1.0, 1.0, side), reach * 0.4**stage
         grid = [place + width * [a, b] for a in steps for b in (steps if width[1] else [0.0])]
         found = [misfit(p) for p in grid]
@@ -314,11 +308,12 @@ class _Fit:
             no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
         ]
         self.expanded_at = [np.full(len(self.x), np.inf) for _ in scans]
-        self.outlined_at = [np.full(4, np.inf) for _ in scans]
+        self.width = [OUTLINE[0] * pitch(s.model.raster.y) for s in scans]
         self.deviation = np.ones(len(self.x))
         self.weights = [np.ones(s.counts.shape) for s in scans]
         self.used = [s.is_used for s in scans]
         start = [probability(s.model, self.layout.of_scan(i, self.x), self.multiple[i]) for i, s in enumerate(scans)]
+        self.member: list[np.ndarray] = [np.zeros(0)] * len(scans)
         self.linear = [
             _linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
             for s, p in zip(scans, start, strict=True)
@@ -341,61 +336,71 @@ class _Fit:
         """Compute the weights of a scan's data over their noise."""
         return np.where(self.used[i], np.sqrt(self.weights[i]) / self.scans[i].sigma, 0.0)
 
+    def image(self, i: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the detection probability of a scan [detector, y, x], and the residuals of its outline [y, x]."""
+        about = self.layout.of_scan(i, x), self.multiple[i], self.width[i], self.member[i]
+        return fitted(self.scans[i].model, *about)
+
     def residuals(self, z: np.ndarray) -> np.ndarray:
-        """Compute all residuals, the priors last."""
+        """Compute all residuals: of the data of all scans, of their outlines, and the priors."""
         x, linear = self.split(z)
-        out = []
+        out, outlines = [], []
         for i, scan in enumerate(self.scans):
-            image = probability(scan.model, self.layout.of_scan(i, x), self.multiple[i])
+            image, outline = self.image(i, x)
             inverse = self.inverse(i)
             misfit = (_expected(scan, linear[i], image) - scan.counts) * inverse
             out.append(line_whitening(misfit, inverse, self.lines[i], scan.slow_axis).ravel())
-        return np.concatenate([*out, z])
+            outlines.append((outline * self.is_outlined(i)).ravel())
+        return np.concatenate([*out, *outlines, z])
+
+    def is_outlined(self, i: int) -> np.ndarray:
+        """Find the pixels that tell where the outline lies [y, x]: those with data."""
+        return np.any(self.used[i], 0)
 
     def derivatives(self, z: np.ndarray) -> np.ndarray:
         """Compute the derivatives of the residuals [residual, unknown]."""
         x, linear = self.split(z)
-        sizes = [s.counts.size for s in self.scans]
+        sizes = [s.counts.size for s in self.scans] + [s.counts[0].size for s in self.scans]
         out = np.zeros((sum(sizes) + len(z), len(z)))
-        first = 0
+        rows = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         for i, scan in enumerate(self.scans):
-            value, slopes = probability_and_derivative(scan.model, self.layout.of_scan(i, x), self.multiple[i])
-            inverse, rows = self.inverse(i), slice(first, first + sizes[i])
-            first += sizes[i]
+            about = self.layout.of_scan(i, x), self.multiple[i], self.width[i], self.member[i]
+            (value, _), (slopes, outline_slopes) = fitted_and_derivative(scan.model, *about)
+            inverse, is_outlined = self.inverse(i), self.is_outlined(i)
 
-            def put(column: int, image: np.ndarray, i=i, scan=scan, inverse=inverse, rows=rows) -> None:
-                out[rows, column] = line_whitening(image * inverse, inverse, self.lines[i], scan.slow_axis).ravel()
+            def put(column: int, image: np.ndarray, i=i, scan=scan, inverse=inverse) -> None:
+                out[rows[i], column] = line_whitening(image * inverse, inverse, self.lines[i], scan.slow_axis).ravel()
 
-            for column, slope in zip(self.layout.place[i], slopes, strict=True):
+            for column, slope, of_outline in zip(self.layout.place[i], slopes, outline_slopes, strict=True):
                 put(column, linear[i][:, 0, None, None] * slope * self.layout.scale[column])
+                moved = of_outline * is_outlined * self.layout.scale[column]
+                out[rows[len(self.scans) + i], column] = moved.ravel()
             for k in range(len(value)):
                 for c, mode in enumerate((value[k], *scan.columns.modes)):
                     image = np.zeros(value.shape)
                     image[k] = self.prior[i][k, c] * mode
                     put(int(self.offsets[i]) + k * scan.n_linear + c, image)
-        out[first:] = np.eye(len(z))
+        out[sum(sizes) :] = np.eye(len(z))
         return out
 
     def update(self, number: int) -> None:
         """Compute multiple scattering, weights, lines and excluded pixels, at the present unknowns."""
-        if number in _LATER_ROUNDS:
-            self.search_places()
         instrument = self.fitted()
         for i, scan in enumerate(self.scans):
             at = self.layout.of_scan(i, self.x)
             own, seen = scan.model.object_of(at), see(scan.model, at)
-            lengths = np.array([own[name] for name in ("object x", "object y", "radius", "height")], float)
             if scan.known.kind != "flat":
                 self.multiple[i] = self._scattered_again(i, at, seen, instrument)
-            margin = OUTLINE[min(number, len(OUTLINE) - 1)] * pitch(scan.model.raster.y)
-            if number < len(OUTLINE) or np.max(np.abs(lengths - self.outlined_at[i])) > 0.5 * margin:
-                self.outlined_at[i] = lengths
-                outline = straddles_outline(scan.model, at, margin)
-                self.used[i] = scan.is_used & ~outline & ~_ring(scan, own, seen, self.settings)
-            image = probability(scan.model, at, self.multiple[i])
+            self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * pitch(scan.model.raster.y)
+            self.used[i] = scan.is_used & ~_ring(scan, own, seen, self.settings)
+            wide = OUTLINE[0] * pitch(scan.model.raster.y)
+            value, log_share = parts(scan.model, at, self.multiple[i], wide)
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
-                self.linear[i] = _linear_start(scan, image, inverse, self.settings)
+                mean = np.sum(np.exp(log_share)[:, None] * value, 0)
+                self.linear[i] = _linear_start(scan, mean, inverse, self.settings)
+            self.member[i] = _membership(scan, self.used[i], self.linear[i], value, log_share, self.settings)
+            image = np.sum(self.member[i][:, None] * value, 0)
             misfit = np.where(self.used[i], scan.counts - _expected(scan, self.linear[i], image), np.nan)
             scale = max(1.0, float(robust_std(misfit / scan.sigma)))
             self.weights[i] = np.nan_to_num(
@@ -403,20 +408,6 @@ class _Fit:
             )
             if number > 0:
                 self.lines[i] = _line_std(scan, misfit, self.weights[i])
-
-    def search_places(self) -> None:
-        """Move the objects to where the outline agrees with the data, the instrument held."""
-        for i, scan in enumerate(self.scans):
-            if scan.known.kind == "flat":
-                continue
-            at = self.layout.of_scan(i, self.x)
-            reach = _LATER_REACH * pitch(scan.model.raster.y) * np.array([1.0, float(scan.known.kind == "ball")])
-            place, _ = _find_place(scan, at, self.multiple[i], reach, _LATER_SIDES, self.settings)
-            first = len(at) - len(scan.own)
-            for index, value in ((first, place[0]), (first + 1, place[1])):
-                for column in self.layout.place[i][self.layout.free[i] == index]:
-                    self.x = self.x.copy()
-                    self.x[column] += (value - at[index]) / self.layout.scale[column]
 
     def _scattered_again(self, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
         """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
@@ -454,6 +445,28 @@ def _ring(scan: KnownScan, own: dict[str, float], seen: Seen, settings: KnownSha
     return (seen.distance > low * foot) & (seen.distance < high * foot)
 
 
+def _membership(
+    scan: KnownScan,
+    used: np.ndarray,
+    linear: np.ndarray,
+    value: np.ndarray,
+    log_share: np.ndarray,
+    settings: KnownShapeSettings,
+) -> np.ndarray:
+    """Compute the probability that a pixel lies on each part, by its data and by where the outline is [part, y, x].
+
+    One of several causes far off, as dust, makes no difference: residuals count as in the fit, robustly.
+    """
+    limit = settings.robust_limit
+    loss = np.zeros(log_share.shape)
+    for m, image in enumerate(value):
+        residual = (scan.counts - _expected(scan, linear, image)) / scan.sigma
+        loss[m] = np.sum(np.where(used, limit**2 * np.log1p((residual / limit) ** 2), 0.0), 0)
+    weight = log_share - 0.5 * loss
+    weight = np.exp(weight - weight.max(0))
+    return weight / weight.sum(0)
+
+
 def _line_std(scan: KnownScan, misfit: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Estimate the standard deviation of the offsets of single scan lines [detector], counts."""
     along = 2 - scan.slow_axis
@@ -479,7 +492,7 @@ def _started(
         base, is_ball = layout.start[0], known.kind == "ball"
         reach = 2.0 * _SEARCH_REACH * stack_reach * np.array([1.0, float(is_ball)])
         nothing = no_multiple(coarse.model, base, layout.free[0])
-        place, misfit = _find_place(coarse, base, nothing, reach, _SEARCH_SIDES, settings)
+        place, misfit = _find_place(coarse, base, nothing, reach, settings)
         own = [u._replace(stated=float(p)) for u, p in zip(trial.own[:2], place, strict=True)] + trial.own[2:]
         found.append((replace(trial, own=own), misfit))
     return min(found, key=lambda entry: entry[1])
@@ -554,12 +567,12 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     z = fit.joined()
     jacobian, residual = fit.derivatives(z), fit.residuals(z)
     inverse = np.linalg.inv(jacobian.T @ jacobian)
-    n_data = len(residual) - len(z)
+    n_data = sum(scan.counts.size for scan in fit.scans)
     chi_square, correlated = _misfit(fit, jacobian[:n_data], residual[:n_data], inverse)
     inflation = max(1.0, np.sqrt(chi_square), correlated)
     n = len(fit.x)
-    # priors are no data: the residuals say nothing about them
-    informed = jacobian[:n_data].T @ jacobian[:n_data] / inflation**2 + np.eye(len(z))
+    # outlines and priors are no data: the residuals say nothing about them
+    informed = jacobian[:n_data].T @ jacobian[:n_data] / inflation**2 + jacobian[n_data:].T @ jacobian[n_data:]
     covariance = np.linalg.inv(informed)
     std, u = np.sqrt(np.diag(covariance)), fit.layout.unknowns
     several = len(fit.scans) > 1
@@ -572,7 +585,7 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     residuals, expected, seen = [], [], []
     for i, scan in enumerate(fit.scans):
         at = fit.layout.of_scan(i, fit.x)
-        expected.append(_expected(scan, fit.linear[i], probability(scan.model, at, fit.multiple[i])))
+        expected.append(_expected(scan, fit.linear[i], fit.image(i, fit.x)[0]))
         residuals.append(np.where(fit.used[i], (scan.counts - expected[-1]) / scan.sigma, np.nan))
         seen.append(see(scan.model, at))
     return KnownFit(

@@ -76,7 +76,7 @@ class KnownShapeSettings(Settings):
     """Ring about the foot of a ball that is left out, in radii of the foot, e.g. [0.93, 1.06]."""
     robust_limit: float = Field(default=4.0, gt=0.0, le=100.0)
     """Residual [standard deviations] at which a pixel's weight falls to a half."""
-    max_rounds: int = Field(default=8, ge=1, le=50)
+    max_rounds: int = Field(default=14, ge=1, le=50)
     """How often multiple scattering and weights are computed anew."""
     substrate_um: float = Field(default=8000.0, gt=0.0, le=1e6)
     """Side of the substrate about the image's middle, as far as it scatters [um]."""

@@ -3,39 +3,58 @@
 Each shape knows its own frame (z up, z = 0 on the substrate, the object about the origin) and two closed forms there:
 the first hit of the beam, and the steepest slope up to the object from a point of the substrate. `PlacedShape` puts it
 into the sample frame: place, azimuth, and the substrate's tilt against the plate, the stage moving along the plate. A
-tilt turns the beam in the shape's frame, so it is exact as well. All is differentiable in shape, place and beam; which
-pixels lie on the object is constant under differentiation.
+tilt turns the beam in the shape's frame, so it is exact as well. All is differentiable in shape, place and beam.
+
+What the beam sees consists of parts (object and substrate; a step has an upper terrace, a facet and the substrate). A
+part's share of a pixel falls from 1 to 0 across its outline as a logistic function of the distance, so that images are
+differentiable in where the outline lies, too; of width 0 it is a step, and constant under differentiation.
 Source: own derivation; tests/physics/test_known_shapes.py compares with the tracer.
 """
 
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from helio_jax.forward.optics import Optics, Raster, rotation_matrix
-from helio_jax.forward.surface import Surface
+from helio_jax.forward.surface import MIN_FACING, Surface
 
 NO_HORIZON = -1e9
 """Slope of a horizon where nothing rises."""
 _TINY = 1e-12
+_NEAR = 1e-6
 
 
-class Hit(eqx.Module):
-    """First hits of the beam: heights [y, x], normals [3, y, x], and which lie on the object [y, x]."""
+class Part(eqx.Module):
+    """One part of what the beam sees, continued beyond its outline.
 
+    Attributes:
+        share: of the pixel that it takes [y, x].
+        height: where the beam meets it [y, x], um.
+        normal: unit normals [3, y, x].
+        is_object: whether it belongs to the object, not to the substrate.
+    """
+
+    share: Any
     height: Any
     normal: Any
-    is_object: Any
+    is_object: bool = eqx.field(static=True)
 
 
 class Flat(eqx.Module):
     """The bare substrate."""
 
-    def hit(self, x: Any, y: Any, shift: Any) -> Hit:
-        """Compute the first hits at beam positions (x, y) [y, x], um, of a beam of that shift per um of depth."""
-        return Hit(jnp.zeros_like(x), _upward(x), jnp.zeros(x.shape, bool))
+    def parts(self, x: Any, y: Any, shift: Any, width: Any) -> list[Part]:
+        """Compute what beams at positions (x, y) [y, x], um, meet.
+
+        Args:
+            x, y: where the beams meet the substrate.
+            shift: of a beam per um of depth.
+            width: over which the parts' shares change at an outline, the scale of a logistic function [um]; 0: a step.
+        """
+        return [Part(jnp.ones_like(x), jnp.zeros_like(x), _upward(x), False)]
 
     def horizon(self, x: Any, y: Any, direction: Any, shift: Any) -> Any:
         """Compute the slope up to the object [y, x] from the substrate at beam positions (x, y), along a direction."""
@@ -48,17 +67,26 @@ class Ball(eqx.Module):
     radius: Float[Any, ""]
     height: Float[Any, ""]
 
-    def hit(self, x: Any, y: Any, shift: Any) -> Hit:
-        """Compute the first hits, see `Flat.hit`."""
+    def parts(self, x: Any, y: Any, shift: Any, width: Any) -> list[Part]:
+        """Compute the ball and the substrate, see `Flat.parts`.
+
+        The outline is the foot where the beam meets the ball's lower edge, elsewhere the contour where it grazes the
+        ball. Beyond that contour, and where the beam all but grazes, the ball is continued by its nearest normals.
+        """
         depth = self.height - self.radius  # of the centre
         square = 1.0 + shift @ shift
         half = x * shift[0] + y * shift[1] + depth
-        inside = half**2 - square * (x**2 + y**2 + depth**2 - self.radius**2)
-        root = (half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0))) / square
-        is_object = (inside > 0.0) & (root > 0.0)
-        h = jnp.where(is_object, root, 0.0)
-        normal = jnp.stack([x - h * shift[0], y - h * shift[1], h - depth]) / self.radius
-        return Hit(h, jnp.where(is_object, normal, _upward(x)), is_object)
+        out_of_foot = x**2 + y**2 + depth**2 - self.radius**2
+        inside = half**2 - square * out_of_foot  # the square of radius times the cosine to the beam, over `square`
+        least = (MIN_FACING * self.radius) ** 2
+        steepness = jnp.sqrt((half * shift[0] - square * x) ** 2 + (half * shift[1] - square * y) ** 2 + least)
+        to_contour = 0.5 * inside / steepness
+        to_foot = -0.5 * out_of_foot / jnp.sqrt(x**2 + y**2 + least)
+        share = _share(jnp.where(half > 0.0, to_contour, to_foot), width)
+        height = (half + jnp.sqrt(jnp.maximum(inside, least))) / square
+        normal = jnp.stack([x - height * shift[0], y - height * shift[1], height - depth])
+        normal = normal / jnp.sqrt(jnp.sum(normal**2, 0))
+        return [Part(share, height, normal, True), Part(1.0 - share, jnp.zeros_like(x), _upward(x), False)]
 
     def horizon(self, x: Any, y: Any, direction: Any, shift: Any) -> Any:
         """Compute the slope of the tangent to the ball, see `Flat.horizon`.
@@ -69,6 +97,7 @@ class Ball(eqx.Module):
         depth = self.height - self.radius
         e_w = -(direction @ shift)
         w_w = 1.0 + shift @ shift
+        x, y = self._beside(x, y, shift)
         v_e = x * direction[0] + y * direction[1]
         v_w = -x * shift[0] - y * shift[1] - depth
         outside = jnp.maximum(x**2 + y**2 + depth**2 - self.radius**2, 0.0)
@@ -84,6 +113,21 @@ class Ball(eqx.Module):
             slope = jnp.where(is_ahead, jnp.maximum(slope, s), slope)
         return slope
 
+    def _beside(self, x: Any, y: Any, shift: Any) -> tuple[Any, Any]:
+        """Move points that the ball covers, which only a blurred outline has, to its outline, away from its middle."""
+        depth = self.height - self.radius
+        half = x * shift[0] + y * shift[1] + depth
+        square = 1.0 + shift @ shift
+        size = square * self.radius**2  # of the form below where the beam grazes the ball
+        form = size - half**2 + square * (x**2 + y**2 + depth**2 - self.radius**2)
+        foot = jnp.maximum(self.radius**2 - depth**2, 0.0)
+        least = _NEAR * self.radius**2
+        ratio = jnp.where(half > 0.0, size / jnp.maximum(form, least), foot / jnp.maximum(x**2 + y**2, least))
+        away = jnp.sqrt(jnp.maximum((1.0 + _NEAR) * ratio, 1.0))
+        middle = jnp.where(half > 0.0, depth, 0.0)
+        moved = [middle * t + away * (v - middle * t) for v, t in zip((x, y), shift, strict=True)]
+        return moved[0], moved[1]
+
 
 class Ramp(eqx.Module):
     """A straight step: an upper terrace for x < 0 at `height` [um], and a facet down to the substrate on its +x side.
@@ -94,17 +138,23 @@ class Ramp(eqx.Module):
     height: Float[Any, ""]
     cotangent: Float[Any, ""]
 
-    def hit(self, x: Any, y: Any, shift: Any) -> Hit:
-        """Compute the first hits, see `Flat.hit`."""
-        is_top = x - self.height * shift[0] <= 0.0
+    def parts(self, x: Any, y: Any, shift: Any, width: Any) -> list[Part]:
+        """Compute terrace, facet and substrate, see `Flat.parts`."""
+        edge = self.height * shift[0]
         run = self.cotangent - shift[0]  # of the facet's foot in the beam frame, per um of height
         is_lit = run > 0.0
+        foot = edge + self.height * jnp.maximum(run, 0.0)
+        top, bottom = _share(edge - x, width), _share(x - foot, width)
         facet = (self.height * self.cotangent - x) / jnp.where(is_lit, run, 1.0)
-        is_facet = ~is_top & is_lit & (facet > 0.0)
-        height = jnp.where(is_top, self.height, jnp.where(is_facet, facet, 0.0))
         size = jnp.sqrt(1.0 + self.cotangent**2)
         face = jnp.stack([1.0 / size, 0.0 * size, self.cotangent / size])[:, None, None]
-        return Hit(height, jnp.where(is_facet, face, _upward(x)), is_top | is_facet)
+        face = jnp.where(is_lit, face * jnp.ones_like(x), _upward(x))
+        middle = jnp.where(is_lit, jnp.maximum(1.0 - top - bottom, 0.0), 0.0)
+        return [
+            Part(top, self.height * jnp.ones_like(x), _upward(x), True),
+            Part(middle, jnp.where(is_lit, facet, 0.0), face, True),
+            Part(bottom, jnp.zeros_like(x), _upward(x), False),
+        ]
 
     def horizon(self, x: Any, y: Any, direction: Any, shift: Any) -> Any:
         """Compute the slope up to the upper edge, see `Flat.horizon`."""
@@ -150,22 +200,39 @@ class PlacedShape(eqx.Module):
         at = ends[:2] + ends[2] * local_shift[:, None, None] - place[:, None, None]
         return axes, beam, local_shift, at
 
-    def seen(self, raster: Raster, shift: Any) -> tuple[Surface, Any]:
-        """Compute the surface that the beam sees, and which pixels lie on the object [y, x].
+    def parts(self, raster: Raster, shift: Any, width: Any = 0.0) -> list[tuple[Any, Surface, bool]]:
+        """Compute the parts of what the beam sees: share of each pixel [y, x], surface, whether it is of the object.
 
         Args:
             raster: beam positions.
             shift: `Optics.beam_shift`.
+            width: of the outline, see `Flat.parts` [um].
         """
         axes, beam, local_shift, at = self._local(raster, shift)
-        hit = self.shape.hit(at[0], at[1], local_shift)
         x, y = jnp.meshgrid(raster.x, raster.y)
         # the local height is a distance along the beam: `beam[2]` of it per um of the sample's height
         start = jnp.einsum("j,jyx->yx", axes[:, 2], jnp.stack([x, y, jnp.zeros_like(x)]))
-        height = (hit.height - start) / beam[2]
-        normal = jnp.einsum("ij,jyx->iyx", axes, hit.normal)
-        facing = normal[2] - normal[0] * shift[0] - normal[1] * shift[1]
-        return Surface(height, -normal[0] / facing, -normal[1] / facing), hit.is_object
+        out = []
+        for part in self.shape.parts(at[0], at[1], local_shift, width):
+            height = (part.height - start) / beam[2]
+            normal = jnp.einsum("ij,jyx->iyx", axes, part.normal)
+            facing = jnp.maximum(normal[2] - normal[0] * shift[0] - normal[1] * shift[1], 0.5 * MIN_FACING)
+            out.append((part.share, Surface(height, -normal[0] / facing, -normal[1] / facing), part.is_object))
+        return out
+
+    def seen(self, raster: Raster, shift: Any) -> tuple[Surface, Any]:
+        """Compute the surface that the beam sees, and which pixels lie on the object [y, x].
+
+        Args:
+            raster, shift: as for `parts`.
+        """
+        (share, surface, _), *others = self.parts(raster, shift)
+        is_object = share > 0.5 if len(others) else jnp.zeros(raster.shape, bool)
+        for other_share, other, of_object in others:
+            is_here = other_share > 0.5
+            surface = jax.tree.map(lambda a, b, is_here=is_here: jnp.where(is_here, b, a), surface, other)
+            is_object = is_object | (is_here & of_object)
+        return surface, is_object
 
     def horizon(self, raster: Raster, shift: Any, direction: Any) -> Any:
         """Compute the slope from every point of the substrate up to the object [y, x], in the beam frame.
@@ -185,6 +252,13 @@ class PlacedShape(eqx.Module):
 def _upward(x: Any) -> Any:
     """Return vertical unit normals [3, y, x]."""
     return jnp.stack([jnp.zeros_like(x), jnp.zeros_like(x), jnp.ones_like(x)])
+
+
+def _share(distance: Any, width: Any) -> Any:
+    """Compute the share of a pixel at a distance [um] within the outline of a part, see `Flat.parts`."""
+    is_blurred = width > 0.0
+    blurred = jax.nn.sigmoid(distance / jnp.where(is_blurred, width, 1.0))
+    return jnp.where(is_blurred, blurred, (distance > 0.0).astype(blurred.dtype))
 
 
 def seen_surface(shape: PlacedShape, raster: Raster, optics: Optics) -> tuple[Surface, Any]:

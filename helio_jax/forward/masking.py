@@ -130,16 +130,24 @@ def masked_form_factor(
     return _sum_slices(horizon_of, (slices, horizons), Surface(height, slope_x, slope_y), optics.beam_shift, width)
 
 
-def masked_by_shape(shape: PlacedShape, optics: Optics, raster: Raster, *, n_slices: int = N_SLICES) -> jax.Array:
-    """Compute what `masked_form_factor` does for an object of known shape, by its exact horizons [detector, 3, y, x].
+def masked_by_shape(
+    shape: PlacedShape,
+    optics: Optics,
+    raster: Raster,
+    surface: Surface,
+    is_object: bool,
+    *,
+    n_slices: int = N_SLICES,
+) -> jax.Array:
+    """Compute what `masked_form_factor` does for a part of a known shape, by exact horizons [detector, 3, y, x].
 
-    Independent of the pitch: no relief within a pixel is missed. Differentiable in shape and optics.
+    Independent of the pitch: no relief within a pixel is missed. Differentiable in shape and optics. `surface` and
+    `is_object` are those of the part (`PlacedShape.parts`); the object, convex, masks only the substrate.
     """
     shift = jnp.asarray(optics.beam_shift)
-    surface, is_object = shape.seen(raster, shift)
 
-    def horizon_of(piece: Slices) -> jax.Array:
-        return jnp.where(is_object, NO_HORIZON, shape.horizon(raster, shift, piece.direction))
+    def horizon_of(piece: Slices) -> Any:
+        return NO_HORIZON if is_object else shape.horizon(raster, shift, piece.direction)
 
     return _sum_slices(horizon_of, (slice_apertures(optics, n_slices),), surface, shift, 0.0)
 
