@@ -30,6 +30,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   block_fit           least squares with per-pixel unknowns eliminated
   detector            apertures in the plate and cones at infinity
   instrument          beam, plate and detectors, and the geometry that follows from them
+  geometry_prior      joint prior of sample distance and aperture directions, as an instrument file states it
   micrograph          MicrographStack, MicrographSet
   heightmap           HeightMap on a regular grid
   reconstruction      Reconstruction: height, error bars, validity, reasons

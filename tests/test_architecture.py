@@ -20,7 +20,7 @@ LEVELS = [
     {"arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
     {"detector"},
     {"instrument"},
-    {"micrograph", "heightmap", "reconstruction"},
+    {"micrograph", "heightmap", "reconstruction", "geometry_prior"},
     {"scene"},
     {"trace", "forward", "formats"},
     {"inverse", "calibration", "alignment", "scores", "measure", "planning"},

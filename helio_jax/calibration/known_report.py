@@ -6,6 +6,7 @@ import numpy as np
 
 from helio_jax.arrays import robust_std
 from helio_jax.calibration.known_shape import KnownFit
+from helio_jax.geometry_prior import geometry_covariance
 from helio_jax.instrument import Covariance, Instrument, Uncertainty
 
 UNDETERMINED = 0.7
@@ -16,8 +17,6 @@ INFLATED = 1.2
 FAR = 3.0
 """Prior standard deviations from the stated value beyond which the scans contradict the instrument file."""
 _MIN_PIXELS = 12
-_STEP = 1e-3
-"""Step of the derivatives of aperture angles, in standard deviations."""
 
 
 class Row(NamedTuple):
@@ -142,7 +141,8 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
         std=tuple(float(f"{s:.4g}") for s in fit.stds[:n]),
         correlation=tuple(tuple(np.round(row, 4).tolist()) for row in correlation),
     )
-    polar, azimuth = _direction_stds(fit)
+    directions = np.diag(geometry_covariance(fit.instrument, covariance))[1:].reshape(-1, 2)
+    polar, azimuth = np.degrees(np.sqrt(directions.max(0))).tolist()
     stated = fit.stated.uncertainty
     found = {
         "plate_shift_um": max(std.get("plate shift x", 0.0), std.get("plate shift y", 0.0)),
@@ -156,35 +156,6 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     }
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
     return fit.instrument.model_copy(update={"uncertainty": uncertainty, "covariance": covariance})
-
-
-def _direction_stds(fit: KnownFit) -> tuple[float, float]:
-    """Compute the standard deviations of polar angle and azimuth, the largest of all apertures [deg]."""
-    n = fit.n_shared
-    ways = {
-        "plate shift x": lambda v: {"plate_shift": (v, 0.0)},
-        "plate shift y": lambda v: {"plate_shift": (0.0, v)},
-        "plate scale": lambda v: {"scale": 1.0 + v},
-        "plate rotation": lambda v: {"rotation": np.radians(v)},
-    }
-    detectors = fit.instrument.detector_names
-
-    def directions(name: str, step: float) -> np.ndarray:
-        aim = np.zeros((len(detectors), 2))
-        kind, _, of = name.partition(" of ")
-        if kind in ("polar", "azimuth"):
-            aim[detectors.index(of), int(kind == "azimuth")] = np.radians(step)
-        moved = fit.instrument.moved(aim, 0.0, **ways.get(name, lambda v: {})(step))
-        return np.array([d.aim(moved.working_distance) for d in moved.detector])
-
-    slopes = [
-        (directions(name, _STEP * std) - directions(name, -_STEP * std)) / (2.0 * _STEP * std)
-        for name, std in zip(fit.names[:n], fit.stds[:n], strict=True)
-    ]
-    scaled = np.stack(slopes, -1) * fit.priors[:n]
-    variance = np.einsum("dai,ij,daj->da", scaled, fit.covariance[:n, :n], scaled)
-    polar, azimuth = np.degrees(np.sqrt(variance.max(0)))
-    return float(polar), float(azimuth)
 
 
 def as_record(fit: KnownFit) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from helio_jax.arrays import border_mask
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections, single_scattering
-from helio_jax.instrument import Uncertainty
+from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.inverse.linear import PhotometricSolution
 from helio_jax.inverse.samples import on_raster, thinning
 from helio_jax.inverse.settings import ReconstructSettings
@@ -43,7 +43,7 @@ def bootstrap_heights(
     signal: np.ndarray,
     variance: np.ndarray,
     optics: Optics,
-    uncertainty: Uncertainty,
+    geometry: GeometryPrior,
     settings: ReconstructSettings,
     solve: Solve,
     misfit: np.ndarray | None = None,
@@ -58,7 +58,7 @@ def bootstrap_heights(
     Args:
         signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
         optics: as stated.
-        uncertainty: of the instrument: how far the apertures may be elsewhere.
+        geometry: how far sample, apertures and beam may be elsewhere.
         settings: priors (table refine), border, number of samples.
         solve: the method.
         misfit: systematic error of the data [detector, y, x], of unknown sign and not everywhere the same share of it;
@@ -74,7 +74,7 @@ def bootstrap_heights(
     systematic = None if misfit is None else np.nan_to_num(misfit[:, ::stride, ::stride])
     drawn = []
     for _ in range(settings.samples):
-        other = _drawn_optics(optics, uncertainty, rng)
+        other = _drawn_optics(optics, geometry, rng)
         reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
         if systematic is not None:
             reading = reading + patchy_amplitude(height.shape, patches) * systematic
@@ -98,14 +98,13 @@ def patchy_amplitude(shape: tuple[int, int], rng: np.random.Generator) -> np.nda
     return smooth / np.sqrt(np.mean(smooth**2))
 
 
-def _drawn_optics(optics: Optics, uncertainty: Uncertainty, rng: np.random.Generator) -> Optics:
-    """Draw the optics of an instrument within its uncertainty."""
-    std = np.radians([uncertainty.polar_deg, uncertainty.azimuth_deg])
-    polar, azimuth = (std * rng.standard_normal((optics.n_detectors, 2))).T
-    distance = uncertainty.sample_distance_um * float(rng.standard_normal())
-    if not (std.any() or distance):
+def _drawn_optics(optics: Optics, geometry: GeometryPrior, rng: np.random.Generator) -> Optics:
+    """Draw the optics of an instrument within its prior."""
+    distance, polar, azimuth, incidence = geometry.draw(rng)
+    if not (distance or incidence or polar.any() or azimuth.any()):
         return optics
-    return jax.tree.map(np.asarray, optics.moved(polar=polar, azimuth=azimuth, distance=distance))
+    moves = {"distance": distance, "polar": polar, "azimuth": azimuth} | ({"incidence": incidence} if incidence else {})
+    return jax.tree.map(np.asarray, optics.moved(**moves))
 
 
 def _drawn_reading(

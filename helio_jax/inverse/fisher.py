@@ -22,7 +22,7 @@ from helio_jax.forward.render import (
 from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.fit import posterior_at
-from helio_jax.inverse.instrument_report import kind_of, plain_name, prior_stds
+from helio_jax.inverse.instrument_report import plain_name, units_of
 from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
@@ -101,13 +101,14 @@ def fisher(
     problem = FitProblem.of(probability, variance, optics, raster, surface, settings, uncertainty=uncertainty)
     state = set_corrections(problem, FitState.at(problem, surface), corrections, surface)
     posterior = posterior_at(problem, with_responses(problem, state), n_samples)
-    deviation = np.sqrt(np.diag(posterior.instrument_covariance))
-    units = prior_stds(problem.uncertainty, float(problem.priors.distance), problem.settings)
-    numbers, parameters = tuple(map(str, range(optics.n_detectors))), {}
-    for name, std in zip(posterior.names, deviation, strict=True):
-        prior, unit = units.get(kind_of(name), (1.0, "prior standard deviations"))
-        if prior > 0:
-            parameters[plain_name(name, numbers)] = (float(prior * std), float(prior), unit)
+    matrix, units = units_of(problem, posterior.names)
+    deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance @ matrix.T))
+    numbers, priors = tuple(map(str, range(optics.n_detectors))), np.linalg.norm(matrix, axis=1)
+    parameters = {
+        plain_name(name, numbers): (float(std), float(prior), unit)
+        for name, std, prior, unit in zip(posterior.names, deviation, priors, units, strict=True)
+        if prior > 0.0
+    }
     return Information(posterior.height_std, parameters, posterior)
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.anchors import Anchors
@@ -23,9 +24,9 @@ from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
-from helio_jax.inverse.residuals import Parameters, smooth_albedo
+from helio_jax.inverse.residuals import FixedTerms, Parameters, Unknowns, data_by_incidence, smooth_albedo
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
+from helio_jax.inverse.state import FitState, Predict, moved_optics, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
@@ -51,7 +52,6 @@ class Fit:
         gain, offset: per detector, data = gain * model + offset.
         instrument: with the geometry that was fitted.
         parameters: all unknowns but the surface, in prior standard deviations.
-        distance_std: prior standard deviation of the distance of the sample, um.
         residuals: (model - data) / standard deviation [detector, y, x].
         weight: robust weight of each datum [detector, y, x].
         model_share: share of the prediction errors in the variance of each datum [detector, y, x].
@@ -73,7 +73,6 @@ class Fit:
     offset: np.ndarray
     instrument: Instrument
     parameters: Parameters
-    distance_std: float
     residuals: np.ndarray
     weight: np.ndarray
     model_share: np.ndarray
@@ -110,9 +109,23 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int, sums: Anc
     linear, planes = linearise(unknowns, fixed), part.priors.tilt * part.position
     thin = (slice(None, None, stride),) * 2
     of_sums = None if sums is None else derivative_of_sums(sums.thinned(thin), planes, linear)
-    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, sums=of_sums)
+    unfitted = _incidence_error(part, there, unknowns, fixed)
+    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, sums=of_sums, unfitted=unfitted)
     found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
+
+
+def _incidence_error(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
+    """Compute what one standard deviation of the incidence, which is not fitted, does to the data [residual, 1]."""
+    std = problem.geometry.incidence_std
+    if not std or problem.optics.beam_shifts is not None:
+        return None
+    with jax.enable_x64(True):
+        optics = jax.tree.map(jnp.asarray, moved_optics(problem.optics, problem.moves(state.parameters)))
+        return std * np.asarray(_data_by_incidence(unknowns, fixed, optics)).reshape(-1, 1)
+
+
+_data_by_incidence = compiled(data_by_incidence)
 
 
 def derivative_of_sums(sums: Anchors, planes: np.ndarray, linear: Linearised) -> np.ndarray:
@@ -256,13 +269,12 @@ def _finish(
     remaining: np.ndarray,
     optimiser: str,
 ) -> Fit:
-    s, priors = problem.settings, problem.priors
+    s = problem.settings
     limit, cut = s.robust_limits[-1], s.jump_limits[-1]
     edges_x, edges_y = edges_of(problem, state.surface, cut)
     return Fit(
         problem=problem,
         **_shown(problem, state),
-        distance_std=float(priors.distance),
         residuals=state.residuals,
         weight=cauchy_weight(state.residuals, limit),
         model_share=model_share(problem, state),

@@ -4,13 +4,13 @@ A combination of parameters that the data hardly distinguish from others is no b
 depend on that prior: such combinations are listed, never hidden.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 
-from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.fit import Fit
-from helio_jax.inverse.settings import RefineSettings
+from helio_jax.inverse.problem import FitProblem
 
 WEAK = 0.5
 """A combination is weak when the data leave more than this share of its prior standard deviation."""
@@ -21,20 +21,31 @@ _PRIOR_DOMINATED = 1.0 - 1e-6
 """A parameter that keeps all of its prior standard deviation affects no datum, and so no height."""
 
 
-def prior_stds(uncertainty: Uncertainty, distance_um: float, settings: RefineSettings) -> dict[str, tuple[float, str]]:
-    """List the prior standard deviation and its unit of every kind of parameter."""
-    return {
-        "log_gain": (settings.gain_std, "relative"),
-        "offset": (settings.offset_std, "of the signal"),
-        "log_multiple": (settings.multiple_error, "relative"),
-        "drift": (settings.drift_std, "of the signal"),
-        "law": (settings.law_std, "of the exponent"),
-        "patch": (settings.patch_albedo_std, "natural logarithm"),
-        "distance": (distance_um, "um"),
-        "tilt": (uncertainty.tilt_deg, "deg"),
-        "polar": (uncertainty.polar_deg, "deg"),
-        "azimuth": (uncertainty.azimuth_deg, "deg"),
+def units_of(problem: FitProblem, names: tuple[str, ...]) -> tuple[np.ndarray, list[str]]:
+    """Compute the matrix from parameters in prior deviations to the units that are shown, and those units.
+
+    It is diagonal but for distance and directions, whose prior errors may belong together.
+    """
+    s, geometry = problem.settings, problem.priors.geometry
+    priors = {
+        "log_gain": (s.gain_std, "relative"),
+        "offset": (s.offset_std, "of the signal"),
+        "log_multiple": (s.multiple_error, "relative"),
+        "drift": (s.drift_std, "of the signal"),
+        "law": (s.law_std, "of the exponent"),
+        "patch": (s.patch_albedo_std, "natural logarithm"),
+        "tilt": (math.degrees(problem.tilt_std), "deg"),
+        "distance": (1.0, "um"),
+        "polar": (math.degrees(1.0), "deg"),
+        "azimuth": (math.degrees(1.0), "deg"),
     }
+    kinds = [kind_of(name) for name in names]
+    found = [priors.get(kind, (1.0, "prior standard deviations")) for kind in kinds]
+    matrix = np.diag([size for size, _ in found])
+    of_geometry = [i for i, kind in enumerate(kinds) if kind in ("distance", "polar", "azimuth")]
+    if of_geometry:
+        matrix[np.ix_(of_geometry, of_geometry)] = np.diag(matrix)[of_geometry, None] * geometry
+    return matrix, [unit for _, unit in found]
 
 
 def kind_of(name: str) -> str:
@@ -60,7 +71,7 @@ def plain_name(name: str, detectors: tuple[str, ...]) -> str:
     return f"{kind} {detectors[parts[0]]}{rest}"
 
 
-def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
+def describe_instrument(fit: Fit) -> dict[str, Any]:
     """List values, standard deviations and weakly determined combinations of the instrument's parameters.
 
     `values`: name -> (value, standard deviation, prior standard deviation, unit); gain, offset, drift and angles as
@@ -73,23 +84,27 @@ def describe_instrument(fit: Fit, settings: RefineSettings) -> dict[str, Any]:
     if posterior is None:
         return {}
     detectors = fit.instrument.detector_names
-    units = prior_stds(fit.instrument.uncertainty, fit.distance_std, settings)
+    matrix, units = units_of(fit.problem, posterior.names)
     flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])
-    deviation = np.sqrt(np.diag(posterior.instrument_covariance))
-    values = {}
-    for name, value, std in zip(posterior.names, flat, deviation, strict=True):
-        prior, unit = units.get(kind_of(name), (1.0, "prior deviations"))
-        if prior > 0:
-            numbers = (float(prior * value), float(prior * std), float(prior))
-            values[plain_name(name, detectors)] = [*numbers, unit]
-    determined = np.flatnonzero(deviation < _PRIOR_DOMINATED)
-    size, vector = np.linalg.eigh(posterior.instrument_covariance[np.ix_(determined, determined)])
+    covariance, prior = posterior.instrument_covariance, np.linalg.norm(matrix, axis=1)
+    found = zip(
+        posterior.names, matrix @ flat, np.sqrt(np.diag(matrix @ covariance @ matrix.T)), prior, units, strict=True
+    )
+    values = {
+        plain_name(name, detectors): [float(value), float(std), float(own), unit]
+        for name, value, std, own, unit in found
+        if own > 0.0
+    }
+    determined = np.flatnonzero(np.sqrt(np.diag(covariance)) < _PRIOR_DOMINATED)
+    size, vector = np.linalg.eigh(covariance[np.ix_(determined, determined)])
+    relative = matrix[np.ix_(determined, determined)] / np.where(prior > 0.0, prior, 1.0)[determined, None]
     weak = []
     for i in np.argsort(size)[::-1][:_MAX_LISTED]:
         if size[i] <= WEAK**2:
             break
-        terms = np.argsort(-np.abs(vector[:, i]))[:_MAX_TERMS]
-        of = {plain_name(posterior.names[determined[t]], detectors): round(float(vector[t, i]), 3) for t in terms}
+        combination = relative @ vector[:, i]
+        terms = np.argsort(-np.abs(combination))[:_MAX_TERMS]
+        of = {plain_name(posterior.names[determined[t]], detectors): round(float(combination[t]), 3) for t in terms}
         weak.append({"share": float(np.sqrt(size[i])), "of": of})
     common = 0.0 if posterior.common_modes is None else float(np.sqrt((posterior.common_modes**2).sum(0)).max())
     return {"values": values, "weak": weak, "inflation": posterior.inflation, "common_mode_um": common}

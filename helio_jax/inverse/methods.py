@@ -214,7 +214,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
             "height_changes_um": list(fit.changes),
             "contraction": fit.contraction,
             "sensitivity": sensitivity(fit, settings),
-            "instrument": describe_instrument(fit, settings.refine),
+            "instrument": describe_instrument(fit),
             "chi_square": fit.chi_square,
             "assumed": found.assumed,
             "anchors": as_records(anchors),

@@ -19,6 +19,7 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import slopes_of_normal
+from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.inverse.bootstrap import SEED, bootstrap_heights, rescale_to_border, unmodelled_signal
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.linear import MIN_IMAGES, PhotometricSolution, signal_of, solve_linear
@@ -190,7 +191,7 @@ def photometric_heights(
         modes.append(path_error(rec, misfit, Raster.of(stack), expected, settings))
     if not modes:
         return rec.replace(warnings=(*rec.warnings, f"no error bars: {failure}"))
-    known = solver.optics, stack.instrument.uncertainty, settings
+    known = solver.optics, GeometryPrior.of(stack.instrument), settings
     difference = None if misfit is None else misfit.difference
     samples = bootstrap_heights(data, solver.variance, *known, lambda *drawn: solver.solve(*drawn)[0], difference)
     samples = add_common_modes(samples, modes, SEED + 1)

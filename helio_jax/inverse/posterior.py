@@ -317,6 +317,7 @@ def sample_posterior(
     error: ModelError | None = None,
     edge_error: EdgeError | None = None,
     sums: np.ndarray | None = None,
+    unfitted: np.ndarray | None = None,
 ) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
@@ -331,8 +332,11 @@ def sample_posterior(
         edge_error: what is assumed of the edges between pixels.
         sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
             instrument [3 * pixel + parameter, sum].
+        unfitted: change of the residuals of the data by one standard deviation of each number that is uncertain but not
+            fitted [residual, number]: a fit that takes it as stated answers to its error as to noise.
 
-    Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; samples: Bardsley, Solonen, Haario and
+    Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; numbers that are not fitted: Schmidt,
+        Adv. Control Syst. 3 (1966) 293 (consider analysis); samples: Bardsley, Solonen, Haario and
         Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
         takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
     """
@@ -349,12 +353,17 @@ def sample_posterior(
             rows = slice(n_done, n_done + assumed.share.size)
             noise[rows], n_done = assumed.draw(rng, noise[rows]), rows.stop
             errors.append((assumed, rows))
+    considered = np.zeros((jc.shape[0], 0 if unfitted is None else unfitted.shape[1]))
+    if unfitted is not None:
+        considered[: len(unfitted)] = unfitted
+        noise += considered @ rng.standard_normal((considered.shape[1], n_samples))
 
     def covariance(influence: np.ndarray) -> np.ndarray:
         of_all = np.zeros((influence.shape[1],) * 2)
         for assumed, rows in errors:
             of_all = of_all + assumed.covariance(influence[rows])
-        return of_all + influence[n_done:].T @ influence[n_done:]
+        by_unfitted = influence.T @ considered
+        return of_all + influence[n_done:].T @ influence[n_done:] + by_unfitted @ by_unfitted.T
 
     instrument = influence.T @ noise
     surface = solve(linear.transposed(noise)) - answer @ instrument

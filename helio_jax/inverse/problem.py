@@ -15,6 +15,7 @@ from helio_jax.arrays import border_mask
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.forward.surface import Surface
+from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
@@ -35,7 +36,8 @@ class FitProblem:
     Attributes:
         signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
         optics: as stated.
-        uncertainty: prior standard deviations of the geometry.
+        tilt_std: prior standard deviation of the substrate's tilt, about each of x and y [rad].
+        geometry: prior of distance and directions.
         raster: beam positions.
         reconstruct_settings: of the fit (`settings`), and what is known of the border.
         order: in which the pixels were recorded.
@@ -57,7 +59,8 @@ class FitProblem:
     signal: np.ndarray
     variance: np.ndarray
     optics: Optics
-    uncertainty: Uncertainty
+    tilt_std: float
+    geometry: GeometryPrior
     raster: Raster
     reconstruct_settings: ReconstructSettings
     order: ScanOrder
@@ -98,6 +101,10 @@ class FitProblem:
         """
         given, optics = (None, instrument) if isinstance(instrument, Optics) else (instrument, Optics.of(instrument))
         stated = uncertainty or (Uncertainty() if given is None else given.uncertainty)
+        if given is None or uncertainty is not None:
+            geometry = GeometryPrior.of_uncertainty(stated, len(signal))
+        else:
+            geometry = GeometryPrior.of(given)
         s, shape = settings.refine, signal.shape[1:]
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
@@ -106,7 +113,7 @@ class FitProblem:
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
-            signal, variance, optics, stated, raster, settings, order, is_held,
+            signal, variance, optics, math.radians(stated.tilt_deg), geometry, raster, settings, order, is_held,
             is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
             patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))), given,
@@ -161,10 +168,21 @@ class FitProblem:
         return self.raster.centred_positions()
 
     @property
+    def geometry_prior(self) -> GeometryPrior:
+        """Prior of distance and directions, where a held level stands for the distance."""
+        held = self.settings.level_std_um if self.is_level_held else None
+        return self.geometry.with_distance(held) if held else self.geometry
+
+    @property
+    def distance_std(self) -> float:
+        """Prior standard deviation of the sample distance [um]."""
+        return self.geometry_prior.distance_std
+
+    @property
     def priors(self) -> Priors:
-        """Prior standard deviations of the parameters; a held level stands for the distance."""
-        s, stated, median = self.settings, self.uncertainty, self.median_signal
-        held = s.level_std_um if self.is_level_held else None
+        """Prior standard deviations of the parameters."""
+        s, median = self.settings, self.median_signal
+        free = [bool(self.distance_std), *[self.geometry.is_aimed] * 2 * len(self.signal)]
         numbers = {
             "gain": s.gain_std,
             "offset": s.offset_std * median,
@@ -173,19 +191,17 @@ class FitProblem:
             "drift": s.drift_std * median,
             "lines": s.line_std * median,
             "law": s.law_std,
-            "distance": held or stated.sample_distance_um,
-            "tilt": math.radians(stated.tilt_deg),
-            "aim": np.radians([stated.polar_deg, stated.azimuth_deg]),
+            "geometry": self.geometry_prior.factor()[np.ix_(free, free)],
+            "tilt": self.tilt_std,
             "patch": s.patch_albedo_std,
         }
         return Priors(**{name: np.asarray(value, float) for name, value in numbers.items()})
 
     def prior_means(self) -> Parameters:
         """Make the parameters at their prior means, all 0; those that are known have no entries."""
-        s, stated = self.settings, self.uncertainty
+        s = self.settings
         k, n = self.signal.shape[0], s.albedo_modes if s.albedo_std else 0
         lines = self.signal.shape[1 + self.order.slow_axis] if s.line_std else 0
-        is_aimed = s.geometry and (stated.polar_deg or stated.azimuth_deg)
         shapes = {
             "log_gain": k,
             "offset": k,
@@ -196,9 +212,9 @@ class FitProblem:
             "drift": (k, self.drift_modes.shape[1]),
             "lines": (k, lines),
             "law": 1 if s.law_std else 0,
-            "distance": 1 if s.geometry and float(self.priors.distance) else 0,
-            "tilt": 2 if s.geometry and stated.tilt_deg else 0,
-            "aim": (k, 2) if is_aimed else 0,
+            "distance": 1 if s.geometry and self.distance_std else 0,
+            "tilt": 2 if s.geometry and self.tilt_std else 0,
+            "aim": (k, 2) if s.geometry and self.geometry.is_aimed else 0,
             "patch": len(self.patches.members),
         }
         return Parameters(**{name: np.zeros(shape) for name, shape in shapes.items()})

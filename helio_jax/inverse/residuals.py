@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.fft import idctn
 
+from helio_jax.forward.form_factor import form_factor_at
+from helio_jax.forward.optics import Optics
 from helio_jax.forward.readout import Readout
 from helio_jax.forward.render import MIN_COS, single_scattering
 from helio_jax.forward.surface import Surface, one_sided, unit_normal
@@ -83,8 +85,8 @@ class Unknowns(eqx.Module):
 
 class Priors(eqx.Module):
     """Prior standard deviations: relative gain; offset [detector]; scale of multiple scattering; albedo; drift and line
-    offsets [detector]; exponent of the law; distance [um]; tilt [rad]; polar angle and azimuth [2, rad]; log albedo of
-    patches."""
+    offsets [detector]; exponent of the law; tilt [rad]; log albedo of patches. Of the geometry, a factor of the prior
+    covariance of what is unknown of distance [um] and directions [rad] (`GeometryPrior`) [parameter, parameter]."""
 
     gain: Any
     offset: Any
@@ -93,9 +95,8 @@ class Priors(eqx.Module):
     drift: Any
     lines: Any
     law: Any
-    distance: Any
+    geometry: Any
     tilt: Any
-    aim: Any
     patch: Any
 
 
@@ -272,9 +273,14 @@ def moves_of(parameters: Parameters, priors: Priors, n_detectors: int) -> jax.Ar
     """Compute distance [um], polar angle and azimuth [rad] beyond the stated ones [move, detector]; none if known."""
     if not parameters.distance.size and not parameters.aim.size:
         return jnp.zeros((0, n_detectors))
-    distance = jnp.broadcast_to(jnp.sum(priors.distance * parameters.distance), (1, n_detectors))
-    aim = (priors.aim * parameters.aim).T if parameters.aim.size else jnp.zeros((2, n_detectors))
-    return jnp.concatenate([distance, aim])
+    found = priors.geometry @ jnp.concatenate([parameters.distance, parameters.aim.ravel()])
+    distance, aim = found[: parameters.distance.size], found[parameters.distance.size :]
+    return jnp.concatenate(
+        [
+            jnp.broadcast_to(jnp.sum(distance), (1, n_detectors)),
+            aim.reshape(n_detectors, 2).T if aim.size else jnp.zeros((2, n_detectors)),
+        ]
+    )
 
 
 def readout_of(parameters: Parameters, priors: Priors, drift_modes: Any, slow_axis: int) -> Readout:
@@ -347,6 +353,23 @@ def second_order_noise_bias(
 def data_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
     """Compute (model - data) / standard deviation, robustly weighted [detector, y, x]."""
     return (expected_data(surface, parameters, fixed) - fixed.data) * fixed.inverse_sigma
+
+
+def data_by_incidence(unknowns: Unknowns, fixed: FixedTerms, optics: Optics) -> jax.Array:
+    """Compute the derivative of the data's residuals by the beam's incidence [detector, y, x], per rad.
+
+    Heights and slopes at the beam positions stay; what they mean turns with the beam. Masks are held.
+    """
+    surface, factors = surface_of(unknowns, fixed), fixed.form_factors
+
+    def at(step: jax.Array) -> jax.Array:
+        moved = optics.moved(incidence=step)
+        change = form_factor_at(moved, surface.height) - form_factor_at(optics, surface.height)
+        terms = factors.terms.at[0].add(change)
+        there = eqx.tree_at(lambda f: (f.form_factors.terms, f.beam_shift), fixed, (terms, moved.beam_shift))
+        return data_residuals(surface, unknowns.parameters, there)
+
+    return jax.jvp(at, (jnp.zeros(()),), (jnp.ones(()),))[1]
 
 
 def edge_scale(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:

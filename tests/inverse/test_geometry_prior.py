@@ -1,0 +1,173 @@
+"""The joint prior of an instrument's geometry: from the file, in the fit, in drawn instruments, and in error bars."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import helio_jax as hx
+from helio_jax.errors import SceneError
+from helio_jax.forward.render import Corrections
+from helio_jax.geometry_prior import GeometryPrior
+from helio_jax.instrument import Covariance, Uncertainty
+from helio_jax.inverse.fit import _incidence_error
+from helio_jax.inverse.instrument_report import units_of
+from helio_jax.inverse.posterior import exact_height_covariance, linearise, sample_posterior
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState, set_corrections, with_responses
+from helio_jax.inverse.steps import freeze
+
+SHIFT = 30.0
+NAMES = ("plate shift x", "plate shift y", "sample distance")
+
+
+def with_plate_error(instrument, std=(SHIFT, SHIFT, 20.0), correlation=0.5, **uncertainty):
+    """Return an instrument whose plate is shifted by an unknown length, correlated with the distance."""
+    matrix = np.eye(3)
+    matrix[0, 2] = matrix[2, 0] = correlation
+    covariance = Covariance(
+        parameters=NAMES, units=("um", "um", "um"), std=std, correlation=tuple(map(tuple, matrix.tolist()))
+    )
+    update = {"covariance": covariance, "uncertainty": Uncertainty(**uncertainty)}
+    return instrument.model_copy(update=update)
+
+
+def test_shifted_plate_turns_all_apertures_together(bshem):
+    """A shift along x turns every aperture by its closed form; distance correlates as stated.
+
+    Catches wrong units, the order of polar angle and azimuth, and a lost correlation.
+    """
+    prior = GeometryPrior.of(with_plate_error(bshem, std=(SHIFT, 0.0, 20.0)))
+    center = np.array([a.center for a in bshem.apertures()])
+    radius, w = np.hypot(*center[:, :2].T), bshem.working_distance
+    polar = SHIFT * center[:, 0] / radius * w / (w**2 + radius**2)
+    azimuth = -SHIFT * center[:, 1] / radius**2
+    along = np.array([0.5 * 20.0, *np.stack([polar, azimuth], 1).ravel()])
+    expected = np.outer(along, along)
+    expected[0, 0] = 20.0**2
+    # what the shift alone explains; 0.001 of the largest direction is independent
+    assert prior.covariance[1:, 1:] == pytest.approx(expected[1:, 1:], rel=3e-3, abs=3e-6 * expected[1:, 1:].max())
+    assert prior.covariance[0] == pytest.approx(expected[0], rel=3e-3, abs=1e-9)
+    factor = prior.factor()
+    assert factor @ factor.T == pytest.approx(prior.covariance, rel=1e-9, abs=1e-15)
+
+
+def test_draws_have_the_covariance(bshem):
+    """20000 draws: 6 standard errors of a variance are 6 %. Rejects independent draws (0 instead of 0.5)."""
+    prior = GeometryPrior.of(with_plate_error(bshem, incidence_deg=0.5))
+    rng = np.random.default_rng(3)
+    draws = [prior.draw(rng) for _ in range(20_000)]
+    flat = np.array([[d, *np.stack([polar, azimuth], 1).ravel()] for d, polar, azimuth, _ in draws])
+    size = np.sqrt(np.diag(prior.covariance))
+    assert np.cov(flat.T) / np.outer(size, size) == pytest.approx(prior.covariance / np.outer(size, size), abs=0.06)
+    assert np.std([d[3] for d in draws]) == pytest.approx(math.radians(0.5), rel=0.03)
+
+
+def test_uncertainty_widens_a_covariance(bshem):
+    """A user who states more than the calibration gets more; who states less, what was calibrated."""
+    calibrated = GeometryPrior.of(with_plate_error(bshem))
+    wider = GeometryPrior.of(with_plate_error(bshem, sample_distance_um=50.0, polar_deg=5.0))
+    less = GeometryPrior.of(with_plate_error(bshem, sample_distance_um=1.0, polar_deg=0.01))
+    assert wider.distance_std == pytest.approx(50.0, rel=1e-3)
+    assert np.sqrt(np.diag(wider.covariance)[1::2].max()) == pytest.approx(math.radians(5.0), rel=1e-3)
+    assert less.covariance == pytest.approx(calibrated.covariance)
+    assert not GeometryPrior.of(bshem.model_copy(update={"uncertainty": Uncertainty()})).covariance.any()
+
+
+def test_covariance_of_another_instrument_is_refused(bshem):
+    """Catches a table that is silently ignored after a detector was renamed."""
+    covariance = Covariance(parameters=("polar of left over",), units=("deg",), std=(1.0,), correlation=((1.0,),))
+    with pytest.raises(SceneError, match=r"polar of left over.*calibrate it anew"):
+        GeometryPrior.of(bshem.model_copy(update={"covariance": covariance}))
+
+
+AXIS = 40.0 * (np.arange(13) - 6.0)
+RASTER = hx.Raster(AXIS, AXIS)
+NOISE = 0.002
+
+
+@pytest.fixture(scope="module")
+def hill():
+    """A hill of 40 um, heights and slopes."""
+    x, y = np.meshgrid(AXIS, AXIS)
+    with jax.enable_x64(True):
+        surface = hx.surface_of_heights(40.0 * np.exp(-0.5 * (x**2 + y**2) / 110.0**2), RASTER)
+        return jax.tree.map(lambda f: np.asarray(f, np.float64), surface)
+
+
+def images_of(hill, optics) -> np.ndarray:
+    """Render without masks and multiple scattering."""
+    with jax.enable_x64(True):
+        none = Corrections.none((optics.n_detectors, *RASTER.shape))
+        return np.asarray(hx.render(hill, jax.tree.map(jnp.asarray, optics), RASTER, corrections=none))
+
+
+def fit_at(hill, instrument):
+    """Pose the fit of the hill's images under an instrument, at the truth."""
+    signal = images_of(hill, hx.Optics.of(instrument))
+    variance = np.full(signal.shape, (NOISE * signal.mean()) ** 2)
+    problem = FitProblem.of(signal, variance, instrument, RASTER, hill, ReconstructSettings())
+    state = set_corrections(problem, FitState.at(problem, hill), Corrections.none(signal.shape), hill)
+    return problem, with_responses(problem, state)
+
+
+def linearised(problem, state):
+    """Linearise a fit at its state."""
+    return linearise(*freeze(problem, state, problem.settings.robust_limits[-1], problem.settings.jump_limits[-1]))
+
+
+def test_fit_has_the_joint_prior(bshem, hill):
+    """Its derivative by the unknowns of the geometry is that by independent ones, times the prior's factor.
+
+    The report gives each direction the prior of the file. Catches a fit that drops the correlations, and a factor that
+    is transposed.
+    """
+    plain = bshem.model_copy(update={"uncertainty": Uncertainty()})
+    joint = with_plate_error(plain)
+    prior = GeometryPrior.of(joint)
+    polar, azimuth = np.degrees(np.sqrt(np.diag(prior.covariance)[1:].reshape(-1, 2).max(0)))
+    stated = Uncertainty(sample_distance_um=20.0, polar_deg=polar, azimuth_deg=azimuth)
+    problems = [fit_at(hill, i) for i in (plain, joint, plain.model_copy(update={"uncertainty": stated}))]
+    _, together, apart = linears = [linearised(*p) for p in problems]
+    exact, less = (np.sqrt(np.diag(exact_height_covariance(f))).mean() for f in linears[:2])
+    assert exact < less
+    geometry = np.array([name.partition("[")[0] in ("distance", "aim") for name in together.names])
+    assert together.names == apart.names and geometry.sum() == 7
+    rows = slice(0, -len(together.names))  # all but the priors
+    size = np.array([20.0, *np.radians([polar, azimuth] * 3)])
+    by_units = apart.instrument[rows][:, geometry] / size
+    found = together.instrument[rows][:, geometry]
+    assert found == pytest.approx(by_units @ prior.factor(), rel=1e-6, abs=1e-9 * np.abs(found).max())
+    matrix, units = units_of(problems[1][0], together.names)
+    stds = np.linalg.norm(matrix, axis=1)[geometry]
+    stds[np.array(units)[geometry] == "deg"] *= math.radians(1.0)
+    assert stds == pytest.approx(np.sqrt(np.diag(prior.covariance)), rel=1e-6)
+
+
+def test_incidence_that_is_not_fitted_is_in_the_error_bars(bshem, hill):
+    """Data change by a wrong incidence as the images do, and heights by the answer of the fit to such data.
+
+    Catches a missing term of the normals, of where the beam meets the surface, and a wrong sign or unit.
+    """
+    std = 0.2
+    problem, state = fit_at(hill, bshem.model_copy(update={"uncertainty": Uncertainty(incidence_deg=std)}))
+    unknowns, fixed = freeze(problem, state, problem.settings.robust_limits[-1], problem.settings.jump_limits[-1])
+    error = _incidence_error(problem, state, unknowns, fixed)
+    assert error is not None
+    optics = jax.tree.map(jnp.asarray, problem.optics)
+    tipped = [images_of(hill, optics.moved(incidence=s * math.radians(std))) for s in (1.0, -1.0)]
+    expected = (0.5 * (tipped[0] - tipped[1]) * np.asarray(fixed.inverse_sigma)).ravel()
+    assert error.ravel() == pytest.approx(expected, rel=1e-3, abs=2e-3 * np.abs(expected).max())
+    linear = linearise(unknowns, fixed)
+    dense = np.hstack([linear.surface.toarray() + linear.common @ linear.weights.T, linear.instrument])
+    right = np.zeros(len(dense))
+    error = 10.0 * error  # 2 deg: as large as what the noise leaves
+    right[: len(expected)] = error.ravel()
+    answer = np.linalg.lstsq(dense, right, rcond=None)[0][: 3 * AXIS.size**2 : 3]
+    exact = np.sqrt(np.diag(exact_height_covariance(linear)) + answer**2)
+    found = sample_posterior(linear, 4000, unfitted=error).height_std.ravel()
+    assert np.abs(answer).max() > 0.3 * np.sqrt(np.diag(exact_height_covariance(linear))).min()
+    assert found == pytest.approx(exact, rel=0.06)  # 5 standard errors
