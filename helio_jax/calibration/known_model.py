@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.calibration.unknowns import OBJECT, PLATE
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.known_shapes import Ball, Flat, PlacedShape, Ramp, Shape
 from helio_jax.forward.masking import masked_by_shape
 from helio_jax.forward.optics import Optics, Raster
@@ -113,7 +114,7 @@ class Seen(NamedTuple):
     distance: np.ndarray
 
 
-@eqx.filter_jit
+@compiled
 def _geometry(model: ScanModel, unknowns: Any) -> Any:
     optics, shape = model.moved_optics(unknowns), model.shape_of(unknowns)
     surface, is_object = shape.seen(model.raster, optics.beam_shift)
@@ -133,7 +134,7 @@ def see(model: ScanModel, unknowns: np.ndarray) -> Seen:
         return Seen(np.asarray(surface.height), *map(np.asarray, rest))
 
 
-@eqx.filter_jit
+@compiled
 def _lies_on_object(model: ScanModel, unknowns: Any) -> Any:
     return model.shape_of(unknowns).seen(model.raster, model.moved_optics(unknowns).beam_shift)[1]
 
@@ -153,14 +154,14 @@ def straddles_outline(model: ScanModel, unknowns: np.ndarray, margin: float) -> 
     return np.any(found != found[0], 0)
 
 
-@eqx.filter_jit
+@compiled
 def _value_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple) -> tuple[Any, Any]:
     value, push = jax.linearize(lambda u: model.probability(u, multiple), unknowns)
     ways = jnp.eye(len(unknowns), dtype=value.dtype)[multiple.free]
     return value, jax.lax.map(push, ways)
 
 
-_value = eqx.filter_jit(lambda model, unknowns, multiple: model.probability(unknowns, multiple))
+_value = compiled(lambda model, unknowns, multiple: model.probability(unknowns, multiple))
 
 
 def probability(model: ScanModel, unknowns: np.ndarray, multiple: Multiple) -> np.ndarray:
@@ -178,12 +179,12 @@ def probability_and_derivative(
         return np.asarray(value), np.asarray(slopes)
 
 
-@eqx.filter_jit
+@compiled
 def _scattered_again(model: ScanModel, unknowns: Any, plan: Any) -> Any:
     return model.scattered_again(unknowns, plan)
 
 
-@eqx.filter_jit
+@compiled
 def _again_derivative(model: ScanModel, unknowns: Any, plan: Any, free: Any) -> Any:
     ways = jnp.eye(len(unknowns))[free]
     return jax.lax.map(lambda way: jax.jvp(lambda u: model.scattered_again(u, plan), (unknowns,), (way,))[1], ways)
