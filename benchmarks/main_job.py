@@ -186,7 +186,7 @@ def measured_rows(shared: Path) -> list[Row]:
 
 def tiny_rows(seed: int) -> list[Row]:
     """Run a small simulated sphere through the same code."""
-    small = {"scan.nx": 41, "scan.ny": 41, "scan.pixel_size_um": 88.0, "reconstruct.refine.max_rounds": 1}
+    small = {"scan.nx": 21, "scan.ny": 21, "scan.pixel_size_um": 170.0, "reconstruct.refine.max_rounds": 1}
     scene = load_scene(ROOT / "scenes" / "sphere_a.toml", small)
     stack = pipeline.record(scene, pipeline.simulate(scene, rays=16, seed=seed))
     return [r | {"reached": None} for r in height_rows(scene, stack)]

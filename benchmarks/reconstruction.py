@@ -379,10 +379,10 @@ def main() -> None:
     record = Record(args.output / ("reconstruction_tiny.json" if args.tiny else "reconstruction.json"), args.seed)
     instrument = load_scene(SCENES / "sphere_a.toml").instrument
     if args.tiny:
-        height_rows(record, None, args.seed, 32, {"2", "7"})
-        efficiency_row(record, instrument, 2, 24)
-        coverage_row(record, instrument, 2, 24)
-        gradient_row(record, instrument, (24, 20))
+        height_rows(record, None, args.seed, 21, {"7"})
+        efficiency_row(record, instrument, 2, 21)
+        coverage_row(record, instrument, 2, 21)
+        gradient_row(record, instrument, (21, 21))
         return
     shared = args.shared if (args.shared / "data").is_dir() else None
     height_rows(record, shared, args.seed, 121, wanted)

@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=917)
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()
-    n, members = (25, 1) if args.tiny else (args.size, args.members)
+    n, members = (21, 1) if args.tiny else (args.size, args.members)
     settings = ReconstructSettings(method="nearfield", samples=0) if args.tiny else ReconstructSettings(method="refine")
     rng, rows = np.random.default_rng(args.seed), []
     for number in range(members):

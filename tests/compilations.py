@@ -1,4 +1,4 @@
-"""Counts what XLA compiles, by the names of the jitted functions."""
+"""Counts what XLA compiles, by the names of the jitted functions; options of what is measured."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,6 +9,10 @@ from jax import monitoring
 EVENT = "/jax/core/compile/backend_compile_duration"
 """What JAX 0.10 tells once for every program it asks XLA for, with `fun_name` "jit(NAME)". Also where the persistent
 cache has the program, so counts do not depend on what ran before; not where the process has it in memory."""
+
+OPTIMISED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+"""Options of `Lowered.compile` for programs whose time or memory is measured: other tests compile without optimisation
+(tests/conftest.py)."""
 
 
 @contextmanager

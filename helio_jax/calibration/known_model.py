@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.calibration.unknowns import OBJECT, PLATE
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.known_shapes import Ball, Flat, PlacedShape, Ramp, Shape
 from helio_jax.forward.masking import masked_by_shape
 from helio_jax.forward.optics import Optics, Raster
@@ -141,7 +142,7 @@ class Seen(NamedTuple):
     distance: np.ndarray
 
 
-@eqx.filter_jit
+@compiled
 def _geometry(model: ScanModel, unknowns: Any) -> Any:
     optics, shape = model.moved_optics(unknowns), model.shape_of(unknowns)
     surface, is_object = shape.seen(model.raster, optics.beam_shift)
@@ -164,12 +165,12 @@ def see(model: ScanModel, unknowns: np.ndarray) -> Seen:
         return Seen(np.asarray(surface.height), *map(np.asarray, rest))
 
 
-_value = eqx.filter_jit(lambda model, *about: model.probability(*about))
-_parts = eqx.filter_jit(lambda model, *about: model.parts(*about))
-_fitted = eqx.filter_jit(lambda model, *about: model.fitted(*about))
+_value = compiled(lambda model, *about: model.probability(*about))
+_parts = compiled(lambda model, *about: model.parts(*about))
+_fitted = compiled(lambda model, *about: model.fitted(*about))
 
 
-@eqx.filter_jit
+@compiled
 def _fitted_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple, width: Any, member: Any) -> Any:
     value, push = jax.linearize(lambda u: model.fitted(u, multiple, width, member), unknowns)
     ways = jnp.eye(len(unknowns), dtype=value[0].dtype)[multiple.free]
@@ -208,12 +209,12 @@ def fitted_and_derivative(
         return jax.tree.map(np.asarray, (value, slopes))
 
 
-@eqx.filter_jit
+@compiled
 def _scattered_again(model: ScanModel, unknowns: Any, plan: Any) -> Any:
     return model.scattered_again(unknowns, plan)
 
 
-@eqx.filter_jit
+@compiled
 def _again_derivative(model: ScanModel, unknowns: Any, plan: Any, free: Any) -> Any:
     ways = jnp.eye(len(unknowns))[free]
     return jax.lax.map(lambda way: jax.jvp(lambda u: model.scattered_again(u, plan), (unknowns,), (way,))[1], ways)

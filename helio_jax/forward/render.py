@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from helio_jax.errors import SceneError
-from helio_jax.forward.compiling import batched_in_chunks
+from helio_jax.forward.compiling import batched_in_chunks, compiled
 from helio_jax.forward.form_factor import form_factor_at
 from helio_jax.forward.masking import N_SLICES, choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast, in_own_precision
@@ -161,7 +161,7 @@ def _corrections(surface, optics, raster, plan, kind: str, n_slices: int, horizo
     return Corrections(masked, multiple)
 
 
-_jitted_corrections = eqx.filter_jit(_corrections)
+_jitted_corrections = compiled(_corrections)
 
 
 def masking_corrections(surface: Surface, optics: Optics, raster: Raster) -> Corrections:

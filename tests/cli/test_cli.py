@@ -25,11 +25,11 @@ def helio(*args: object, **kwargs) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def small_scene(tmp_path_factory) -> Path:
-    """Sphere A on 31 x 31 pixels; its instrument is named by absolute path."""
+    """Sphere A on 21 x 21 pixels; its instrument is named by absolute path."""
     text = (ROOT / "scenes" / "sphere_a.toml").read_text()
     text = text.replace('"instruments/', f'"{(ROOT / "scenes" / "instruments").as_posix()}/')
-    text = text.replace("nx = 121", "nx = 31").replace("ny = 121", "ny = 31")
-    text = text.replace("pixel_size_um = 30.0", "pixel_size_um = 117.0")
+    text = text.replace("nx = 121", "nx = 21").replace("ny = 121", "ny = 21")
+    text = text.replace("pixel_size_um = 30.0", "pixel_size_um = 170.0")
     path = tmp_path_factory.mktemp("scene") / "small.toml"
     text = text.replace("[reconstruct.refine]", "[reconstruct.refine]\nmax_rounds = 1")
     path.write_text(text.replace('method = "refine"', 'method = "nearfield"'))
@@ -102,7 +102,7 @@ def test_wrong_scene_lists_all_errors(tmp_path, small_scene):
     """Two errors in one file are both reported, with key and limit."""
     bad = tmp_path / "bad.toml"
     bad.write_text(
-        small_scene.read_text().replace("nx = 31", "nx = -4").replace("radius_um = 1000.0", "radius_um = 0.0")
+        small_scene.read_text().replace("nx = 21", "nx = -4").replace("radius_um = 1000.0", "radius_um = 0.0")
     )
     done = helio("validate", bad)
     assert done.returncode == 2

@@ -24,6 +24,8 @@ Anew, where a change is meant (say why in the commit; the largest changes are pr
     python tests/inverse/test_frozen.py --renew --inputs       micrographs, too: traced anew, then all results
 """
 
+import os
+import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -282,6 +284,23 @@ def test_results_are_as_they_were(stored, name):
     found = changes(pinned(stored, name), results(stored, name))
     assert found.pop("reason") <= CASES[name].reasons
     assert max(found.values()) <= CASES[name].tolerance, found
+
+
+def test_optimised_program_gives_the_same(tmp_path):
+    """What XLA compiles for users, with optimisation, gives the pinned numbers, too, in a process of its own.
+
+    The other tests compile without it (tests/conftest.py). Catches an optimisation that changes a result.
+    """
+    env = os.environ | {"XLA_FLAGS": "", "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(Path(__file__)), "nearfield", "refine"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, env=env)
+    assert done.returncode == 0, done.stderr
+    assert len(lines := done.stdout.splitlines()) == 2
+    for line in lines:
+        name, *told = line.split()
+        found = dict(zip(told[::2], map(float, told[1::2]), strict=True))
+        assert found.keys() >= {"height", "height_std"} and found.pop("reason") <= CASES[name].reasons
+        assert max(found.values()) <= CASES[name].tolerance, line
 
 
 def test_one_compilation_serves_every_geometry(stored):

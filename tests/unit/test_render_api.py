@@ -69,47 +69,66 @@ def precision(request):
         yield request.param
 
 
-@pytest.mark.parametrize("corrections", ["none", "masking", "plan"])
-def test_transformations(precision, corrections):
-    """jit, grad, jvp, jacfwd, jacrev and vmap run in every number, keep its precision and agree with one another.
+def corrections_of(kind: str) -> Any:
+    """Make the corrections of a kind; a plan is made on the heights of `arguments`."""
+    if kind != "plan":
+        return kind
+    height, moved = arguments()["height"], OPTICS.moved(**MOVES)
+    surface = hx.surface_of_heights(jnp.asarray(height), RASTER)
+    return hx.plan_radiosity(height, surface.normals(np.asarray(moved.beam_shift)), moved, RASTER)
 
-    Catches a conversion to NumPy, a Python branch on a value, a constant of another precision, and a callback that
-    knows no batch.
+
+@pytest.mark.parametrize("kind", ["none", "masking", "plan"])
+def test_transformations(precision, kind):
+    """jit, grad, jvp and vmap run in every number, keep its precision and agree with one another.
+
+    The gradient of the image's sum of squares is multiplied by the direction of the jvp. Catches a conversion to NumPy,
+    a Python branch on a value, a constant of another precision, a derivative that one of the modes lacks, and a callback
+    that knows no batch.
     """
-    plan: Any = corrections
-    if corrections == "plan":
-        values = arguments()
-        moved = OPTICS.moved(**MOVES)
-        surface = hx.surface_of_heights(jnp.asarray(values["height"]), RASTER)
-        plan = hx.plan_radiosity(values["height"], surface.normals(np.asarray(moved.beam_shift)), moved, RASTER)
-    tree = in_precision(arguments(), precision)
+    plan, tree = corrections_of(kind), in_precision(arguments(), precision)
     direction = jax.tree.map(jnp.ones_like, tree)
     tolerance = 1e-4 if precision == "float32" else 1e-10
-    if corrections == "plan":
+    if kind == "plan":
         tolerance = max(tolerance, 1e-6)  # where the series of the radiosity ends
 
     @jax.jit
     def run(tree):
         return image(tree, plan)
 
-    def bright(tree):
-        return jnp.sum(run(tree) ** 2)
-
     def along(s):
         return run(jax.tree.map(lambda a, v: a + s * v, tree, direction))
 
     value, change = jax.jvp(run, (tree,), (direction,))
-    gradient = jax.grad(bright)(tree)
+    gradient = jax.grad(lambda tree: jnp.sum(run(tree) ** 2))(tree)
     for leaf in jax.tree.leaves((value, change, gradient)):
         assert leaf.dtype == precision and np.all(np.isfinite(leaf))
     assert value.shape == (3, *SHAPE)
-    part = {name: tree[name] for name in ("exponent", "optics", "raster", "moves")}
-    backward = jax.jacrev(lambda part: run(tree | part))(part)
-    forward = jax.jacfwd(lambda part: run(tree | part))(part)
-    for a, b in zip(jax.tree.leaves(backward), jax.tree.leaves(forward), strict=True):
-        assert np.abs(a - b).max() <= tolerance * np.abs(b).max()
+    parts = [float(np.sum(np.asarray(leaf, float))) for leaf in jax.tree.leaves(gradient)]
+    expected = 2.0 * np.sum(np.asarray(value, float) * np.asarray(change, float))
+    assert abs(sum(parts) - expected) <= tolerance * np.abs(parts).sum()
     batch = jax.vmap(along)(jnp.asarray([0.0, 1e-3, 2e-3], precision))
     assert batch.dtype == precision and np.abs(batch[0] - value).max() <= tolerance * np.abs(value).max()
+
+
+@pytest.mark.parametrize("kind", ["none", "masking", "plan"])
+def test_jacobians(kind):
+    """jacfwd and jacrev run and agree, pixel by pixel, in the geometry and the exponent; float64.
+
+    Catches a rule that knows no batch of tangents or cotangents, and one that mixes pixels or detectors.
+    """
+    plan = corrections_of(kind)
+    with jax.enable_x64(True):
+        tree = in_precision(arguments(), "float64")
+        part = {name: tree[name] for name in ("exponent", "optics", "raster", "moves")}
+
+        @jax.jit
+        def run(part):
+            return image(tree | part, plan)
+
+        backward, forward = jax.jacrev(run)(part), jax.jacfwd(run)(part)
+    for a, b in zip(jax.tree.leaves(backward), jax.tree.leaves(forward), strict=True):
+        assert np.abs(a - b).max() <= (1e-6 if kind == "plan" else 1e-10) * np.abs(b).max()
 
 
 def test_single_precision_is_close():
