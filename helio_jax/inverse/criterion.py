@@ -73,7 +73,7 @@ class Case(eqx.Module):
         background: counts per pixel [detector].
         unknowns, fixed: of the linearised fit; what depends on the optics is replaced.
         edge_x, edge_y: constant terms of the edges.
-        runs: which edges share the place of a kink, one column a run [edge, run].
+        run: number of the run of edges that share the place of a kink, 0: of none [edge].
         agreement: covariance of prediction errors between pixels of variance 1, along y and along x.
         counted: pixels whose heights count [pixel].
         relief: range of the heights [um].
@@ -90,7 +90,7 @@ class Case(eqx.Module):
     fixed: FixedTerms
     edge_x: EdgeTerms
     edge_y: EdgeTerms
-    runs: Any
+    run: Any
     agreement: tuple[Any, Any]
     counted: Any
     relief: Any
@@ -145,8 +145,7 @@ def pose_case(
     cut = s.jump_limits[-1]
     unknowns, fixed = freeze(problem, state, s.robust_limits[-1], cut)
     found = edges_of(problem, surface, cut)
-    errors = EdgeError.of(surface, *found)
-    runs = (errors.run[:, None] == np.arange(1, errors.run.max(initial=0) + 1)).astype(float)
+    run = EdgeError.of(surface, *found).run
     reach = s.error_reach * float(np.ptp(surface.height))
     n_detectors = optics.n_detectors
     with jax.enable_x64(True):
@@ -156,7 +155,7 @@ def pose_case(
             np.broadcast_to(np.asarray(dose, float), n_detectors).copy(),
             np.broadcast_to(np.asarray(background, float), n_detectors).copy(),
             unknowns, fixed,
-            _edge_terms(problem, surface, 1), _edge_terms(problem, surface, 0), runs,
+            _edge_terms(problem, surface, 1), _edge_terms(problem, surface, 0), run,
             (_agreement(raster.shape[0], reach / raster.dy), _agreement(raster.shape[1], reach / raster.dx)),
             ~border_mask(raster.shape, BORDER_SHARE).ravel(),
             np.asarray(np.ptp(surface.height)), names, s, is_masked,
@@ -220,28 +219,23 @@ def expect_errors(case: Case, optics: Optics) -> Expectation:
     own = jnp.stack(data, 1).reshape(len(data[0]), 3, n)
     of_data = own, by_parameter(data_by, len(own), n)
     edges = [
-        jnp.concatenate([rows, by_parameter(blocks, len(rows))], 1)
+        (*rows, by_parameter(blocks, len(rows[0])))
         for rows, blocks in zip(_edge_rows(case, fixed, raised, scale), edges_by, strict=True)
     ]
-    of_edges = jnp.concatenate(edges)
-    own_border = jnp.concatenate([jnp.diag(case.fixed.border.ravel()), jnp.zeros((n, 2 * n))], 1)
-    of_border = jnp.concatenate([own_border, by_parameter(border_by, n)], 1)
-    priors = jnp.concatenate([jnp.zeros(n), jnp.full(2 * n, SLOPE_STD**-2), jnp.ones(n_parameters)])
-    others = of_border.T @ of_border + jnp.diag(priors)
-    information = _of_data(*of_data) + of_edges.T @ of_edges + others
+    others = sum(_of_edges(rows, axis) for rows, axis in zip(edges, (1, 0), strict=True))
+    others = others + _of_border(case, by_parameter(border_by, n))
+    information = _of_data(*of_data) + others
     wanted = jnp.eye(len(information), n)
     if tilts := tilts_of(case.names):  # above the tilted substrate
         planes = (case.fixed.priors.tilt * case.fixed.position).reshape(2, n)
         wanted = wanted.at[3 * n + np.array(tilts)].set(-planes)
     answer = cho_solve(cho_factor(information, lower=True), wanted)
-    spread = information
-    if case.is_masked:
-        spread = _of_data(*of_data, error_share, case.agreement) + of_edges.T @ of_edges + others
-    if case.runs.shape[1]:
-        common = _common_share(case, floor)
-        together = (jnp.asarray(case.runs) * common[:, None]).T @ of_edges
-        spread = spread - (of_edges * (common**2)[:, None]).T @ of_edges + together.T @ together
+    spread = _of_data(*of_data, error_share, case.agreement) + others if case.is_masked else information
     variance = jnp.sum(answer * (spread @ answer), 0)
+    misfits = jnp.concatenate([_applied(rows, axis, answer) for rows, axis in zip(edges, (1, 0), strict=True)])
+    common = _common_share(case, floor)[:, None] * misfits
+    together = jax.ops.segment_sum(common, case.run, len(common) + 1)
+    variance = variance + jnp.sum(together**2, 0) - jnp.sum(common**2, 0)
     return Expectation(variance.reshape(shape), masked, counts)
 
 
@@ -277,27 +271,53 @@ def _root(square: jax.Array) -> jax.Array:
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
-def _edge_rows(case: Case, fixed: FixedTerms, raised: Any, scale: Any) -> list[jax.Array]:
-    """Compute the derivatives of the edges' residuals by heights and slopes [edge, 3 * pixel], along x and along y."""
-    out, n = [], case.surface.height.size
-    edges = fixed.edges
-    for axis, terms, weight, smooth, by_height in (
-        (1, case.edge_x, edges.inverse_std_x, edges.smooth_x, raised[0]),
-        (0, case.edge_y, edges.inverse_std_y, edges.smooth_y, raised[1]),
+def _edge_rows(case: Case, fixed: FixedTerms, raised: Any, scale: Any) -> list[tuple[jax.Array, jax.Array]]:
+    """Compute the derivatives of the edges' residuals by the heights and by the slopes along the edge [edge, pixel].
+
+    Along x and along y.
+    """
+    out, edges, n = [], fixed.edges, case.surface.height.size
+    for terms, weight, smooth, by_height in (
+        (case.edge_x, edges.inverse_std_x, edges.smooth_x, raised[0]),
+        (case.edge_y, edges.inverse_std_y, edges.smooth_y, raised[1]),
     ):
         of_slope = terms.mean - (terms.mean * (smooth.ravel() / 12.0)) @ terms.second
-        w, none = (scale * weight).reshape(-1, 1), jnp.zeros_like(of_slope)
-        of_height = w * terms.of_height + by_height.reshape(-1, 1) / n  # the last: through the scale of all edges
-        slopes = (-w * of_slope, none) if axis == 1 else (none, -w * of_slope)
-        out.append(jnp.concatenate([of_height, *slopes], 1))
+        w = (scale * weight).reshape(-1, 1)
+        # the last term: through the scale of all edges, which follows the mean height
+        out.append((w * terms.of_height + by_height.reshape(-1, 1) / n, -w * of_slope))
     return out
+
+
+def _of_edges(rows: tuple[jax.Array, jax.Array, jax.Array], axis: int) -> jax.Array:
+    """Compute J' J of rows by heights, by slopes along an axis and by parameters, in the place of all unknowns."""
+    dense, n, m = jnp.concatenate(rows, 1), rows[0].shape[1], rows[2].shape[1]
+    square = dense.T @ dense
+    place = jnp.concatenate([jnp.arange(n), (2 - axis) * n + jnp.arange(n), 3 * n + jnp.arange(m)])
+    return jnp.zeros((3 * n + m, 3 * n + m)).at[jnp.ix_(place, place)].set(square)
+
+
+def _applied(rows: tuple[jax.Array, jax.Array, jax.Array], axis: int, unknowns: jax.Array) -> jax.Array:
+    """Apply such rows to unknowns [unknown, ...]."""
+    (height, slope, parameter), n = rows, rows[0].shape[1]
+    start = (2 - axis) * n
+    return height @ unknowns[:n] + slope @ unknowns[start : start + n] + parameter @ unknowns[3 * n :]
+
+
+def _of_border(case: Case, by_parameter: jax.Array) -> jax.Array:
+    """Compute J' J of the border's heights, with the priors of slopes and parameters."""
+    (n, m), weight = by_parameter.shape, jnp.asarray(case.fixed.border).ravel()
+    diagonal = jnp.concatenate([weight**2, jnp.full(2 * n, SLOPE_STD**-2), jnp.ones(m)])
+    both = jnp.concatenate([weight[:, None] * by_parameter, jnp.zeros((2 * n, m)), by_parameter.T @ by_parameter])
+    parameters = slice(3 * n, None)
+    out = jnp.diag(diagonal).at[:, parameters].add(both)
+    return out.at[parameters, : 3 * n].add(both[: 3 * n].T)
 
 
 def _common_share(case: Case, floor: Any) -> jax.Array:
     """Compute the root of the share of every edge's variance that its run has in common [edge], x then y."""
     kink = jnp.concatenate([case.edge_x.kink, case.edge_y.kink])
     variance = floor**2 + jnp.concatenate([case.edge_x.variance, case.edge_y.variance])
-    return jnp.where(jnp.asarray(case.runs).any(1), kink / jnp.sqrt(12.0 * variance), 0.0)
+    return jnp.where(case.run > 0, kink / jnp.sqrt(12.0 * variance), 0.0)
 
 
 class _Terms(NamedTuple):

@@ -138,7 +138,9 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
     corrections = held.masked, held.moves, held.moved
     with jax.enable_x64(True):
-        factors = expand_form_factors(problem.optics, problem.moves(state.parameters), state.surface.height, corrections)
+        factors = expand_form_factors(
+            problem.optics, problem.moves(state.parameters), state.surface.height, corrections
+        )
         bias = _noise_bias(*slopes, factors.terms[0], problem.shift, inverse_sigma, largest)
     return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
 
