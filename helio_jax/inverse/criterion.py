@@ -211,7 +211,7 @@ def expect_errors(case: Case, optics: Optics) -> Expectation:
     fixed, error_share, floor, masked, counts = _terms_at(case, optics)
     data, data_by, (*edges_by, border_by), raised, scale = block_derivatives(case.unknowns, fixed)
     free = case.unknowns.parameters.free()
-    n, n_parameters, shape = data[0][0].size, len(case.names), case.surface.height.shape
+    n, shape = data[0][0].size, case.surface.height.shape
 
     def by_parameter(blocks: dict[str, Any], *rows: int) -> jax.Array:
         return jnp.concatenate([blocks[name].reshape(*rows, -1) for name in free], -1)

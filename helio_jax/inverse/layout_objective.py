@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.layout import Layout
-from helio_jax.forward.optics import Optics, cast
+from helio_jax.forward.optics import Optics
 from helio_jax.inverse.criterion import Case, expect_errors
 
 
@@ -29,23 +30,25 @@ class Ties(eqx.Module):
         working_distance: stated [um].
     """
 
-    base: Any
-    matrix: Any
-    total_area: Any
-    working_distance: Any
+    base: np.ndarray
+    matrix: np.ndarray
+    total_area: float
+    working_distance: float
 
-    def layout(self, unknowns: Any) -> Layout:
-        """Make the layout of unknowns."""
-        everything = self.base + self.matrix @ unknowns
-        polar, azimuth, log_area = everything[:-1].reshape(3, -1)
-        return Layout(
-            polar, azimuth, self.total_area * jax.nn.softmax(log_area), self.working_distance * jnp.exp(everything[-1])
-        )
-
-    def numbers(self, unknowns: np.ndarray) -> Layout:
+    def layout(self, unknowns: np.ndarray) -> Layout:
         """Make the layout of unknowns as NumPy arrays."""
         with jax.enable_x64(True):
-            return jax.tree.map(np.asarray, self.layout(jnp.asarray(unknowns)))
+            return jax.tree.map(np.asarray, _layout_of(*self._at(unknowns)))
+
+    def _at(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vector of the layout, and what it refers to."""
+        return self.base + self.matrix @ unknowns, np.array([self.total_area, self.working_distance])
+
+
+def _layout_of(vector: Any, scale: Any) -> Layout:
+    """Make a layout of its vector, and total area [um^2] and stated working distance [um]."""
+    polar, azimuth, log_area = vector[:-1].reshape(3, -1)
+    return Layout(polar, azimuth, scale[0] * jax.nn.softmax(jnp.asarray(log_area)), scale[1] * jnp.exp(vector[-1]))
 
 
 class Limits(eqx.Module):
@@ -107,58 +110,80 @@ class Goal(eqx.Module):
 
     def assess_optics(self, optics: Optics) -> Assessment:
         """Assess optics, whose distance to the substrate is each sample's, as NumPy arrays [sample]."""
-        with jax.enable_x64(True):
-            at = [replace(optics, sample_distance=optics.working_distance + drop) for drop in self.drops]
-            return _stacked([_assessed(case, cast(o, jnp.float64)) for case, o in zip(self.cases, at, strict=True)])
+        optics = jax.tree.map(lambda a: np.asarray(a, np.float64), optics)
+        at = [replace(optics, sample_distance=optics.working_distance + drop) for drop in self.drops]
+        return self._assessed(at, 0.0)[0]
 
     def assess(self, ties: Ties, unknowns: np.ndarray) -> Assessment:
         """Assess a layout, as NumPy arrays [sample]."""
-        with jax.enable_x64(True):
-            pairs = zip(self.cases, self.drops, strict=True)
-            return _stacked([_layout_assessed(jnp.asarray(unknowns), ties, *pair) for pair in pairs])
+        return self._assessed(self._optics(ties, unknowns), 0.0)[0]
 
     def value_and_slope(self, ties: Ties, masked_weight: float, unknowns: np.ndarray) -> tuple[float, np.ndarray]:
         """Compute the mean over the samples of log(variance) + weight * masked share, and its gradient [unknown]."""
+        at = self._optics(ties, unknowns)
+        found, slopes = self._assessed(at, masked_weight)
         with jax.enable_x64(True):
-            at, weight = jnp.asarray(unknowns), jnp.asarray(masked_weight, jnp.float64)
-            found = [_goal(at, ties, c, d, weight) for c, d in zip(self.cases, self.drops, strict=True)]
-            return float(np.mean([v for v, _ in found])), np.mean([np.asarray(slope) for _, slope in found], 0)
+            by_vector = [
+                np.asarray(_pulled_back(*ties._at(unknowns), self.beam_shift, np.asarray(drop, float), slope))
+                for drop, slope in zip(self.drops, slopes, strict=True)
+            ]
+        value = float(np.mean(np.log(found.variance) + masked_weight * found.masked))
+        return value, ties.matrix.T @ np.mean(by_vector, 0)
+
+    def _optics(self, ties: Ties, unknowns: np.ndarray) -> list[Optics]:
+        with jax.enable_x64(True):
+            at = [_optics_of(*ties._at(unknowns), self.beam_shift, np.asarray(d, float)) for d in self.drops]
+            return jax.tree.map(np.asarray, at)
+
+    def _assessed(self, optics: list[Optics], masked_weight: float) -> tuple[Assessment, list[Optics]]:
+        """Assess optics, one for each sample; return the gradients of the goal by each one's numbers, too."""
+        weight = np.asarray(masked_weight, float)
+        with jax.enable_x64(True):
+            found = [
+                jax.tree.map(np.asarray, _assessed_with_slope(o, case, weight))
+                for case, o in zip(self.cases, optics, strict=True)
+            ]
+        parts = [assessment for (_, assessment), _ in found]
+        return Assessment(*map(np.array, zip(*parts, strict=True))), [slope for _, slope in found]
 
 
-def _stacked(parts: list[Assessment]) -> Assessment:
-    return Assessment(*(np.array([float(v) for v in values]) for values in zip(*parts, strict=True)))
+@compiled
+def _assessed_with_slope(optics: Optics, case: Case, masked_weight: Any) -> Any:
+    """Assess optics; return the goal, too, and its gradient. Everything goes through here: it compiles for long."""
 
+    def goal(optics: Optics) -> tuple[Any, Assessment]:
+        found = assess(case, optics)
+        return jnp.log(found.variance) + masked_weight * found.masked, found
 
-_assessed = eqx.filter_jit(assess)
+    return jax.value_and_grad(goal, has_aux=True)(optics)
 
 
 @eqx.filter_jit
-def _layout_assessed(unknowns: Any, ties: Ties, case: Case, drop: Any) -> Assessment:
-    return assess(case, ties.layout(unknowns).optics(case.fixed.beam_shift, drop))
+def _optics_of(vector: Any, scale: Any, beam_shift: Any, drop: Any) -> Optics:
+    return _layout_of(vector, scale).optics(beam_shift, drop)
 
 
 @eqx.filter_jit
-@eqx.filter_value_and_grad
-def _goal(unknowns: Any, ties: Ties, case: Case, drop: Any, masked_weight: Any) -> Any:
-    found = assess(case, ties.layout(unknowns).optics(case.fixed.beam_shift, drop))
-    return jnp.log(found.variance) + masked_weight * found.masked
+def _pulled_back(vector: Any, scale: Any, beam_shift: Any, drop: Any, slope: Optics) -> Any:
+    """Compute the gradient by the vector of a layout from that by its optics."""
+    return jax.vjp(lambda v: _layout_of(v, scale).optics(beam_shift, drop), jnp.asarray(vector))[1](slope)[0]
 
 
 def room_of(ties: Ties, unknowns: np.ndarray, beam_shift: Any, limits: Limits) -> np.ndarray:
     """Compute by how much a layout keeps every limit [limit], mm; negative: broken."""
     with jax.enable_x64(True):
-        return np.asarray(_room(jnp.asarray(unknowns), ties, jnp.asarray(beam_shift), limits))
+        return np.asarray(_room(*ties._at(unknowns), beam_shift, limits))
 
 
 def room_slope_of(ties: Ties, unknowns: np.ndarray, beam_shift: Any, limits: Limits) -> np.ndarray:
     """Compute the derivative of `room_of` [limit, unknown]."""
     with jax.enable_x64(True):
-        return np.asarray(_room_slope(jnp.asarray(unknowns), ties, jnp.asarray(beam_shift), limits))
+        return np.asarray(_room_slope(*ties._at(unknowns), beam_shift, limits)) @ ties.matrix
 
 
 @eqx.filter_jit
-def _room(unknowns: Any, ties: Ties, beam_shift: Any, limits: Limits) -> jax.Array:
-    layout = ties.layout(unknowns)
+def _room(vector: Any, scale: Any, beam_shift: Any, limits: Limits) -> jax.Array:
+    layout = _layout_of(vector, scale)
     to_edge = jnp.minimum(limits.plate_radius, 1e9) - layout.reach(limits.thickness)
     return 1e-3 * (jnp.concatenate([layout.gaps(beam_shift, limits.clearance), to_edge]) - limits.wall)
 

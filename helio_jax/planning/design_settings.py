@@ -46,8 +46,8 @@ class DesignSettings(Settings):
     pixels: int = Field(default=13, ge=7, le=31)
     """Pixels along the longer side of the raster on which a sample is assessed; the field is that of its scene."""
     starts: int = Field(default=2, ge=1, le=100)
-    """Random starts beside rings, symmetric pairs and the scene's layout; and how many searches of each number and weight
-    begin at the best starts without symmetry, beside one at the best symmetric pairs."""
+    """Random starts, beside rings, symmetric pairs and the scene's layout. So many searches, of each number and weight,
+    begin at the best starts without symmetry, and one at the best symmetric pairs."""
     steps: int = Field(default=30, ge=1, le=1000)
     """Most steps of a search."""
     seed: int = Field(default=1, ge=0, lt=2**63)

@@ -112,7 +112,7 @@ def _goal(scenes: Sequence[SceneFile], scene: SceneFile, instrument: Instrument,
 
 
 def _ties(base: np.ndarray, matrix: np.ndarray, area: float, instrument: Instrument) -> Ties:
-    return Ties(base, matrix, np.asarray(area), np.asarray(instrument.working_distance))
+    return Ties(base, matrix, area, instrument.working_distance)
 
 
 def _limits(s: DesignSettings) -> Limits:
@@ -129,7 +129,7 @@ def _ranges(s: DesignSettings, working_distance: float) -> Ranges:
 
 def _instrument_of(scene: SceneFile, incidence_deg: float, ties: Ties, x: np.ndarray, drop: float = 0.0) -> Instrument:
     """Make the instrument of a layout, apertures by azimuth, the substrate `drop` below the nominal spot [um]."""
-    layout, detectors = ties.numbers(x), []
+    layout, detectors = ties.layout(x), []
     w = float(layout.working_distance)
     for k, i in enumerate(np.argsort(np.mod(layout.azimuth, 2.0 * np.pi), kind="stable"), 1):
         polar, azimuth = float(layout.polar[i]), math.remainder(float(layout.azimuth[i]), 2.0 * math.pi)
