@@ -15,16 +15,9 @@ from helio_jax.figures.instrument_page import draw_instrument
 from helio_jax.formats.safe import atomic_path
 from helio_jax.formats.toml import write_calibrated
 from helio_jax.instrument import Instrument
-from helio_jax.planning.design_settings import MAX_KEPT
 
 SAME = 3e-3
 """Layouts of one number of apertures whose results differ by less than this share are one."""
-FILES = (
-    "design.json",
-    "pareto.png",
-    *(f"layout_{i}.{suffix}" for i in range(1, MAX_KEPT + 1) for suffix in ("toml", "png")),
-)
-"""What `Design.write` may write."""
 
 
 @dataclass(frozen=True)
