@@ -157,7 +157,7 @@ def main() -> None:
             variance = float(np.exp(np.mean(np.log(ratios[i]))))
             own, of_bshem = np.sum(masked[i], axis=0)
             share = own / of_bshem if of_bshem else np.nan
-            is_reached = variance <= WANTED_VARIANCE or share <= WANTED_MASKED
+            is_reached = bool(variance <= WANTED_VARIANCE or share <= WANTED_MASKED)
             value = f"variance {variance:.2f}, masked area {share:.2f}"
             target = f"<= {WANTED_VARIANCE:g} or <= {WANTED_MASKED:g}"
             keep(row("3", f"layout {i}, all unseen samples", value, target, None if given.tiny else is_reached))

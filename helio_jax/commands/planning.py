@@ -175,9 +175,8 @@ def design(
     if as_json:
         print(json.dumps({"files": [str(file) for file in files], **found.as_dict()}))
         return
-    print(
-        f"{'layout':>6} {'apertures':>15} {'heights':>10} {'variance':>8} {'masked':>7} {'counts':>6}  polar@azimuth [deg]"
-    )
+    head = f"{'layout':>6} {'apertures':>15} {'heights':>10} {'variance':>8} {'masked':>7} {'counts':>6}"
+    print(f"{head}  polar@azimuth [deg]")
     for i, p in enumerate((found.reference, *found.proposals)):
         aims = " ".join(f"{polar:.0f}@{azimuth:+.0f}" for polar, azimuth in p.angles_deg)
         print(

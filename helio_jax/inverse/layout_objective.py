@@ -81,13 +81,14 @@ class Assessment(NamedTuple):
     counts: Any
 
 
-def assess(case: Case, optics: Optics) -> Assessment:
-    """Assess optics on one sample.
+def assess(case: Case, optics: Optics, is_smooth: Any = False) -> Assessment:
+    """Assess optics on one sample; `is_smooth` as in `expect_errors`.
 
-    A height that no image determines counts with the sample's relief as its standard deviation: nobody knows less.
+    A height that no image determines counts with the sample's relief as its standard deviation, or a pixel's size where
+    that is more: nobody knows less.
     """
-    found = expect_errors(case, optics)
-    own, most = found.variance.ravel(), jnp.maximum(case.relief, 1.0) ** 2
+    found = expect_errors(case, optics, is_smooth)
+    own, most = found.variance.ravel(), jnp.maximum(case.relief, case.fixed.dx) ** 2
     limited = jnp.where(case.counted, own * most / (own + most), 0.0)
     return Assessment(jnp.sum(limited) / jnp.sum(case.counted), found.masked, found.counts)
 
@@ -112,16 +113,16 @@ class Goal(eqx.Module):
         """Assess optics, whose distance to the substrate is each sample's, as NumPy arrays [sample]."""
         optics = jax.tree.map(lambda a: np.asarray(a, np.float64), optics)
         at = [replace(optics, sample_distance=optics.working_distance + drop) for drop in self.drops]
-        return self._assessed(at, 0.0)[0]
+        return self._assessed(at, 0.0, is_smooth=False)[0]
 
     def assess(self, ties: Ties, unknowns: np.ndarray) -> Assessment:
         """Assess a layout, as NumPy arrays [sample]."""
-        return self._assessed(self._optics(ties, unknowns), 0.0)[0]
+        return self._assessed(self._optics(ties, unknowns), 0.0, is_smooth=False)[0]
 
     def value_and_slope(self, ties: Ties, masked_weight: float, unknowns: np.ndarray) -> tuple[float, np.ndarray]:
-        """Compute the mean over the samples of log(variance) + weight * masked share, and its gradient [unknown]."""
+        """Compute the mean over the samples of log(variance) + weight * masked share, smoothed, and its gradient."""
         at = self._optics(ties, unknowns)
-        found, slopes = self._assessed(at, masked_weight)
+        found, slopes = self._assessed(at, masked_weight, is_smooth=True)
         with jax.enable_x64(True):
             by_vector = [
                 np.asarray(_pulled_back(*ties._at(unknowns), self.beam_shift, np.asarray(drop, float), slope))
@@ -135,12 +136,14 @@ class Goal(eqx.Module):
             at = [_optics_of(*ties._at(unknowns), self.beam_shift, np.asarray(d, float)) for d in self.drops]
             return jax.tree.map(np.asarray, at)
 
-    def _assessed(self, optics: list[Optics], masked_weight: float) -> tuple[Assessment, list[Optics]]:
+    def _assessed(
+        self, optics: list[Optics], masked_weight: float, *, is_smooth: bool
+    ) -> tuple[Assessment, list[Optics]]:
         """Assess optics, one for each sample; return the gradients of the goal by each one's numbers, too."""
-        weight = np.asarray(masked_weight, float)
+        how = np.asarray(masked_weight, float), np.asarray(is_smooth)
         with jax.enable_x64(True):
             found = [
-                jax.tree.map(np.asarray, _assessed_with_slope(o, case, weight))
+                jax.tree.map(np.asarray, _assessed_with_slope(o, case, *how))
                 for case, o in zip(self.cases, optics, strict=True)
             ]
         parts = [assessment for (_, assessment), _ in found]
@@ -148,11 +151,11 @@ class Goal(eqx.Module):
 
 
 @compiled
-def _assessed_with_slope(optics: Optics, case: Case, masked_weight: Any) -> Any:
+def _assessed_with_slope(optics: Optics, case: Case, masked_weight: Any, is_smooth: Any) -> Any:
     """Assess optics; return the goal, too, and its gradient. Everything goes through here: it compiles for long."""
 
     def goal(optics: Optics) -> tuple[Any, Assessment]:
-        found = assess(case, optics)
+        found = assess(case, optics, is_smooth)
         return jnp.log(found.variance) + masked_weight * found.masked, found
 
     return jax.value_and_grad(goal, has_aux=True)(optics)
