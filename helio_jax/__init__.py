@@ -87,6 +87,7 @@ forward/              heights and optics -> expected counts, differentiable (JAX
   horizon             horizon search along a march over the surface
   masking             masked part of each form factor: the shadow mask of a reconstruction
   radiosity           multiple scattering by radiosity
+  layout              layouts of apertures as optics; walls between them
   readout             Readout: gain, offset, drift, pedestal, scan lines
   render              hx.render: the render model; the single-scattering law
 inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
@@ -123,6 +124,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   steps               one least-squares step: fixed terms, solve
   solver              inexact Gauss-Newton; the only door to optimistix
   fisher              hx.fisher: what an experiment would determine
+  criterion           variance of the heights as a differentiable function of the optics
+  layout_objective    what a search of aperture layouts minimises
   fit                 outer iterations of the fit
   convergence         convergence error and status of a fit
   posterior           Laplace posterior of heights and slopes
@@ -161,10 +164,13 @@ alignment/            rotated scans onto one raster; orientation of arrays
   correlate           normalised cross-correlation with missing data
   resample            images at other positions; several scans on one raster
   orientation         rotated, mirrored and reordered images; what a file leaves open
-planning/             how long an acquisition takes and what it sees: numbers in, numbers out
+planning/             how long an acquisition takes and what it sees, layouts of apertures: numbers in, numbers out
   timing              time of an acquisition; overhead of a measured scan
   coverage            field of view after rotation
   stage               rotation centre of a stage; windows that keep a region in view
+  design_settings     the [design] table
+  starts              where searches of aperture layouts start; symmetric pairs
+  search              local minimum with constraints
 scores/               errors against something known
   settings            the [truth] table
   metrics             scores of a reconstruction against the true surface
@@ -222,6 +228,7 @@ figures/              pictures
   spot                the beam's spot
   sweep               scores of a study
   planning            error against time of a plan
+  design              error against masked area of a design
   pick                window for control points
 formats/              the only door to files
   hdf5                reads and writes stacks and reconstructions (HDF5)
@@ -279,6 +286,8 @@ workflows/            what joins the stages
   study               sweeps of scene values
   study_file          the study file
   plan                hx.plan: time and expected errors of acquisitions
+  design              hx.design: layouts of apertures
+  design_result       layouts that a design has found: records, ranking, files
   plan_windows        hx.plan_windows: rotation centre and stage windows
   export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
@@ -297,7 +306,7 @@ commands/             the command line; no logic of its own
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  planning            plan, plan-windows
+  planning            plan, plan-windows, design
   scenes              scenes, init, validate, schema
   about               doctor, fetch-data, cite
 ```
@@ -332,6 +341,7 @@ _HOME = {
     "measure_profile": "measure.profiles",
     "measure_step_height": "measure.step_height",
     "measure_texture": "measure.texture",
+    "design": "workflows.design",
     "plan": "workflows.plan",
     "plan_windows": "workflows.plan_windows",
     "load_scene": "workflows.scene_file",

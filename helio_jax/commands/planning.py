@@ -1,4 +1,4 @@
-"""Commands before a measurement: plan, plan-windows. They only parse, call, print."""
+"""Commands before a measurement: plan, plan-windows, design. They only parse, call, print."""
 
 import json
 from dataclasses import replace
@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import CSV, FIGURE, AsJson, SceneArg, app, say
-from helio_jax.commands.door import Reads
+from helio_jax.commands.app import CSV, FIGURE, AsJson, SceneArg, Set, app, say, scene_overrides
+from helio_jax.commands.door import Reads, Writes
+
+DESIGN = (
+    "design.json",
+    "pareto.png",
+    *(f"layout_{i}.{suffix}" for i in range(1, 13) for suffix in ("toml", "png")),
+)
+"""What `design` may write in its folder (workflows/design_result.py); as many layouts as [design] keep may be."""
 
 
 def _numbers(option: str, text: str | None, whole: bool = False) -> list[float]:
@@ -135,3 +142,45 @@ def plan_windows(
         ends = "".join(f"{row[f'{n}_{e}_um']:>11.1f} um" for n in names for e in ("low", "high"))
         print(f"{row['rotation_deg']:>8g} deg{ends}")
     print(f"all windows see {found.seen_by_all:.0%} of the first one")
+
+
+@app.command()
+def design(
+    scene: SceneArg,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder: table, Pareto plot, instrument files and drawings."),
+        Writes(within=DESIGN),
+    ],
+    sample: Annotated[
+        list[Path] | None,
+        typer.Option(help="Scene whose sample counts, too (repeat).", metavar="SCENE"),
+        Reads(names_files=True),
+    ] = None,
+    apertures: Annotated[str | None, typer.Option(help="Numbers of apertures, separated by commas.")] = None,
+    starts: Annotated[int | None, typer.Option(help="Searches from starts without symmetry.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the random starts.")] = None,
+    changes: Set = None,
+    as_json: AsJson = False,
+) -> None:
+    """Design layouts of apertures: least expected errors of the heights, least masked area, against the scene's."""
+    from helio_jax.workflows.design import design as design_layouts
+    from helio_jax.workflows.scene_file import load_scene
+
+    numbers = _numbers("--apertures", apertures, whole=True) or None
+    options = {"design.apertures": numbers, "design.starts": starts, "design.seed": seed}
+    loaded = load_scene(scene, scene_overrides(changes, **options))
+    found = design_layouts(loaded, samples=[load_scene(path) for path in sample or ()], say=say)
+    files = found.write(output)
+    if as_json:
+        print(json.dumps({"files": [str(file) for file in files], **found.as_dict()}))
+        return
+    head = f"{'layout':>6} {'apertures':>15} {'heights':>10} {'variance':>8} {'masked':>7} {'counts':>6}"
+    print(f"{head}  polar@azimuth [deg]")
+    for i, p in enumerate((found.reference, *found.proposals)):
+        aims = " ".join(f"{polar:.0f}@{azimuth:+.0f}" for polar, azimuth in p.angles_deg)
+        print(
+            f"{i or '-':>6} {p.label:>15} {p.height_std_um:>7.3g} um {p.variance_ratio:>8.2f} {p.masked:>7.2%} "
+            f"{p.count_ratio:>6.2f}  {aims}"
+        )
+    print(f"files in {output}: {', '.join(file.name for file in files)}")

@@ -275,26 +275,33 @@ def plate(
         Reads(names_files=True),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="File to write (.obj)."), Writes("OBJ, which names parts", (".obj",))
+        Path,
+        typer.Option("--output", "-o", help="File to write: .obj (um), or .stl (mm) to print or mill."),
+        Writes("OBJ, which names parts, or STL", (".obj", ".stl")),
     ],
     thickness_um: Annotated[float, typer.Option(help="Thickness of the plate [um].")],
     radius_um: Annotated[float | None, typer.Option(help="Radius of the disc [um] (default: all apertures).")] = None,
     channel_deg: Annotated[
         float | None, typer.Option(help="Angle of the channels to the plate normal [deg] (default: to the spot).")
     ] = None,
+    conical: Annotated[
+        bool, typer.Option("--conical", help="Channels widen upwards as seen from the nominal spot (default: uniform).")
+    ] = False,
     changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj)."""
+    """Make a watertight mesh of a plate with channels for an instrument's apertures and pinhole (.obj, .stl)."""
     from helio_jax.formats.safe import atomic_path
-    from helio_jax.scene.drill import drill_plate
+    from helio_jax.scene.drill import STL_UNIT, drill_plate
     from helio_jax.workflows.scene_file import load_instrument
 
     angle = None if channel_deg is None else math.radians(channel_deg)
-    found = drill_plate(load_instrument(instrument, scene_overrides(changes)), thickness_um, radius_um, angle)
+    loaded, is_stl = load_instrument(instrument, scene_overrides(changes)), output.suffix.lower() == ".stl"
+    found = drill_plate(loaded, thickness_um, radius_um, angle, is_conical=conical)
     with atomic_path(output) as part:
         about = f"made by helio plate from {instrument.name}, {thickness_um:g} um thick; units: um"
-        part.write_text(found.obj(about), encoding="utf-8")
-    tables, n_faces, n_ends = found.tables(output.name), len(found.faces), len(found.ends)
-    record = {"file": str(output), "triangles": n_faces, "channels": n_ends, "tables": tables}
-    print_result(as_json, record, f"{output}: {n_faces} triangles, {n_ends} channels; in a scene:\n", tables)
+        part.write_bytes(found.stl() if is_stl else found.obj(about).encode())
+    tables = found.tables_of_stl(output.name) if is_stl else found.tables(output.name)
+    n_faces, n_ends, unit = len(found.faces), len(found.ends), STL_UNIT if is_stl else "um"
+    record = {"file": str(output), "triangles": n_faces, "channels": n_ends, "unit": unit, "tables": tables}
+    print_result(as_json, record, f"{output}: {n_faces} triangles, {n_ends} channels, in {unit}; in a scene:\n", tables)

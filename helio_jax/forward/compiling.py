@@ -32,16 +32,18 @@ def _options() -> dict[str, Any]:
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function at its first call for each structure and shape of its arguments; decorator.
 
-    Arrays, NumPy's too, are traced; everything else is static.
+    Arrays, NumPy's too, are traced; everything else is static. Within another JAX transformation the options are those
+    of the outermost one.
     """
 
     @cache
-    def jitted() -> Callable[P, R]:
-        return eqx.filter_jit(function, **_options())
+    def jitted(*, is_outermost: bool) -> Callable[P, R]:
+        return eqx.filter_jit(function, **(_options() if is_outermost else {}))
 
     @wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
-        return jitted()(*args, **kwargs)
+        is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return jitted(is_outermost=not is_traced)(*args, **kwargs)
 
     return wrapped
 

@@ -41,7 +41,7 @@ class ModelError:
         """Average white noise to errors of variance 1 that agree between neighbours; its own transpose."""
         lengths = [n / self.stride for n in self.length]
         smooth = gaussian_filter(white, lengths, axes=(-2, -1))
-        return smooth / np.prod([_averaged_std(n) for n in lengths])
+        return smooth / np.prod([averaged_std(n) for n in lengths])
 
     def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
         """Draw errors of the data [detector * y * x, sample], in deviations assumed of them.
@@ -61,7 +61,7 @@ class ModelError:
         return np.einsum("pkyx,qkyx->pq", both, both)
 
 
-def _averaged_std(length: float) -> float:
+def averaged_std(length: float) -> float:
     """Compute the standard deviation of white noise after a Gaussian average over `length` pixels."""
     impulse = np.zeros(2 * int(4.0 * length + 1.0) + 1)
     impulse[impulse.size // 2] = 1.0

@@ -82,6 +82,33 @@ def fisher(
 
     Source: Cramer-Rao bound with Gaussian priors; sampling as in `posterior.sample_posterior`.
     """
+    problem, state = pose_experiment(
+        height, optics, raster, dose, background, uncertainty, settings, corrections, albedo
+    )
+    posterior = posterior_at(problem, with_responses(problem, state), n_samples)
+    matrix, units = units_of(problem, posterior.names)
+    deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance @ matrix.T))
+    numbers, priors = tuple(map(str, range(optics.n_detectors))), np.linalg.norm(matrix, axis=1)
+    parameters = {
+        plain_name(name, numbers): (float(std), float(prior), unit)
+        for name, std, prior, unit in zip(posterior.names, deviation, priors, units, strict=True)
+        if prior > 0.0
+    }
+    return Information(posterior.height_std, parameters, posterior)
+
+
+def pose_experiment(
+    height: Any,
+    optics: Optics,
+    raster: Raster,
+    dose: Any,
+    background: Any,
+    uncertainty: Uncertainty | None,
+    settings: ReconstructSettings | None,
+    corrections: Corrections | Literal["none", "masking", "radiosity"],
+    albedo: Any,
+) -> tuple[FitProblem, FitState]:
+    """Pose the fit to the expected micrographs of an assumed surface, its state being the truth; as `fisher`."""
     settings = settings or ReconstructSettings()
     shift = np.asarray(optics.beam_shift)
     with jax.enable_x64(True):
@@ -99,17 +126,7 @@ def fisher(
     counts = dose * np.maximum(probability, 0.0) + np.broadcast_to(background, len(probability))[:, None, None]
     variance = np.maximum(counts, 1.0) / dose**2
     problem = FitProblem.of(probability, variance, optics, raster, surface, settings, uncertainty=uncertainty)
-    state = set_corrections(problem, FitState.at(problem, surface), corrections, surface)
-    posterior = posterior_at(problem, with_responses(problem, state), n_samples)
-    matrix, units = units_of(problem, posterior.names)
-    deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance @ matrix.T))
-    numbers, priors = tuple(map(str, range(optics.n_detectors))), np.linalg.norm(matrix, axis=1)
-    parameters = {
-        plain_name(name, numbers): (float(std), float(prior), unit)
-        for name, std, prior, unit in zip(posterior.names, deviation, priors, units, strict=True)
-        if prior > 0.0
-    }
-    return Information(posterior.height_std, parameters, posterior)
+    return problem, set_corrections(problem, FitState.at(problem, surface), corrections, surface)
 
 
 def posterior_std(height: Any, optics: Optics, raster: Raster, dose: Any, **options: Any) -> np.ndarray:

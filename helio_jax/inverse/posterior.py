@@ -231,7 +231,7 @@ class _Rows:
 
 
 @compiled
-def _derivatives(unknowns: Unknowns, fixed: FixedTerms):
+def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
     """Compute the blocks of the Jacobian.
 
     In this order: data by surface field, data, edges and border by parameter, edges by mean height; and the factor of
@@ -261,7 +261,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     shape, edges = fixed.border.shape, fixed.edges
     pixel = np.arange(fixed.border.size).reshape(shape)
     with jax.enable_x64(True):
-        found = jax.tree.map(np.asarray, _derivatives(unknowns, fixed))
+        found = jax.tree.map(np.asarray, block_derivatives(unknowns, fixed))
     data, data_by, others_by, raised, scale = found
     free = unknowns.parameters.free()
     rows = _Rows(pixel.size)

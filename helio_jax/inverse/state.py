@@ -158,7 +158,7 @@ def set_corrections(problem: FitProblem, state: FitState, corrections: Correctio
     held = _held(problem, corrections, surface, state.parameters)
     if len(held.moved):
         with jax.enable_x64(True):
-            moves = _masked_moves(cast(surface, jnp.float64), problem.optics, problem.raster, held.moved)
+            moves = masked_moves(cast(surface, jnp.float64), problem.optics, problem.raster, held.moved)
         held = replace(held, moves=np.asarray(moves))
     return replace(state, held=held)
 
@@ -197,7 +197,7 @@ def moved_optics(optics: Optics, moves: Any) -> Optics:
 
 
 @compiled
-def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
+def masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
     """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
 
     Each aperture depends on its own polar angle and azimuth only, so that one derivative serves all detectors.

@@ -35,7 +35,7 @@ from helio_jax.robust import cauchy_weight
 
 MODE_BLOCK = 4
 """Common modes and anchors are filled up to a multiple of this."""
-_NOISY = 3.0
+NOISY = 3.0
 """Largest standard deviation that slopes are credited with, in that of a pixel with median noise."""
 
 
@@ -49,7 +49,7 @@ def _whitening(shape: tuple[int, int], dx: float, dy: float, slope_noise: float)
 
 
 @compiled
-def _form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormFactors:
+def expand_form_factors(optics: Optics, moved: Any, height: Any, held: tuple) -> FormFactors:
     """Expand the visible form factors about heights [y, x] and moves [move, detector]."""
     masked, masked_moves, masked_at = held
 
@@ -134,16 +134,18 @@ class PixelTerms(NamedTuple):
 def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerms:
     """Expand form factors and estimate the noise bias at a state; `limit` as in `freeze`."""
     held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
-    largest = _NOISY * noise * _steepness(*slopes)
+    largest = NOISY * noise * steepness(*slopes)
     inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
     corrections = held.masked, held.moves, held.moved
     with jax.enable_x64(True):
-        factors = _form_factors(problem.optics, problem.moves(state.parameters), state.surface.height, corrections)
+        factors = expand_form_factors(
+            problem.optics, problem.moves(state.parameters), state.surface.height, corrections
+        )
         bias = _noise_bias(*slopes, factors.terms[0], problem.shift, inverse_sigma, largest)
     return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
 
 
-def _steepness(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
+def steepness(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
     """Compute by how much more the slopes of a facet follow its normal than those of a level one [y, x]."""
     return 1.0 + slope_x**2 + slope_y**2
 
@@ -186,7 +188,7 @@ def freeze(
         smoothness_weight(along_x.joined, slope_x, noise, 1),
         smoothness_weight(along_y.joined, slope_y, noise, 0),
     )
-    free = noise * _steepness(slope_x, slope_y)
+    free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))
     whitening = _whitening(problem.raster.shape, dx, dy, noise)
     unknowns = Unknowns(

@@ -6,6 +6,7 @@ at the upper end of every channel.
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +15,13 @@ import numpy as np
 from helio_jax.detector import Aperture
 from helio_jax.errors import MissingDependencyError, SceneError
 from helio_jax.instrument import Instrument
+from helio_jax.scene.meshes import stl_bytes
+from helio_jax.settings import UNITS_UM
 
 SEGMENTS = 128
 """Sides of the polygon, of equal area, that represents an ellipse or a disc."""
+STL_UNIT = "mm"
+"""Unit of an STL file, which states none itself."""
 SOLID_NAME = "plate_solid"
 """Part of the OBJ file that scatters."""
 _RADIUS_RATIO = 1.25
@@ -32,11 +37,13 @@ class DrilledPlate:
     Attributes:
         vertices, faces: of the solid, watertight [n, 3], [m, 3].
         ends: rim of the upper end of every detector's channel, counter-clockwise from above [SEGMENTS, 3].
+        openings: the ellipse of each of these rims.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     ends: dict[str, np.ndarray]
+    openings: Mapping[str, Aperture]
 
     def obj(self, comment: str = "") -> str:
         """Format as an OBJ file: the solid, and for each detector a part of its name."""
@@ -49,8 +56,27 @@ class DrilledPlate:
             start += len(vertices)
         return "\n".join(lines) + "\n"
 
+    def stl(self) -> bytes:
+        """Format the solid as a binary STL file in mm, the unit of programs that print or mill it; without the ends."""
+        return stl_bytes(self.vertices / UNITS_UM[STL_UNIT], self.faces)
+
+    def tables_of_stl(self, file: str) -> str:
+        """Format the tables of a scene that uses the STL file: ellipses at the upper ends count the atoms."""
+        text, top = (
+            [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "{STL_UNIT}"'],
+            self.vertices[:, 2].max(),
+        )
+        for name, a in self.openings.items():
+            (x, y), (first, second) = a.center, a.semi_axes
+            text.append(
+                f"[[detector]]\nname = {json.dumps(name)}\ncenter_um = [{x:.9g}, {y:.9g}]\n"
+                f"axes_um = [{2.0 * first:.9g}, {2.0 * second:.9g}]\nrotation_deg = {math.degrees(a.rotation):.9g}\n"
+                f"height_um = {top:.9g}"
+            )
+        return "\n\n".join([*text, '[trace]\nestimator = "analog"'])
+
     def tables(self, file: str) -> str:
-        """Format the tables of a scene that uses the file."""
+        """Format the tables of a scene that uses the OBJ file."""
         text = [f'[plate]\nkind = "mesh"\nfile = {json.dumps(file)}\nunit = "um"\npart = "{SOLID_NAME}"']
         text += [f"[[detector]]\nname = {json.dumps(name)}\npart = {json.dumps(name)}" for name in self.ends]
         return "\n\n".join([*text, '[trace]\nestimator = "analog"'])
@@ -58,56 +84,91 @@ class DrilledPlate:
 
 @dataclass(frozen=True)
 class _Bore:
-    """A straight channel: its outline in the underside [n, 2], and its lateral shift (x, y) per um of height."""
+    """A straight channel.
+
+    Attributes:
+        name: of its detector; "": the pinhole's.
+        opening: its ellipse in the underside.
+        outline: that ellipse as a polygon [n, 2].
+        lean: lateral shift (x, y) per um of height.
+        widening: growth of the ellipse's size per um of height, relative.
+    """
 
     name: str
+    opening: Aperture
     outline: np.ndarray
     lean: tuple[float, float]
+    widening: float = 0.0
 
     def outline_at(self, z: float) -> np.ndarray:
         """Return the outline at a height [n, 3], um."""
-        return np.column_stack([self.outline + z * np.asarray(self.lean), np.full(len(self.outline), z)])
+        center = np.asarray(self.opening.center)
+        at = center + (self.outline - center) * (1.0 + z * self.widening) + z * np.asarray(self.lean)
+        return np.column_stack([at, np.full(len(at), z)])
+
+    def opening_at(self, z: float) -> Aperture:
+        """Return the ellipse at a height."""
+        (x, y), size = self.opening.center, 1.0 + z * self.widening
+        axes = self.opening.semi_axes[0] * size, self.opening.semi_axes[1] * size
+        return Aperture((x + z * self.lean[0], y + z * self.lean[1]), axes, self.opening.rotation)
 
 
 def drill_plate(
-    instrument: Instrument, thickness: float, radius: float | None = None, angle: float | None = None
+    instrument: Instrument,
+    thickness: float,
+    radius: float | None = None,
+    angle: float | None = None,
+    *,
+    is_conical: bool = False,
 ) -> DrilledPlate:
     """Generate a plate with channels for an instrument's apertures and pinhole.
 
-    The cross-section of a channel parallel to the plate is its aperture at all heights. Its axis leans radially away
-    from the point above the nominal spot; the pinhole's channel follows the beam.
+    The cross-section of a channel parallel to the plate is its aperture at all heights; of a conical one it is the
+    section of the cone from the nominal spot through its aperture, so that it cuts off nothing of what that spot sends.
+    Its axis leans radially away from the point above the nominal spot; the pinhole's channel follows the beam and is
+    never conical.
 
     Args:
         instrument: apertures, pinhole and, for a flat scattering plate, its outline.
         thickness: of the plate, um.
         radius: of the disc, um; default: the outline of a scattering plate, or a disc that contains all channels.
         angle: between channels and plate normal, rad; default: each channel points at the nominal spot.
+        is_conical: whether the channels of the detectors are cones.
 
     Raises:
-        SceneError: thickness or angle out of range; a channel leaves the plate sideways or meets another one; a
-            detector is no aperture in a flat plate, or its name cannot name a mesh part.
+        SceneError: thickness or angle out of range; an angle of conical channels; a channel leaves the plate sideways
+            or meets another one; a detector is no aperture in a flat plate, or its name cannot name a mesh part.
         MissingDependencyError: manifold3d is not installed.
     """
     if not 0.0 < thickness <= 1e6:
         raise SceneError(f"the plate's thickness must be > 0 um and <= 1e6 um, got {thickness:g}")
     if angle is not None and not 0.0 <= angle < math.radians(80.0):
         raise SceneError(f"the channels' angle must be >= 0 deg and < 80 deg, got {math.degrees(angle):g}")
+    if is_conical and angle is not None:
+        raise SceneError("conical channels point at the nominal spot: leave out the channels' angle")
+    if is_conical and thickness >= instrument.working_distance:
+        raise SceneError(
+            f"a plate with conical channels must be thinner than the working distance of "
+            f"{instrument.working_distance:g} um, got {thickness:g} um: reduce the thickness"
+        )
     try:
         import manifold3d
     except ImportError:
         raise MissingDependencyError("helio plate needs manifold3d: pip install 'helio-jax[plates]'") from None
-    bores = _bores(instrument, angle)
-    block = _prism(manifold3d, _outline(instrument, bores, thickness, radius), (0.0, 0.0), 0.0, thickness)
-    tools = [_prism(manifold3d, b.outline, b.lean, -0.5 * thickness, 1.5 * thickness) for b in bores]
+    bores = _bores(instrument, angle, is_conical)
+    block = manifold3d.CrossSection([_outline(instrument, bores, thickness, radius)]).extrude(thickness)
+    tools = [_tool(manifold3d, bore, -0.5 * thickness, 1.5 * thickness) for bore in bores]
     _check(manifold3d, bores, tools, block, thickness)
     solid = block - manifold3d.Manifold.batch_boolean(tools, manifold3d.OpType.Add)
     mesh = solid.to_mesh64()
     names = set(instrument.detector_names)
-    ends = {b.name: b.outline_at(thickness) for b in bores if b.name in names}
-    return DrilledPlate(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), ends)
+    of_detectors = [b for b in bores if b.name in names]
+    ends = {b.name: b.outline_at(thickness) for b in of_detectors}
+    openings = {b.name: b.opening_at(thickness) for b in of_detectors}
+    return DrilledPlate(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), ends, openings)
 
 
-def _bores(instrument: Instrument, angle: float | None) -> list[_Bore]:
+def _bores(instrument: Instrument, angle: float | None, is_conical: bool) -> list[_Bore]:
     """Construct the channels of all detectors and of the pinhole."""
     out = []
     for detector, a in zip(instrument.detector, instrument.apertures(), strict=True):
@@ -117,10 +178,12 @@ def _bores(instrument: Instrument, angle: float | None) -> list[_Bore]:
         far = math.hypot(x, y)
         slope = far / instrument.working_distance if angle is None else math.tan(angle)
         lean = (slope * x / far, slope * y / far) if far > 0.0 else (0.0, 0.0)
-        out.append(_Bore(detector.name, _polygon(a), lean))
+        widening = 1.0 / instrument.working_distance if is_conical else 0.0
+        out.append(_Bore(detector.name, a, _polygon(a), lean, widening))
     if (r := instrument.beam.pinhole_radius_um) > 0.0:
         (x, y, _), (tx, ty) = instrument.pinhole_center, instrument.beam_shift
-        out.append(_Bore("", _polygon(Aperture((x, y), (r, r), 0.0)), (-tx, -ty)))
+        opening = Aperture((x, y), (r, r), 0.0)
+        out.append(_Bore("", opening, _polygon(opening), (-tx, -ty)))
     return out
 
 
@@ -144,10 +207,13 @@ def _outline(instrument: Instrument, bores: list[_Bore], thickness: float, radiu
     return _polygon(Aperture((0.0, 0.0), (radius, radius), 0.0))
 
 
-def _prism(manifold3d: Any, outline: np.ndarray, lean: tuple[float, float], low: float, high: float) -> Any:
-    """Construct a sheared prism between two heights, whose cross-section at z = 0 is the outline."""
-    upright = manifold3d.CrossSection([outline]).extrude(high - low).translate([0.0, 0.0, low])
-    return upright.transform(np.array([[1.0, 0.0, lean[0], 0.0], [0.0, 1.0, lean[1], 0.0], [0.0, 0.0, 1.0, 0.0]]))
+def _tool(manifold3d: Any, bore: _Bore, low: float, high: float) -> Any:
+    """Construct a channel between two heights: a sheared prism, or cone, whose section at z = 0 is the outline."""
+    (x, y), (lean_x, lean_y) = bore.opening.center, bore.lean
+    at_low, at_high = (1.0 + z * bore.widening for z in (low, high))
+    section = manifold3d.CrossSection([(bore.outline - np.array([x, y])) * at_low])
+    upright = section.extrude(high - low, scale_top=(at_high / at_low,) * 2).translate([0.0, 0.0, low])
+    return upright.transform(np.array([[1.0, 0.0, lean_x, x], [0.0, 1.0, lean_y, y], [0.0, 0.0, 1.0, 0.0]]))
 
 
 def _check(manifold3d: Any, bores: list[_Bore], tools: list[Any], block: Any, thickness: float) -> None:

@@ -170,3 +170,10 @@ def _pieces(data: bytes, kind: str) -> list[tuple[np.ndarray, np.ndarray, str]]:
         mesh.apply_transform(matrix)
         out.append((np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), str(name)))
     return out
+
+
+def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """Format triangles as a binary STL file, in the unit of the vertices [n, 3], single precision."""
+    import trimesh
+
+    return bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl"))

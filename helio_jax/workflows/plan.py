@@ -318,14 +318,14 @@ def expect(scene: SceneFile, n_samples: int = N_SAMPLES) -> Expected:
     assert truth.normals is not None  # of a scene
     surface = Surface(truth.height, *slopes_of_normal(truth.normals, np.asarray(optics.beam_shift))[:2])
     gain, background = (scene.noise.per_detector(key, n) for key in ("gain", "background_per_pixel"))
-    dose = scene.scan.atoms_per_pixel * gain * _substrate_albedo(scene)
+    dose = scene.scan.atoms_per_pixel * gain * substrate_albedo(scene)
     known = {"uncertainty": scene.uncertainty, "settings": scene.reconstruct, "n_samples": n_samples}
     found = fisher(surface, optics, BeamPositions(x, y), dose, background=background, **known)
     signal = dose * substrate_signal(optics)
     return Expected(truth.height, found.posterior.samples, signal / np.sqrt(signal + background))
 
 
-def _substrate_albedo(scene: SceneFile) -> float:
+def substrate_albedo(scene: SceneFile) -> float:
     """Return the share of the atoms that the sample's main material scatters."""
     terms = scene.read_laws().get(scene.sample.material_names[0])
     return 1.0 if terms is None else sum(term.share for term in terms)

@@ -14,6 +14,7 @@ from helio_jax.calibration.noise import NoiseSettings
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.planning.design_settings import DesignSettings
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.files import read_toml
 from helio_jax.scene.scan import with_scan_kind
@@ -37,6 +38,7 @@ class SceneFile(Scene):
     noise: NoiseSettings = NoiseSettings()
     reconstruct: ReconstructSettings = ReconstructSettings()
     truth: TruthSettings = TruthSettings()
+    design: DesignSettings = DesignSettings()
 
     def _problems(self) -> list[str]:
         problems = super()._problems()

@@ -295,7 +295,8 @@ def test_optimised_program_gives_the_same(tmp_path):
     command = [sys.executable, str(Path(__file__)), "nearfield", "refine"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, env=env)
     assert done.returncode == 0, done.stderr
-    assert len(lines := done.stdout.splitlines()) == 2
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
     for line in lines:
         name, *told = line.split()
         found = dict(zip(told[::2], map(float, told[1::2]), strict=True))

@@ -83,8 +83,8 @@ def test_transformations(precision, kind):
     """jit, grad, jvp and vmap run in every number, keep its precision and agree with one another.
 
     The gradient of the image's sum of squares is multiplied by the direction of the jvp. Catches a conversion to NumPy,
-    a Python branch on a value, a constant of another precision, a derivative that one of the modes lacks, and a callback
-    that knows no batch.
+    a Python branch on a value, a constant of another precision, a derivative that one of the modes lacks, and a
+    callback that knows no batch.
     """
     plan, tree = corrections_of(kind), in_precision(arguments(), precision)
     direction = jax.tree.map(jnp.ones_like, tree)
