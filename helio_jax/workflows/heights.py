@@ -37,13 +37,18 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
         changes: settings that replace those, e.g. drift=False.
 
     Raises:
-        SceneError: the stack is calibrated already, or its beam is known (simulated).
+        SceneError: the stack is calibrated already, its beam is known (simulated), or its dwell times differ.
         GuardError: a detector has no signal.
     """
     if stack.n_rays is not None:
         raise SceneError(
             f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
             "calibrated already; calibrate the imported file itself"
+        )
+    if stack.dwell_map is not None:
+        raise SceneError(
+            f"{stack.name}: pixels of different dwell times have no common noise and drift: calibrate the scans that it "
+            "was added from, then add them"
         )
     return calibrate_on_border(
         stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)
