@@ -123,6 +123,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   solver              inexact Gauss-Newton; the only door to optimistix
   fisher              hx.fisher: what an experiment would determine
   fit                 outer iterations of the fit
+  dwell_information   variance of heights as a function of dwell times
+  further_images      images of a fitted surface that are not recorded yet
   convergence         convergence error and status of a fit
   posterior           Laplace posterior of heights and slopes
   correlated_errors   errors that agree between neighbours: predicted data, edges at kinks
@@ -159,10 +161,13 @@ alignment/            rotated scans onto one raster; orientation of arrays
   views               scans as the automatic alignment reads them
   correlate           normalised cross-correlation with missing data
   resample            images at other positions; several scans on one raster
+  added_scans         scans of one orientation added: counts and dwell times add
   orientation         rotated, mirrored and reordered images; what a file leaves open
 planning/             how long an acquisition takes and what it sees: numbers in, numbers out
   timing              time of an acquisition; overhead of a measured scan
   coverage            field of view after rotation
+  dwell               dwell times that minimise a variance within a given time
+  positions           lists of beam positions with dwell times, in scan order
   stage               rotation centre of a stage; windows that keep a region in view
 scores/               errors against something known
   settings            the [truth] table
@@ -279,6 +284,7 @@ workflows/            what joins the stages
   study_file          the study file
   plan                hx.plan: time and expected errors of acquisitions
   plan_windows        hx.plan_windows: rotation centre and stage windows
+  next_scan           hx.next_scan: where to spend the next second
   export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
@@ -333,6 +339,8 @@ _HOME = {
     "measure_texture": "measure.texture",
     "plan": "workflows.plan",
     "plan_windows": "workflows.plan_windows",
+    "next_scan": "workflows.next_scan",
+    "add_scans": "alignment.added_scans",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

@@ -5,6 +5,7 @@ pixels have dwell times of their own (`MicrographStack.dwell_map`). Knows no hei
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,32 @@ def add_scans(first: MicrographStack, *others: MicrographStack) -> MicrographSta
         provenance={"added": [dict(s.provenance) for s in (first, *others)]},
         **dropped,
     )
+
+
+def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = False) -> tuple[MicrographStack, ...]:
+    """Add all scans that see the sample from the same side; one stack of every orientation, in the order given.
+
+    Args:
+        stacks: rasters, and lists of positions on them.
+        only_lists: add lists of positions only; rasters of one orientation stay scans of their own.
+
+    Raises:
+        InputFileError: a list of positions without a raster of its orientation; as `add_scans`.
+    """
+    rasters = [s for s in stacks if s.positions is None]
+    out: list[list[MicrographStack]] = []
+    for stack in [*rasters, *(s for s in stacks if s.positions is not None)]:
+        same = [group for group in out if is_same_orientation(group[0], stack)]
+        if same and not (only_lists and stack.positions is None):
+            same[0].append(stack)
+        elif stack.positions is None:
+            out.append([stack])
+        else:
+            raise InputFileError(
+                f"{stack.name}: is a list of positions at a rotation of {math.degrees(stack.sample_rotation):g} deg: give "
+                "a raster of the same instrument and rotation, too, to which it is added"
+            )
+    return tuple(add_scans(*group) if len(group) > 1 else group[0] for group in out)
 
 
 def _parts(first: MicrographStack, stack: MicrographStack) -> list[tuple[np.ndarray, Any, Any, Any]]:

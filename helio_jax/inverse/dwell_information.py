@@ -17,7 +17,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.state import FitState
 
-N_PROBES = 128
+N_PROBES = 64
 """Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent, and
 its fall by more dwell time, which has the same sums, far better."""
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from helio_jax.errors import SceneError
 
-TOLERANCE = 0.005
+TOLERANCE = 0.01
 """Dwell times are found when the variance is within this share of the least possible one."""
 MAX_STEPS = 60
 """Largest number of multiplicative steps on one set of groups."""
@@ -181,7 +181,7 @@ def _on(
             power *= 0.5
             continue
         share, value, gain = trial, new_value, new_gain
-        power = min(1.2 * power, 1.0)
+        power = min(1.5 * power, 1.0)
     dwell = np.zeros(groups.scan.size)
     dwell[is_used] = counting * share / n
     return DwellTimes(dwell, value, max(_gap(share, gain), 0.0) / max(value, 1e-300), seconds)
