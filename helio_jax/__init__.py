@@ -226,6 +226,7 @@ figures/              pictures
   spot                the beam's spot
   sweep               scores of a study
   planning            error against time of a plan
+  dwell               dwell times of a list of positions
   pick                window for control points
 formats/              the only door to files
   hdf5                reads and writes stacks and reconstructions (HDF5)
@@ -302,7 +303,7 @@ commands/             the command line; no logic of its own
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  planning            plan, plan-windows
+  planning            plan, plan-windows, next
   scenes              scenes, init, validate, schema
   about               doctor, fetch-data, cite
 ```

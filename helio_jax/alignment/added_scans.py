@@ -49,7 +49,7 @@ def add_scans(first: MicrographStack, *others: MicrographStack) -> MicrographSta
     on_raster = [part for stack in (first, *others) for part in _parts(first, stack)]
     seconds = np.stack([part[0] for part in on_raster])  # [part, detector, y, x]
     total = seconds.sum(0)
-    known = np.maximum(total, 1e-300)
+    known = np.where(total > 0.0, total, 1.0)
 
     def mean(number: int, power: int) -> np.ndarray | None:
         """Add arrays weighted by a power of the dwell times."""
@@ -78,11 +78,12 @@ def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = 
     """Add all scans that see the sample from the same side; one stack of every orientation, in the order given.
 
     Args:
-        stacks: rasters, and lists of positions on them.
+        stacks: rasters, and lists of positions on them; a list at a rotation without a raster is put on the beam
+            positions of the first raster of its instrument, of which the rest is not observed.
         only_lists: add lists of positions only; rasters of one orientation stay scans of their own.
 
     Raises:
-        InputFileError: a list of positions without a raster of its orientation; as `add_scans`.
+        InputFileError: a list of positions without a raster of its instrument; as `add_scans`.
     """
     rasters = [s for s in stacks if s.positions is None]
     out: list[list[MicrographStack]] = []
@@ -93,11 +94,28 @@ def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = 
         elif stack.positions is None:
             out.append([stack])
         else:
-            raise InputFileError(
-                f"{stack.name}: is a list of positions at a rotation of {math.degrees(stack.sample_rotation):g} deg: give "
-                "a raster of the same instrument and rotation, too, to which it is added"
-            )
+            out.append([_empty_raster(stack, rasters), stack])
     return tuple(add_scans(*group) if len(group) > 1 else group[0] for group in out)
+
+
+def _empty_raster(stack: MicrographStack, rasters: Sequence[MicrographStack]) -> MicrographStack:
+    """Make a raster for a list of positions at a rotation that has none, with nothing observed."""
+    of_instrument = [r for r in rasters if r.instrument == stack.instrument]
+    if not of_instrument:
+        raise InputFileError(
+            f"{stack.name}: is a list of positions: give a raster of the same instrument, too, whose beam positions it is on"
+        )
+    first = of_instrument[0]
+    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed"))
+    return first.replace(
+        counts=np.full(first.shape, np.nan),
+        is_observed=np.zeros(first.shape, bool),
+        dwell_map=np.zeros(first.shape[1:]),
+        sample_rotation=stack.sample_rotation,
+        name=stack.name,
+        provenance={},
+        **dropped,
+    )
 
 
 def _parts(first: MicrographStack, stack: MicrographStack) -> list[tuple[np.ndarray, Any, Any, Any]]:

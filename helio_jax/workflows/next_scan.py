@@ -79,6 +79,7 @@ class NextScan:
         left_out: number of its pixels that do not: poorly determined ones (`FAR`).
         now_um: root mean square standard deviation of the region's heights so far [um].
         even_um: the same after the same time spent evenly on the present scans; None: that time does not allow for it.
+        even_all_um: the same after that time spent evenly on all orientations; None: likewise, or none is offered.
         proposed_um: the same after the list.
         gap: by how much less the mean variance could be at most, on the visited blocks, relative.
         shares: of the orientations.
@@ -99,6 +100,7 @@ class NextScan:
     left_out: int
     now_um: float
     even_um: float | None
+    even_all_um: float | None
     proposed_um: float
     gap: float
     shares: tuple[Share, ...]
@@ -120,7 +122,7 @@ class NextScan:
     def as_dict(self) -> dict[str, Any]:
         """Make a JSON-compatible record, without maps."""
         names = ("name", "seconds", "spent_s", "region_um", "region_pixels", "left_out", "now_um", "even_um")
-        about = {name: getattr(self, name) for name in (*names, "proposed_um", "gap")}
+        about = {name: getattr(self, name) for name in (*names, "even_all_um", "proposed_um", "gap")}
         more = {"variance_ratio": self.variance_ratio, "positions": int(self.dwell.size)}
         return about | more | {"shares": [asdict(s) for s in self.shares]}
 
@@ -278,11 +280,11 @@ class _Asking:
         """Return the dwell times of all data after further ones [detector, y, x], s."""
         return _on_images(self.orientations, [o.so_far + m for o, m in zip(self.orientations, maps, strict=True)])
 
-    def even(self) -> list[np.ndarray] | None:
-        """Spend the time evenly on the present scans; None where moving takes all of it."""
-        pixels = [o.is_present * (o.so_far > 0.0) for o in self.orientations]
+    def even(self, *, has_further: bool = False) -> list[np.ndarray] | None:
+        """Spend the time evenly on the present scans, or on further ones, too; None where moving takes all of it."""
+        pixels = [o.so_far > 0.0 if o.is_present else has_further & (o.block >= 0) for o in self.orientations]
         n = sum(int(p.sum()) for p in pixels)
-        changes = sum(o.is_present for o in self.orientations) - 1
+        changes = sum(bool(p.any()) for p in pixels) - 1
         counting = self.seconds - n * self.move - changes * self.change
         return [np.where(p, counting / n, 0.0) for p in pixels] if counting > 0.0 else None
 
@@ -341,6 +343,8 @@ class _Asking:
         say("expected standard deviations")
         proposed = self.std(maps, n_samples)
         evenly = None if even is None else self.std(even, n_samples)
+        even_all = None if all(o.is_present for o in self.orientations) else self.even(has_further=True)
+        evenly_all = None if even_all is None else self.std(even_all, n_samples)
         axes = tuple((o.stack.x, o.stack.y) for o in self.orientations)
         positions = Positions.of(maps, axes, self.orientations[0].stack.fast_axis)
         turns = np.array([math.degrees(o.stack.sample_rotation) for o in self.orientations])
@@ -364,6 +368,7 @@ class _Asking:
             left_out=int((self.region & ~counts).sum()),
             now_um=rms(now),
             even_um=None if evenly is None else rms(evenly),
+            even_all_um=None if evenly_all is None else rms(evenly_all),
             proposed_um=rms(proposed),
             gap=found.gap,
             shares=tuple(shares),
