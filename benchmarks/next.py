@@ -42,6 +42,8 @@ COUNTS = 150.0
 """Mean counts of a pixel of the first scan, about."""
 BACKGROUND = 0.05
 """Background, as a share of those."""
+DECISION_PATHS = 400_000
+"""Paths of a prediction in the fits that decisions are made of; those that are scored have the default."""
 WALL = 1.0
 """Slopes between true neighbours above this one are walls, whose two pixels are not scored."""
 MIDDLE = 0.2
@@ -109,11 +111,14 @@ def loop(
         Heights of both, and the ratio of the variances that each decision expects for itself.
     """
     every = np.full(case.expected.shape[1:], DWELL)
+    fewer = settings.refine.model_copy(update={"rays": min(DECISION_PATHS, settings.refine.rays or DECISION_PATHS)})
+    deciding = settings.model_copy(update={"refine": fewer})
     first = case.counted(every, 1000 * seed)
     part, so_far, expected = float(every.sum()), first, []
     for number in range(decisions):
-        found = hx.next_scan(so_far, part, region_um=region, settings=settings, n_samples=16)
+        found = hx.next_scan(so_far, part, region_um=region, settings=deciding, n_samples=16)
         expected.append(found.variance_ratio or math.nan)
+        print(f"{case.name}, seed {seed}, decision {number + 1}: {found.now_um:.3g} um so far", file=sys.stderr, flush=True)
         so_far = hx.add_scans(so_far, case.counted(found.dwell_maps[0], 1000 * seed + 1 + number))
     even = hx.add_scans(first, case.counted(decisions * every, 1000 * seed + 500))
     heights = [hx.reconstruct(s, "refine", settings=settings).height for s in (so_far, even)]

@@ -81,6 +81,16 @@ def parallax_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray] | None:
     return np.where(stack.is_observed, stack.parallax, 0.0) / _unit_of(stack), stack.parallax_height
 
 
+def noise_share_of(stack: MicrographStack) -> np.ndarray | None:
+    """Return the noise of every pixel over that of the median dwell time [y, x], 1 where not observed; None: one time."""
+    if stack.dwell_map is None:
+        return None
+    seen = stack.is_observed.any(0)
+    if not seen.any():
+        return None
+    return np.sqrt(np.where(seen, np.median(stack.dwell_map[seen]) / np.where(seen, stack.dwell_map, 1.0), 1.0))
+
+
 def _weighted_solve(phi: np.ndarray, signal: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Solve the 3 x 3 normal equations of every pixel; returns rho n [y, x, 3]."""
     normal_matrix = np.einsum("kyx,kiyx,kjyx->yxij", weight, phi, phi)
