@@ -11,12 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
+from helio_jax.inverse.edges import noise_of_edges
 from helio_jax.inverse.fit import LinearisedFit, inflated, linearised_at
 from helio_jax.inverse.posterior import Linearised, Posterior, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import edges_of
 
+EDGE_NOISE = 0.26
+"""Part of an edge's standard deviation that comes from the noise of the slopes, in units of that noise: the floor of
+`edges.find_edges`, and the noise in the kinks and curvatures that it finds (0.26 on a level surface with white noise)."""
 N_PROBES = 64
 """Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent, and
 its fall by more dwell time, which has the same sums, far better."""
@@ -32,6 +37,7 @@ class DwellInformation:
         present: dwell time of every datum so far, 0 where there is none yet [detector, y, x].
         state: of the fit on the full raster.
         shape: of the full raster.
+        edge_noise: standard deviation of the edges that the noise of the slopes makes, in units of that noise.
     """
 
     at: LinearisedFit
@@ -39,10 +45,16 @@ class DwellInformation:
     present: np.ndarray
     state: FitState
     shape: tuple[int, int]
+    edge_noise: float = EDGE_NOISE
 
     @classmethod
     def of(
-        cls, problem: FitProblem, state: FitState, seconds: np.ndarray, present: np.ndarray | None = None
+        cls,
+        problem: FitProblem,
+        state: FitState,
+        seconds: np.ndarray,
+        present: np.ndarray | None = None,
+        edge_noise: float = EDGE_NOISE,
     ) -> "DwellInformation":
         """Linearise a fit.
 
@@ -50,11 +62,13 @@ class DwellInformation:
             problem, state: its variance of the counts is that of `seconds`.
             seconds: dwell times [detector, y, x], > 0 where there are data, s.
             present: those of the data so far; default: the same.
+            edge_noise: see there; `edges.NOISE_FLOOR` for a surface without noise.
         """
         at = linearised_at(problem, state)
         thin = (..., slice(None, None, at.stride), slice(None, None, at.stride))
         given = seconds if present is None else present
-        return cls(at, seconds[thin], given[thin], state, (problem.raster.shape[0], problem.raster.shape[1]))
+        shape = problem.raster.shape[0], problem.raster.shape[1]
+        return cls(at, seconds[thin], given[thin], state, shape, edge_noise)
 
     @property
     def counting(self) -> np.ndarray:
@@ -97,13 +111,12 @@ class DwellInformation:
 
         Args:
             seconds: dwell times.
-            edge_factor: by which edges between pixels that are no kinks weigh more, scalar or [edge]: their standard
-                deviation goes with the noise of the slopes.
+            edge_factor: by which edges between pixels weigh more, scalar or [edge], from `edge_factor`.
         """
-        linear, run = self.at.linear, self.at.edge_error.run
+        linear, n_edges = self.at.linear, self.at.edge_error.run.size
         factor = np.ones(len(linear.instrument))
         factor[: seconds.size] = np.sqrt(self.information(seconds)[0]).ravel()
-        factor[seconds.size : seconds.size + run.size] = np.where(run == 0, edge_factor, 1.0)
+        factor[seconds.size : seconds.size + n_edges] = edge_factor
         return replace(
             linear,
             surface=sparse.csr_matrix(sparse.diags_array(factor) @ linear.surface),
@@ -117,11 +130,23 @@ class DwellInformation:
         return np.where((before > 0.0) & (after > 0.0), np.sqrt(after / np.maximum(before, 1e-300)), 1.0)
 
     def edge_factor(self, seconds: np.ndarray) -> np.ndarray:
-        """Compute by how much the weights of edges grow with the dwell times [edge]: by the noise of their two ends."""
-        ratio = self.noise_ratio(seconds)
-        square = ratio**-2
-        ends = (square[:, 1:] + square[:, :-1]).ravel(), (square[1:] + square[:-1]).ravel()
-        return np.concatenate(ends) ** -0.5 * np.sqrt(2.0)
+        """Compute by how much the weights of edges grow with the dwell times [edge].
+
+        Of an edge's standard deviation a part goes with the noise of the slopes at its ends; kinks and curvature stay.
+        """
+        problem, factors = self.at.problem, []
+        noise = np.broadcast_to(np.asarray(problem.pixel_noise), problem.raster.shape)
+        less = noise / self.noise_ratio(seconds)
+        for edges, axis in zip(edges_of(problem, self.at.state.surface, self._cut), (1, 0), strict=True):
+            before, after = (self.edge_noise * np.asarray(noise_of_edges(n, axis)) for n in (noise, less))
+            of_noise = np.minimum(before**2, edges.sigma**2)
+            fallen = edges.sigma**2 - of_noise * (1.0 - (after / before) ** 2)
+            factors.append((edges.sigma / np.sqrt(fallen)).ravel())
+        return np.concatenate(factors)
+
+    @property
+    def _cut(self) -> float:
+        return self.at.problem.settings.jump_limits[-1]
 
     def posterior(self, seconds: np.ndarray, n_samples: int) -> Posterior:
         """Compute the posterior that dwell times [detector, y, x] of the full raster would leave.
