@@ -342,6 +342,7 @@ _HOME = {
     "plan_windows": "workflows.plan_windows",
     "next_scan": "workflows.next_scan",
     "add_scans": "alignment.added_scans",
+    "add_positions": "alignment.added_scans",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

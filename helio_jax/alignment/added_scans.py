@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_float_array, pitch
 from helio_jax.errors import InputFileError
 from helio_jax.micrograph import MicrographStack
 
@@ -96,6 +96,66 @@ def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = 
         else:
             out.append([_empty_raster(stack, rasters), stack])
     return tuple(add_scans(*group) if len(group) > 1 else group[0] for group in out)
+
+
+def add_positions(
+    first: MicrographStack, xy_um: np.ndarray, dwell_s: np.ndarray, counts: np.ndarray, rotation_deg: float | None = None
+) -> MicrographStack:
+    """Add what was recorded at a list of positions to a scan, e.g. at those that `hx.next_scan` proposes.
+
+    The noise of the new counts is taken from the first scan: that of the same pixel, or, at another rotation, the median
+    of each detector's, for the dwell time of the position.
+
+    Args:
+        first: a raster with known dwell time.
+        xy_um: beam positions (x, y) on it [position, 2], um.
+        dwell_s: counting times [position], s.
+        counts: as recorded in these times, background included, in the units of the scan [detector, position].
+        rotation_deg: of the sample [deg]; default: the scan's.
+
+    Returns:
+        The sum; or, at another rotation, a scan of its own on the same raster, observed at these positions only.
+
+    Raises:
+        InputFileError: arrays that do not fit, as `add_scans`.
+
+    Example:
+        >>> both = hx.add_positions(first, found.xy, found.dwell, counts)
+        >>> rec = hx.reconstruct(both)
+    """
+    error, n = InputFileError, np.size(dwell_s)
+    xy, seconds = as_float_array("xy_um", xy_um, (n, 2), error), as_float_array("dwell_s", dwell_s, (n,), error)
+    recorded = as_float_array("counts", counts, (first.shape[0], n), error)
+    if not n or not np.all(np.isfinite(seconds) & (seconds > 0.0)):
+        raise error(f"dwell_s must hold one finite time > 0 s or more, got {n}: leave out positions that were not counted")
+    times = first.dwell_times
+    if not first.dwell or times is None:
+        raise error(f"{first.name}: states no dwell time: set it (MicrographStack.dwell)")
+    turn = first.sample_rotation if rotation_deg is None else math.radians(rotation_deg)
+    made = first.replace(
+        **dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "is_observed", "variance")),
+        counts=(recorded * first.dwell / seconds)[:, None],
+        x=np.arange(float(n)),
+        y=np.zeros(1),
+        positions=xy,
+        dwell_map=seconds[None],
+        background=None if first.background is None else np.zeros((first.shape[0], 1, n)),
+        sample_rotation=turn,
+        name=f"{first.name}, listed",
+        provenance={},
+    )
+    row, column = _pixels(first, made)
+    changes: dict[str, Any] = {}
+    is_same = is_same_orientation(first, made)
+    if first.background is not None:
+        level = first.background if first.background.ndim == 3 else first.background[:, None, None]
+        changes["background"] = np.broadcast_to(level, first.shape)[:, row, column][:, None]
+    if first.variance is not None:
+        known = np.where(first.is_observed & (times > 0.0), first.variance * times, np.nan)
+        usual = np.nanmedian(known, axis=(1, 2))[:, None]
+        own = known[:, row, column] if is_same else np.broadcast_to(usual, (first.shape[0], n))
+        changes["variance"] = (np.where(np.isfinite(own), own, usual) / seconds)[:, None]
+    return add_by_orientation([first, made.replace(**changes)], only_lists=True)[-1]
 
 
 def _empty_raster(stack: MicrographStack, rasters: Sequence[MicrographStack]) -> MicrographStack:

@@ -226,12 +226,17 @@ def next_scan(
 
     Source: own derivation; A-optimal design: Pukelsheim, Optimal Design of Experiments (1993), ch. 6.
     """
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise SceneError(f"the time to spend must be a finite time > 0 s, got {seconds:g}: correct it")
     for name, value in (("time to move", move_s), ("time to change the rotation", change_s)):
         if not (math.isfinite(value) and value >= 0.0):
             raise SceneError(f"the {name} must be a finite time >= 0 s, got {value:g}: correct it")
     given = [micrographs] if isinstance(micrographs, (MicrographStack, MicrographSet)) else list(micrographs)
     present = tuple(map(_ready, add_by_orientation([s for one in given for s in one.stacks])))
     _check_rotations(present, rotations_deg)
+    shape = present[0].shape[1:]
+    region, bounds = _region(region_um, present[0])
+    block_size((shape[0], shape[1]), block, thinning(shape, MAX_PIXELS))
     known = {"settings": settings, "report": report, "workers": workers}
     fit, stack, motions, predict = fit_scans(MicrographSet(present), joins=bool(rotations_deg), **known)
     further = [_like(present[0], a) for a in rotations_deg]
@@ -249,7 +254,6 @@ def next_scan(
     else:
         problem, state, reference = fit.problem, fit.state, so_far
     about = DwellInformation.of(problem, state, reference, so_far)
-    region, bounds = _region(region_um, stack)
     return _Asking(about, orientations, region, seconds, move_s, change_s).answer(stack, fit, bounds, n_samples, say)
 
 

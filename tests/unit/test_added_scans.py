@@ -188,3 +188,31 @@ def test_calibration_wants_even_times(bshem):
     stack = scan(bshem, dwell_map=np.ones((5, 7)), n_rays=None, background=None, noise="measured")
     with pytest.raises(SceneError, match="calibrate the scans"):
         calibrate(stack)
+
+
+def test_recorded_positions_are_added(bshem):
+    """Raw counts of listed positions: the sum over the time, noise as the scan's for that time; elsewhere unchanged.
+
+    Rejects counts taken for scaled ones, and the noise of the scan's own time.
+    """
+    first, times = scan(bshem), np.array([2.0, 0.25])
+    xy = 30.0 * np.array([[2.0, 4.0], [6.0, 1.0]])
+    raw = RATE * times * np.ones((len(bshem.detector), 1))
+    both = hx.add_positions(first, xy, times, raw)
+    assert np.allclose(both.counts[:, 4, 2] * 2.5 / 0.5, first.counts[:, 4, 2] + RATE * 2.0)
+    assert np.allclose(both.variance[:, 4, 2] / first.variance[:, 4, 2], 0.5 / 2.5)
+    assert np.allclose(both.background, first.background[:, None, None])
+    elsewhere = both.dwell_map == 0.5
+    assert elsewhere.sum() == 33 and np.array_equal(both.counts[:, elsewhere], first.counts[:, elsewhere])
+    other = hx.add_positions(first, xy, times, raw, rotation_deg=120.0)
+    assert other.sample_rotation == pytest.approx(np.radians(120.0)) and other.is_observed.sum() == raw.size
+    assert np.allclose(other.variance[:, 1, 6], RATE * 0.5 * 0.5 / 0.25)
+
+
+def test_recorded_positions_must_fit(bshem):
+    """Catches counts that are given per position instead of per detector and position, and a time of 0."""
+    first, xy = scan(bshem), np.array([[60.0, 120.0]])
+    with pytest.raises(InputFileError, match="counts must have the shape"):
+        hx.add_positions(first, xy, np.ones(1), np.ones(1))
+    with pytest.raises(InputFileError, match="finite time > 0 s"):
+        hx.add_positions(first, xy, np.zeros(1), np.ones((len(bshem.detector), 1)))
