@@ -38,7 +38,7 @@ from helio_jax.workflows.truth import true_height  # noqa: E402
 
 DWELL = 0.1
 """Dwell time of a pixel of the first scan [s]."""
-COUNTS = 150.0
+COUNTS = 20.0
 """Mean counts of a pixel of the first scan, about."""
 BACKGROUND = 0.05
 """Background, as a share of those."""
@@ -46,7 +46,7 @@ DECISION_PATHS = 400_000
 """Paths of a prediction in the fits that decisions are made of; those that are scored have the default."""
 WALL = 1.0
 """Slopes between true neighbours above this one are walls, whose two pixels are not scored."""
-MIDDLE = 0.2
+MIDDLE = 0.125
 """Half the side of the middle region, as a share of the field."""
 
 
