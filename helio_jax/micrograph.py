@@ -159,7 +159,9 @@ class MicrographStack(OnRaster):
         times = self.dwell_map
         assert times is not None  # of the caller
         if not self.dwell or not self.dwell > 0:
-            raise InputFileError(f"dwell must be > 0 s where dwell_map is given, got {self.dwell}: set what counts are per")
+            raise InputFileError(
+                f"dwell must be > 0 s where dwell_map is given, got {self.dwell}: set what counts are per"
+            )
         if not np.all(np.isfinite(times) & (times >= 0.0)):
             raise InputFileError("dwell_map must hold finite times >= 0 s: set pixels that were not counted to 0")
         unrecorded = self.is_observed.any(0) & (times == 0.0)
@@ -174,7 +176,7 @@ class MicrographStack(OnRaster):
         """Dwell time of every pixel [y, x], s; 0 where none of the images was recorded; None: unknown."""
         if self.dwell_map is not None:
             return self.dwell_map
-        return None if self.dwell is None else self.dwell * self.is_observed.any(0)
+        return None if self.dwell is None else np.where(self.is_observed.any(0), self.dwell, 0.0)
 
     def _in_short(self) -> str:
         n, ny, nx = self.shape

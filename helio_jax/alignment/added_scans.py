@@ -1,7 +1,7 @@
 """Scans of one sample in one orientation, added up: counts and dwell times add, pixel by pixel.
 
-A further scan of a raster, or a list of positions on it (what `helio next` proposes), so becomes part of one stack whose
-pixels have dwell times of their own (`MicrographStack.dwell_map`). Knows no heights and no noise model.
+A further scan of a raster, or a list of positions on it (what `helio next` proposes), so becomes part of one stack
+whose pixels have dwell times of their own (`MicrographStack.dwell_map`). Knows no heights and no noise model.
 """
 
 import math
@@ -99,12 +99,16 @@ def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = 
 
 
 def add_positions(
-    first: MicrographStack, xy_um: np.ndarray, dwell_s: np.ndarray, counts: np.ndarray, rotation_deg: float | None = None
+    first: MicrographStack,
+    xy_um: np.ndarray,
+    dwell_s: np.ndarray,
+    counts: np.ndarray,
+    rotation_deg: float | None = None,
 ) -> MicrographStack:
     """Add what was recorded at a list of positions to a scan, e.g. at those that `hx.next_scan` proposes.
 
-    The noise of the new counts is taken from the first scan: that of the same pixel, or, at another rotation, the median
-    of each detector's, for the dwell time of the position.
+    The noise of the new counts is taken from the first scan: that of the same pixel, or, at another rotation, the
+    median of each detector's, for the dwell time of the position.
 
     Args:
         first: a raster with known dwell time.
@@ -127,7 +131,9 @@ def add_positions(
     xy, seconds = as_float_array("xy_um", xy_um, (n, 2), error), as_float_array("dwell_s", dwell_s, (n,), error)
     recorded = as_float_array("counts", counts, (first.shape[0], n), error)
     if not n or not np.all(np.isfinite(seconds) & (seconds > 0.0)):
-        raise error(f"dwell_s must hold one finite time > 0 s or more, got {n}: leave out positions that were not counted")
+        raise error(
+            f"dwell_s must hold one finite time > 0 s or more, got {n}: leave out positions that were not counted"
+        )
     times = first.dwell_times
     if not first.dwell or times is None:
         raise error(f"{first.name}: states no dwell time: set it (MicrographStack.dwell)")
@@ -163,7 +169,8 @@ def _empty_raster(stack: MicrographStack, rasters: Sequence[MicrographStack]) ->
     of_instrument = [r for r in rasters if r.instrument == stack.instrument]
     if not of_instrument:
         raise InputFileError(
-            f"{stack.name}: is a list of positions: give a raster of the same instrument, too, whose beam positions it is on"
+            f"{stack.name}: is a list of positions: give a raster of the same instrument, too, on whose beam positions "
+            "they lie"
         )
     first = of_instrument[0]
     dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed"))
@@ -188,7 +195,9 @@ def _parts(first: MicrographStack, stack: MicrographStack) -> list[tuple[np.ndar
     seconds = np.where(stack.is_observed, stack.dwell_times, 0.0)
     background = stack.background
     if background is not None:
-        background = factor * np.broadcast_to(background if background.ndim == 3 else background[:, None, None], stack.shape)
+        background = factor * np.broadcast_to(
+            background if background.ndim == 3 else background[:, None, None], stack.shape
+        )
     variance = None if stack.variance is None else factor**2 * stack.variance
     images = seconds, factor * stack.counts, variance, background
     if stack.positions is None:

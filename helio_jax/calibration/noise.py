@@ -84,7 +84,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
     Carlo variance of the expectation; the drift is not in it. Orders and other components stay expectations, with lag
     and gain. Applies noise also where `settings.enabled` is False: the caller decides.
 
-    Where dwell times differ from pixel to pixel (`dwell_map`), the counts of each pixel's own time are drawn and scaled.
+    Where dwell times differ (`dwell_map`), the counts of each pixel's own time are drawn and scaled.
 
     Args:
         stack: expected counts (noise "expected").

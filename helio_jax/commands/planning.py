@@ -140,7 +140,9 @@ def plan_windows(
 @app.command("next")
 def next_scan(
     scans: Annotated[
-        list[Path], typer.Argument(help="Micrographs of the scans so far (.h5), of one sample.", metavar="SCAN..."), Reads()
+        list[Path],
+        typer.Argument(help="Micrographs of the scans so far (.h5), of one sample.", metavar="SCAN..."),
+        Reads(),
     ],
     seconds: Annotated[float, typer.Option(help="Time to spend: counting, moves and rotations [s].")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="List of positions (.csv)."), CSV] = None,

@@ -21,10 +21,10 @@ from helio_jax.inverse.steps import edges_of
 
 EDGE_NOISE = 0.26
 """Part of an edge's standard deviation that comes from the noise of the slopes, in units of that noise: the floor of
-`edges.find_edges`, and the noise in the kinks and curvatures that it finds (0.26 on a level surface with white noise)."""
+`edges.find_edges`, and the noise in the kinks and curvatures that it finds (measured on a level surface)."""
 N_PROBES = 64
-"""Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent, and
-its fall by more dwell time, which has the same sums, far better."""
+"""Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent, its
+fall by more dwell time, for which the sums are the same, far better."""
 
 
 @dataclass(frozen=True)

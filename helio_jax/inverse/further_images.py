@@ -55,7 +55,9 @@ def with_further_images(
         anchors=known.anchors,
         parallax=parallax_of(stack),
     )
-    problem = replace(problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share)
+    problem = replace(
+        problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share
+    )
     state = replace(FitState.at(problem, surface), parameters=_extended(problem, fit.state.parameters))
     state = update_corrections(problem, state, predict)
     model = expected(problem, state, is_noisy=True)

@@ -48,7 +48,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Cost:
-    """Times beside counting [s], >= 0: to move to a position, to change to another scan than the present one's number."""
+    """Times beside counting [s], >= 0: to move to a position, to change to another scan than number `present`."""
 
     move: float = 0.0
     change: float = 0.0
@@ -114,8 +114,8 @@ def spend(
     if not found:
         least = min(cost.seconds(groups, np.arange(groups.scan.size) == i) for i in range(groups.scan.size))
         raise SceneError(
-            f"{seconds:g} s are too short: the cheapest group of positions takes {least:g} s of moving alone: give more "
-            "time or smaller blocks"
+            f"{seconds:g} s are too short: the cheapest group of positions takes {least:g} s of moving alone: give "
+            "more time or smaller blocks"
         )
     return min(found, key=lambda f: f.variance)
 

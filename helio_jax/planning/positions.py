@@ -1,4 +1,4 @@
-"""Lists of beam positions with dwell times, in the order in which an instrument visits them. Numbers in, numbers out."""
+"""Lists of beam positions with dwell times, in the order in which a scan visits them. Numbers in, numbers out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -52,8 +52,8 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
         )
     if stack.dwell_map is not None:
         raise SceneError(
-            f"{stack.name}: pixels of different dwell times have no common noise and drift: calibrate the scans that it "
-            "was added from, then add them"
+            f"{stack.name}: pixels of different dwell times have no common noise and drift: calibrate the scans that "
+            "it was added from, then add them"
         )
     return calibrate_on_border(
         stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)

@@ -216,7 +216,8 @@ def next_scan(
         say: called with what is done.
 
     Raises:
-        SceneError: an unknown dwell time, a region without pixels, a time or block out of range, a rotation that is there.
+        SceneError: an unknown dwell time, a region without pixels, a time or block out of range, a rotation that is
+            scanned already.
         InputFileError, GuardError: as `hx.reconstruct_scans`; the scans cannot be added.
 
     Example:
@@ -435,7 +436,7 @@ def _joint(
     further: Sequence[MicrographStack],
     motions: Sequence[Rigid],
 ) -> MicrographStack:
-    """Bring present scans and further ones onto the raster of the heights; the present images stay as they were fitted."""
+    """Bring present and further scans onto the raster of the heights; present images stay as they were fitted."""
     of_all = (*motions, *(Rigid(s.sample_rotation, (0.0, 0.0)) for s in further))
     joint = resample(
         MicrographSet((*present, *further)), of_all, "reference", (0.0,) * len(of_all), stack.parallax_height
@@ -493,16 +494,14 @@ def _with_blocks(
     return _Orientation(scan, images, pixel, so_far, number_blocks(may_visit, size))
 
 
-def _seen(
-    orientations: Sequence[_Orientation], is_observed: np.ndarray, block: int | None
-) -> tuple[_Orientation, ...]:
+def _seen(orientations: Sequence[_Orientation], is_observed: np.ndarray, block: int | None) -> tuple[_Orientation, ...]:
     """Leave out pixels whose beam does not reach the surface that they are to show; `is_observed` [detector, y, x]."""
     out = []
     for o in orientations:
         pixel = np.where(is_observed[o.images].any(0), o.pixel, -1)
         if (pixel < 0).all():
             raise SceneError(
-                f"no height is seen at a rotation of {math.degrees(o.stack.sample_rotation):g} deg: remove this rotation"
+                f"no height is seen at a rotation of {math.degrees(o.stack.sample_rotation):g} deg: remove it"
             )
         out.append(_with_blocks(o.stack, o.images, pixel, o.so_far, block, pixel.shape))
     return tuple(out)

@@ -71,7 +71,7 @@ def test_variance_is_that_of_the_dense_inverse(about, region, seconds):
 
 @pytest.mark.parametrize("n_probes", [256, 20])
 def test_derivative_is_that_of_finite_differences(about, region, seconds, n_probes):
-    """Along a random direction, exact and with random sums, to 1e-5. Rejects a factor, and a model error that shrinks."""
+    """Along a random direction, exact and with random sums, to 1e-5. Rejects a factor, and a shrinking model error."""
     variance = RegionVariance(about, region, n_probes=n_probes)
     step = 0.1 * seconds * np.random.default_rng(1).normal(size=seconds.shape)
     up, down = (variance(seconds + s * 1e-3 * step)[0] for s in (1.0, -1.0))
@@ -81,8 +81,10 @@ def test_derivative_is_that_of_finite_differences(about, region, seconds, n_prob
 
 
 def test_variance_is_convex(about, region, seconds):
-    """Below its chord between two sets of dwell times, and above its tangent. Catches an information that is not concave,
-    whose optimum could be a local one."""
+    """Below its chord between two sets of dwell times, and above its tangent.
+
+    Catches an information that is not concave, whose optimum could be a local one.
+    """
     variance = RegionVariance(about, region)
     other = np.random.default_rng(2).uniform(0.2, 5.0, seconds.shape)
     ends = variance(seconds), variance(other)

@@ -75,7 +75,7 @@ def listed(bshem, points: np.ndarray, times: np.ndarray, **changes) -> hx.Microg
 
 
 def test_lists_are_put_on_the_raster(bshem):
-    """Times of listed pixels add, twice where listed twice; the others keep theirs. Catches swapped rows and columns."""
+    """Times of listed pixels add, twice where listed twice; others keep theirs. Catches swapped rows and columns."""
     points, times = np.array([[1, 6], [4, 2], [1, 6]]), np.array([0.25, 1.0, 0.5])
     (both,) = add_by_orientation([listed(bshem, points, times), scan(bshem)])
     expected = np.full((5, 7), 0.5)

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import helio_jax as hx
-import helio_jax.__main__  # noqa: F401 (registers the commands)
+import helio_jax.__main__
 from helio_jax.commands.app import app
 from helio_jax.errors import SceneError
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
@@ -76,7 +76,7 @@ def test_it_is_expected_to_be_better_than_even_times(found):
 
 
 def test_the_next_list_knows_what_was_added(first, found):
-    """Counts of the list are added: the standard deviation so far falls, and the scan is still one of its orientation."""
+    """Counts of the list are added: the standard deviation so far falls, and it is still one scan of its orientation."""
     raw = np.array([[c[r, k] for r, k in _pixels(first, found)] for c in first.counts]) * found.dwell / 0.1
     both = hx.add_positions(first, found.xy, found.dwell, raw)
     again = hx.next_scan([both], SECONDS, region_um=REGION, settings=QUICK)
@@ -136,7 +136,11 @@ def test_page(tmp_path, monkeypatch):
         small += ["--set", f"scan.{key}={value}"]
     lines = [shlex.split(line, comments=True)[1:] for b in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
              for line in b.splitlines()]  # fmt: skip
-    text = (ROOT / "scenes" / "sphere_a.toml").read_text(encoding="utf-8").replace("instruments/bshem_wd4.toml", "bshem_wd4")
+    text = (
+        (ROOT / "scenes" / "sphere_a.toml")
+        .read_text(encoding="utf-8")
+        .replace("instruments/bshem_wd4.toml", "bshem_wd4")
+    )
     head = "[reconstruct.refine]\n"
     text = text.replace(head, head + "max_rounds = 1\nrays = 20000\nphotometric_rounds = 1\n")
     (tmp_path / "quick.toml").write_text(text)
