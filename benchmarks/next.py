@@ -4,10 +4,10 @@
                               [--tiny]
 
 A first even scan takes one part of the time; ten decisions of `hx.next_scan` take one part each, the heights fitted
-anew by `refine` to all counts so far before each of them. Even: the first scan's counts and those of the rest of the time
-spent evenly. Both are fitted by `refine`; the loop sees the truth nowhere. Score: mean square error of the heights of
-the region, off walls (`WALL`), and the variance of the errors over the seeds of the noise, which a wrong model does not
-enter. Rows 1: sphere A, the cap's middle; 2: all of its field; 3 and 4: the same of a random mesa, the first of one
+anew by `refine` to all counts so far before each of them. Even: the first scan's counts and those of the rest of the
+time spent evenly. Both are fitted by `refine`; the loop sees the truth nowhere. Score: mean square error of the heights
+of the region, off walls (`WALL`), and the variance of the errors over the seeds of the noise, which a wrong model does
+not enter. Rows 1: sphere A, the cap's middle; 2: all of its field; 3 and 4: the same of a random mesa, the first of one
 level and without a hole in family `mesa` of `benchmarks/shapes.py`.
 """
 

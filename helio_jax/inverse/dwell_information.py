@@ -23,8 +23,8 @@ EDGE_NOISE = 0.26
 """Part of an edge's standard deviation that comes from the noise of the slopes, in units of that noise: the floor of
 `edges.find_edges`, and the noise in the kinks and curvatures that it finds (measured on a level surface)."""
 N_PROBES = 64
-"""Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent, its
-fall by more dwell time, for which the sums are the same, far better."""
+"""Random sums of heights that stand for all heights of a larger region: the mean variance is known to some per cent,
+its fall by more dwell time, for which the sums are the same, far better."""
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def parallax_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def noise_share_of(stack: MicrographStack) -> np.ndarray | None:
-    """Return the noise of every pixel over that of the median dwell time [y, x], 1 where not observed; None: all alike."""
+    """Return the noise of every pixel over that of the median dwell time [y, x]; None: all alike."""
     if stack.dwell_map is None:
         return None
     seen = stack.is_observed.any(0)

@@ -96,7 +96,7 @@ def spend(
         SceneError: the time does not even allow to visit one group.
 
     Source: Silvey, Titterington and Torsney, Commun. Stat. Theory Methods 7 (1978) 1379 (multiplicative algorithm);
-        bound on what is left to gain: the function's tangent, as in Frank and Wolfe, Nav. Res. Logist. Q. 3 (1956) 95.
+        bound on the gain that remains: the function's tangent, as in Frank and Wolfe, Nav. Res. Logist. Q. 3 (1956) 95.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise SceneError(f"the time to spend must be a finite time > 0 s, got {seconds:g}: correct it")

@@ -21,6 +21,7 @@ from helio_jax.errors import SceneError
 from helio_jax.formats.columns import write_columns
 from helio_jax.inverse.dwell_information import N_PROBES, DwellInformation, RegionVariance
 from helio_jax.inverse.further_images import with_further_images
+from helio_jax.inverse.methods import warnings_of
 from helio_jax.inverse.posterior import MAX_PIXELS
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.settings import ReconstructSettings
@@ -216,7 +217,7 @@ def next_scan(
         say: called with what is done.
 
     Raises:
-        SceneError: an unknown dwell time, a region without pixels, a time or block out of range, a rotation that is
+        SceneError: an unknown dwell time, expected counts, aligned scans, a region without pixels, a time or block out of range, a rotation that is
             scanned already.
         InputFileError, GuardError: as `hx.reconstruct_scans`; the scans cannot be added.
 
@@ -241,6 +242,10 @@ def next_scan(
     known = {"settings": settings, "report": report, "workers": workers}
     fit, stack, motions, predict = fit_scans(MicrographSet(present), joins=bool(rotations_deg), **known)
     further = [_like(present[0], a) for a in rotations_deg]
+    if fit.is_interrupted:
+        raise KeyboardInterrupt
+    for text in warnings_of(fit):
+        say(f"warning: {text}")
     if further:
         say(f"expected images at {', '.join(f'{a:g}' for a in rotations_deg)} deg")
     orientations = _orientations(stack, present, further, motions, block)
@@ -393,8 +398,16 @@ def _ready(stack: MicrographStack) -> MicrographStack:
     """Calibrate a measured scan as `hx.reconstruct` does.
 
     Raises:
-        SceneError: its dwell time is not known.
+        SceneError: its dwell time is not known, it has no counting noise, or it holds scans that were aligned or joined.
     """
+    if stack.noise == "expected":
+        raise SceneError(
+            f"{stack.name}: holds expected counts, whose heights have no counting noise to reduce: simulate with --noise"
+        )
+    if stack.alignment is not None or stack.parallax is not None:
+        raise SceneError(
+            f"{stack.name}: holds several scans, aligned or joined, whose dwell times are not kept apart: give the scans"
+        )
     if not stack.dwell:
         raise SceneError(
             f"{stack.name}: the dwell time that its counts belong to is not known: set noise.dwell_s in the scene, or "

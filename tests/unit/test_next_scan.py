@@ -14,6 +14,7 @@ import helio_jax.__main__
 from helio_jax.commands.app import app
 from helio_jax.errors import SceneError
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.micrograph import ScanAlignment
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 
@@ -76,7 +77,7 @@ def test_it_is_expected_to_be_better_than_even_times(found):
 
 
 def test_the_next_list_knows_what_was_added(first, found):
-    """Counts of the list are added: the standard deviation so far falls, and it is still one scan of its orientation."""
+    """Counts of the list are added: the standard deviation so far falls; it is still one scan of its orientation."""
     raw = np.array([[c[r, k] for r, k in _pixels(first, found)] for c in first.counts]) * found.dwell / 0.1
     both = hx.add_positions(first, found.xy, found.dwell, raw)
     again = hx.next_scan([both], SECONDS, region_um=REGION, settings=QUICK)
@@ -123,6 +124,14 @@ def test_dwell_time_must_be_known(first):
     """Catches a time that is made up."""
     with pytest.raises(SceneError, match="dwell time that its counts belong to is not known"):
         hx.next_scan(first.replace(dwell=None), 10.0)
+
+
+def test_scans_without_noise_or_time_of_their_own_are_refused(first):
+    """Catches a variance that is the tracer's, and dwell times of a mixture."""
+    with pytest.raises(SceneError, match="no counting noise to reduce"):
+        hx.next_scan(first.replace(noise="expected"), 10.0)
+    with pytest.raises(SceneError, match="aligned or joined"):
+        hx.next_scan(first.replace(alignment=ScanAlignment()), 10.0)
 
 
 def test_page(tmp_path, monkeypatch):
