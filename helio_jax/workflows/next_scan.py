@@ -217,8 +217,8 @@ def next_scan(
         say: called with what is done.
 
     Raises:
-        SceneError: an unknown dwell time, expected counts, aligned scans, a region without pixels, a time or block out of range, a rotation that is
-            scanned already.
+        SceneError: an unknown dwell time, expected counts, aligned scans, a region without pixels, a time or block out
+            of range, a rotation that is scanned already.
         InputFileError, GuardError: as `hx.reconstruct_scans`; the scans cannot be added.
 
     Example:
@@ -398,15 +398,15 @@ def _ready(stack: MicrographStack) -> MicrographStack:
     """Calibrate a measured scan as `hx.reconstruct` does.
 
     Raises:
-        SceneError: its dwell time is not known, it has no counting noise, or it holds scans that were aligned or joined.
+        SceneError: its dwell time is not known, it has no counting noise, or it holds aligned or joined scans.
     """
     if stack.noise == "expected":
         raise SceneError(
-            f"{stack.name}: holds expected counts, whose heights have no counting noise to reduce: simulate with --noise"
+            f"{stack.name}: holds expected counts, which have no counting noise to reduce: simulate with --noise"
         )
     if stack.alignment is not None or stack.parallax is not None:
         raise SceneError(
-            f"{stack.name}: holds several scans, aligned or joined, whose dwell times are not kept apart: give the scans"
+            f"{stack.name}: holds several scans, aligned or joined, without the dwell times of each: give the scans"
         )
     if not stack.dwell:
         raise SceneError(
