@@ -8,7 +8,8 @@ anew by `refine` to all counts so far before each of them. Even: the first scan'
 time spent evenly. Both are fitted by `refine`; the loop sees the truth nowhere. Score: mean square error of the heights
 of the region, off walls (`WALL`), and the variance of the errors over the seeds of the noise, which a wrong model does
 not enter. Rows 1: sphere A, the cap's middle; 2: all of its field; 3 and 4: the same of a random mesa, the first of one
-level and without a hole in family `mesa` of `benchmarks/shapes.py`.
+level and without a hole in family `mesa` of `benchmarks/shapes.py`. Rows 5: what is expected of one decision, by the size
+of the region, and with another rotation of the sample to choose from.
 """
 
 import argparse
@@ -171,6 +172,28 @@ def loop_rows(
     return rows
 
 
+def expected_rows(case: Case, settings: ReconstructSettings, rotation: float | None) -> list[Row]:
+    """Rows 5: what is expected of one decision over the first scan's time, by the size of the region; no simulation of it.
+
+    With another rotation to choose from, the last row compares with the time spent evenly on the present and on both.
+    """
+    every = np.full(case.expected.shape[1:], DWELL)
+    first, rows = case.counted(every, 1), []
+    for share in (None, 0.25, MIDDLE):
+        found = hx.next_scan(first, float(every.sum()), region_um=case.region(share), settings=settings)
+        where = "all" if share is None else f"middle {2 * share:.0%}"
+        value = f"{found.variance_ratio:.2f} ({found.proposed_um:.3g} for {found.even_um:.3g} um)"
+        rows.append(row("5", f"{case.name}, {where}: expected of one decision", value, "", None, **found.as_dict()))
+    if rotation is not None:
+        region = case.region(MIDDLE)
+        found = hx.next_scan(first, float(every.sum()), region_um=region, settings=settings, rotations_deg=(rotation,))
+        even_all = found.even_all_um or math.nan
+        value = f"{found.variance_ratio:.2f}; over even on both {(found.proposed_um / even_all) ** 2:.2f}"
+        what = f"{case.name}, middle {2 * MIDDLE:.0%}, {rotation:g} deg offered: expected"
+        rows.append(row("5", what, value, "", None, **found.as_dict()))
+    return rows
+
+
 def sphere_a(size: int) -> Case:
     """Trace sphere A on a raster of so many pixels a side."""
     changes = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": 30.0 * 121 / size}
@@ -196,6 +219,7 @@ def main() -> None:
     parser.add_argument("--shapes", default="sphere,mesa")
     parser.add_argument("--regions", default="middle,all")
     parser.add_argument("--seed", type=int, default=5, help="of the mesa")
+    parser.add_argument("--no-loops", action="store_true", help="rows 5 only")
     parser.add_argument("--tiny", action="store_true")
     args = parser.parse_args()
     if args.tiny:
@@ -207,10 +231,13 @@ def main() -> None:
         if args.tiny:
             quick = {"max_rounds": 1, "rays": 20_000, "photometric_rounds": 1, "samples": 0}
             settings = settings.model_copy(update={"refine": settings.refine.model_copy(update=quick)})
-        for where in args.regions.split(","):
+        if not args.tiny:
+            rows += expected_rows(case, settings, 180.0 if shape == "sphere" else None)
+        for where in () if args.no_loops else args.regions.split(","):
             number = str(1 + 2 * (shape == "mesa") + (where == "all"))
             rows += loop_rows(number, case, MIDDLE if where == "middle" else None, args, settings)
             write(args.output / "next.json", rows, args.seed)
+        write(args.output / "next.json", rows, args.seed)
 
 
 if __name__ == "__main__":
