@@ -8,8 +8,8 @@ anew by `refine` to all counts so far before each of them. Even: the first scan'
 time spent evenly. Both are fitted by `refine`; the loop sees the truth nowhere. Score: mean square error of the heights
 of the region, off walls (`WALL`), and the variance of the errors over the seeds of the noise, which a wrong model does
 not enter. Rows 1: sphere A, the cap's middle; 2: all of its field; 3 and 4: the same of a random mesa, the first of one
-level and without a hole in family `mesa` of `benchmarks/shapes.py`. Rows 5: what is expected of one decision, by the size
-of the region, and with another rotation of the sample to choose from.
+level and without a hole in family `mesa` of `benchmarks/shapes.py`. Rows 5: what is expected of one decision, by the
+size of the region, and with another rotation of the sample to choose from.
 """
 
 import argparse
@@ -173,7 +173,7 @@ def loop_rows(
 
 
 def expected_rows(case: Case, settings: ReconstructSettings, rotation: float | None) -> list[Row]:
-    """Rows 5: what is expected of one decision over the first scan's time, by the size of the region; no simulation of it.
+    """Rows 5: what is expected of one decision over the first scan's time, by the size of the region; not simulated.
 
     With another rotation to choose from, the last row compares with the time spent evenly on the present and on both.
     """
