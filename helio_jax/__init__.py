@@ -127,6 +127,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   criterion           variance of the heights as a differentiable function of the optics
   layout_objective    what a search of aperture layouts minimises
   fit                 outer iterations of the fit
+  dwell_information   variance of heights as a function of dwell times
+  further_images      images of a fitted surface that are not recorded yet
   convergence         convergence error and status of a fit
   posterior           Laplace posterior of heights and slopes
   correlated_errors   errors that agree between neighbours: predicted data, edges at kinks
@@ -163,10 +165,13 @@ alignment/            rotated scans onto one raster; orientation of arrays
   views               scans as the automatic alignment reads them
   correlate           normalised cross-correlation with missing data
   resample            images at other positions; several scans on one raster
+  added_scans         scans of one orientation added: counts and dwell times add
   orientation         rotated, mirrored and reordered images; what a file leaves open
 planning/             how long an acquisition takes and what it sees, layouts of apertures: numbers in, numbers out
   timing              time of an acquisition; overhead of a measured scan
   coverage            field of view after rotation
+  dwell               dwell times that minimise a variance within a given time
+  positions           lists of beam positions with dwell times, in scan order
   stage               rotation centre of a stage; windows that keep a region in view
   design_settings     the [design] table
   starts              where searches of aperture layouts start; symmetric pairs
@@ -229,6 +234,7 @@ figures/              pictures
   sweep               scores of a study
   planning            error against time of a plan
   design              error against masked area of a design
+  dwell               dwell times of a list of positions
   pick                window for control points
 formats/              the only door to files
   hdf5                reads and writes stacks and reconstructions (HDF5)
@@ -289,6 +295,7 @@ workflows/            what joins the stages
   design              hx.design: layouts of apertures
   design_result       layouts that a design has found: records, ranking, files
   plan_windows        hx.plan_windows: rotation centre and stage windows
+  next_scan           hx.next_scan: where to spend the next second
   export              hx.export: formats of other programs, heights on a grid on request
   checkpoint          long simulations that can be resumed
   truth               the true surface of a scene
@@ -306,7 +313,7 @@ commands/             the command line; no logic of its own
   looking             show, info
   heights             reconstruct, evaluate, measure, report
   measured            import, export, compare, align, pick, calibrate, orient
-  planning            plan, plan-windows, design
+  planning            plan, plan-windows, design, next
   scenes              scenes, init, validate, schema
   about               doctor, fetch-data, cite
 ```
@@ -344,6 +351,9 @@ _HOME = {
     "design": "workflows.design",
     "plan": "workflows.plan",
     "plan_windows": "workflows.plan_windows",
+    "next_scan": "workflows.next_scan",
+    "add_scans": "alignment.added_scans",
+    "add_positions": "alignment.added_scans",
     "load_scene": "workflows.scene_file",
     "load_instrument": "workflows.scene_file",
     "simulate": "workflows.pipeline",

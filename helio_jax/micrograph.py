@@ -80,6 +80,8 @@ class MicrographStack(OnRaster):
             the surface of these heights [y, x], um: change of the counts per um by which it is higher [detector, y, x].
         n_rays: beam atoms per pixel that the counts correspond to (simulated), or None.
         dwell: dwell time per pixel [s] (measured), or None.
+        dwell_map: dwell time of every pixel [y, x], s, where it differs from pixel to pixel; counts, variance and
+            background are then scaled to `dwell` seconds in every pixel. None: `dwell` everywhere.
         fast_axis: axis along which the scan moves fastest.
         sample_rotation: rotation of the sample about the plate normal [rad].
         noise: "expected" (noise-free expectation), "poisson" (counts) or "measured".
@@ -108,6 +110,7 @@ class MicrographStack(OnRaster):
     parallax_height: np.ndarray | None = None
     n_rays: float | None = None
     dwell: float | None = None
+    dwell_map: np.ndarray | None = None
     fast_axis: Literal["x", "y"] = "x"
     sample_rotation: float = 0.0
     noise: Literal["expected", "poisson", "measured"] = "expected"
@@ -127,6 +130,7 @@ class MicrographStack(OnRaster):
         others = {
             "shadowed": shape[1:],
             "parallax_height": shape[1:],
+            "dwell_map": shape[1:],
             "positions": (self.x.size, 2),
             "by_order": (None, *shape),
         }
@@ -144,9 +148,35 @@ class MicrographStack(OnRaster):
         object.__setattr__(self, "is_observed", observed)
         if self.variance is not None and not np.all(self.variance[observed] >= 0):
             raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
+        if self.dwell_map is not None:
+            self._check_dwell_map()
         planes = None if self.alignment is None else self.alignment.time_planes
         if planes is not None and len(planes) != shape[0]:
             raise error(f"alignment.time_planes must hold one plane for each of {shape[0]} images, got {len(planes)}")
+
+    def _check_dwell_map(self) -> None:
+        """Refuse dwell times that counts cannot have been recorded in."""
+        times = self.dwell_map
+        assert times is not None  # of the caller
+        if not self.dwell or not self.dwell > 0:
+            raise InputFileError(
+                f"dwell must be > 0 s where dwell_map is given, got {self.dwell}: set what counts are per"
+            )
+        if not np.all(np.isfinite(times) & (times >= 0.0)):
+            raise InputFileError("dwell_map must hold finite times >= 0 s: set pixels that were not counted to 0")
+        unrecorded = self.is_observed.any(0) & (times == 0.0)
+        if unrecorded.any():
+            raise InputFileError(
+                f"dwell_map must be > 0 s where counts were recorded, got 0 at {int(unrecorded.sum())} such pixels: "
+                "set is_observed to false there"
+            )
+
+    @property
+    def dwell_times(self) -> np.ndarray | None:
+        """Dwell time of every pixel [y, x], s; 0 where none of the images was recorded; None: unknown."""
+        if self.dwell_map is not None:
+            return self.dwell_map
+        return None if self.dwell is None else np.where(self.is_observed.any(0), self.dwell, 0.0)
 
     def _in_short(self) -> str:
         n, ny, nx = self.shape

@@ -98,7 +98,7 @@ def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> Mi
         )
     if stack.by_order is not None:
         fields["by_order"] = turn.image(stack.by_order[:, pick])
-    for name in ("shadowed", "parallax_height"):
+    for name in ("shadowed", "parallax_height", "dwell_map"):
         if getattr(stack, name) is not None:
             fields[name] = turn.image(getattr(stack, name))
     x, y = turn.axes(stack.x, stack.y)
@@ -135,6 +135,7 @@ def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
         variance=None if stack.variance is None else of(stack.variance) / (known * n * n),
         is_observed=share >= 0.5,
         background=background,
+        dwell_map=None if stack.dwell_map is None else mean(stack.dwell_map),
         **dropped,
     )
 

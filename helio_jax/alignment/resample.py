@@ -220,7 +220,7 @@ def resample(
                 level = np.broadcast_to(stack.background[k], image.shape)  # type: ignore[index]
                 background.append(SplineImage.of(level, known, stack.x, stack.y).at(places)[0])
     first = scans.stacks[0]
-    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "calibration"))
+    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "calibration", "dwell_map"))
     return first.replace(
         counts=np.stack(counts),
         x=x,

@@ -84,13 +84,16 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
     Carlo variance of the expectation; the drift is not in it. Orders and other components stay expectations, with lag
     and gain. Applies noise also where `settings.enabled` is False: the caller decides.
 
+    Where dwell times differ (`dwell_map`), the counts of each pixel's own time are drawn and scaled.
+
     Args:
         stack: expected counts (noise "expected").
         settings: background, gain, lag, drift.
         seed: used in place of `settings.seed`.
 
     Raises:
-        SceneError: the stack is noisy already, a list does not fit its detectors, or an expectation is negative.
+        SceneError: the stack is noisy already, a list does not fit its detectors, an expectation is negative, or lag or
+            another dwell time is asked for where dwell times differ.
     """
     if stack.noise != "expected":
         raise SceneError(f"noise can be added only to expected counts, got a stack with noise = {stack.noise!r}")
@@ -101,6 +104,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
         settings.per_detector(key, n_detectors) for key in ("background_per_pixel", "gain", "lag_s", "drift_per_pixel")
     )
     seed = settings.seed if seed is None else seed
+    share = _dwell_share(stack, settings)
 
     def recorded(images: np.ndarray) -> np.ndarray:
         """Apply lag and gain to images [..., detector, y, x]."""
@@ -118,8 +122,8 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
             "noise.background_per_pixel"
         )
     counts = np.full(mean.shape, np.nan)
-    counts[observed] = np.random.default_rng([seed, _STREAM]).poisson(mean[observed])
-    variance = mean.copy()
+    counts[observed] = np.random.default_rng([seed, _STREAM]).poisson((mean * share)[observed])
+    counts, variance = counts / share, mean / share
     if stack.variance is not None:
         variance += gain[:, None, None] ** 2 * stack.variance
     components = {key: getattr(stack, key) for key in ("by_order", "effuse", "plate")}
@@ -130,12 +134,24 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
         variance=variance,
         background=background,
         noise="poisson",
-        dwell=settings.dwell_s,
+        dwell=settings.dwell_s if stack.dwell_map is None else stack.dwell,
         fast_axis=settings.fast_axis,
         provenance={**stack.provenance, "noise": record},
         **{key: recorded(image) for key, image in components.items() if image is not None},
     )
     return _as_measured(noisy) if settings.as_measured else noisy
+
+
+def _dwell_share(stack: MicrographStack, settings: NoiseSettings) -> np.ndarray:
+    """Return the dwell time of every pixel over the stack's, 1 where it was not counted [y, x]."""
+    if stack.dwell_map is None or stack.dwell is None:
+        return np.ones(stack.shape[1:])
+    if np.any(np.atleast_1d(settings.lag_s)) or settings.dwell_s not in (None, stack.dwell):
+        raise SceneError(
+            f"noise: the pixels of {stack.name} have dwell times of their own, scaled to {stack.dwell:g} s, got "
+            f"lag_s = {settings.lag_s} and dwell_s = {settings.dwell_s}: set noise.lag_s = 0 and remove noise.dwell_s"
+        )
+    return np.where(stack.dwell_map > 0.0, stack.dwell_map / stack.dwell, 1.0)
 
 
 def _as_measured(stack: MicrographStack) -> MicrographStack:

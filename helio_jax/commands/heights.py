@@ -59,6 +59,7 @@ def reconstruct_files(
 ) -> None:
     """Reconstruct a height map from three or more micrographs, of one scan or of several of one sample."""
     from helio_jax import MicrographSet, write
+    from helio_jax.alignment.added_scans import add_by_orientation
     from helio_jax.figures.trust import anchor_lines, trust_lines
     from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.hdf5 import read_micrographs
@@ -67,7 +68,7 @@ def reconstruct_files(
 
     given = load_scene(settings).reconstruct if settings else None
     known = read_anchors(anchors) if anchors else None
-    scans = [scan for path in stack for scan in read_micrographs(path).stacks]
+    scans = add_by_orientation([s for path in stack for s in read_micrographs(path).stacks], only_lists=True)
     if write_instrument:
         from helio_jax.formats import toml
 
@@ -78,7 +79,7 @@ def reconstruct_files(
         if len(scans) == 1:
             result = reconstruct(scans[0], method, **how)
         else:
-            result, joined = reconstruct_scans(MicrographSet(tuple(scans)), method, motions=motions, **how)
+            result, joined = reconstruct_scans(MicrographSet(scans), method, motions=motions, **how)
     write(result, output)
     if write_joined:
         write(scans[0] if joined is None else joined.stack, write_joined)

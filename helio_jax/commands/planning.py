@@ -1,4 +1,4 @@
-"""Commands before a measurement: plan, plan-windows, design. They only parse, call, print."""
+"""Commands before and during a measurement: plan, plan-windows, design, next. They only parse, call, print."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from helio_jax.commands.app import CSV, FIGURE, AsJson, SceneArg, Set, app, say, scene_overrides
+from helio_jax.commands.app import CSV, FIGURE, AsJson, Bar, SceneArg, Set, app, say, scene_overrides
 from helio_jax.commands.door import Reads, Writes
 
 DESIGN = (
@@ -184,3 +184,103 @@ def design(
             f"{p.count_ratio:>6.2f}  {aims}"
         )
     print(f"files in {output}: {', '.join(file.name for file in files)}")
+
+
+@app.command("next")
+def next_scan(
+    scans: Annotated[
+        list[Path],
+        typer.Argument(help="Micrographs of the scans so far (.h5), of one sample.", metavar="SCAN..."),
+        Reads(),
+    ],
+    seconds: Annotated[float, typer.Option(help="Time to spend: counting, moves and rotations [s].")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="List of positions (.csv)."), CSV] = None,
+    region: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="X0 X1 Y0 Y1", help="Region whose heights count [um] (default: all)."),
+    ] = None,
+    rotations: Annotated[
+        str | None, typer.Option(help='Further rotations of the sample to choose from [deg], e.g. "120,240".')
+    ] = None,
+    dwell: Annotated[
+        float | None, typer.Option(help="Dwell time that the counts belong to [s] (default: the files').")
+    ] = None,
+    move: Annotated[float, typer.Option(help="Time to reach a position, without counting [s].")] = 0.0,
+    change: Annotated[float, typer.Option(help="Time to change to another rotation [s].")] = 0.0,
+    timing: Annotated[
+        Path | None, typer.Option(help="Measured scan (.mat, .h5): pause and time to move are taken from it."), Reads()
+    ] = None,
+    block: Annotated[
+        int | None, typer.Option(min=1, help="Side of the squares of pixels with one dwell time [pixels].")
+    ] = None,
+    settings: Annotated[
+        Path | None, typer.Option(help="Scene file whose table [reconstruct] is used."), Reads(names_files=True)
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Dwell map over the heights (.png, .pdf, .svg)."), FIGURE] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List where to spend the next seconds: positions and dwell times that most reduce the variance of the heights."""
+    from helio_jax.errors import SceneError
+    from helio_jax.figures.dwell import DwellMap, save_dwell
+    from helio_jax.figures.wording import duration
+    from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.workflows.next_scan import next_scan as find_next
+    from helio_jax.workflows.plan import measured_timing
+    from helio_jax.workflows.scene_file import load_scene
+
+    if timing and move:
+        raise SceneError("--move and --timing both give the time to move: give one of them")
+    stage = measured_timing(timing) if timing else None
+    stacks = [stack for path in scans for stack in read_micrographs(path).stacks]
+    if dwell is not None:
+        if known := [s for s in stacks if s.dwell is not None and s.dwell != dwell]:
+            raise SceneError(
+                f"--dwell {dwell:g} s contradicts {known[0].name}, whose file states {known[0].dwell:g} s: leave it out"
+            )
+        stacks = [s.replace(dwell=dwell) for s in stacks]
+    given = load_scene(settings).reconstruct if settings else None
+    with Bar("finding the next positions") as bar:
+        found = find_next(
+            stacks,
+            seconds,
+            region_um=region,
+            rotations_deg=_numbers("--rotations", rotations),
+            move_s=move if stage is None else stage.pause + stage.move,
+            change_s=change,
+            block=block,
+            settings=given,
+            report=bar,
+            say=say,
+        )
+    if output:
+        found.write(output)
+    if picture:
+        maps = [
+            DwellMap(f"{share.rotation_deg:g} deg, {share.share:.0%} of the time", *axes, image)
+            for share, axes, image in zip(found.shares, found.axes, found.dwell_maps, strict=True)
+        ]
+        std = found.std_now, found.std_proposed
+        save_dwell(*found.height_axes, found.height, std, found.region_um, maps, f"{found.name}: next scan", picture)
+    if as_json:
+        print(json.dumps(found.as_dict()))
+        return
+    out = f", {found.left_out} poorly determined ones left out" if found.left_out else ""
+    print(f"{found.name}: s.d. of the region's heights ({found.region_pixels} pixels{out})")
+    even = "not possible: moving alone takes longer" if found.even_um is None else f"{found.even_um:.3g} um"
+    rows = [("so far", f"{found.now_um:.3g} um"), (f"after {duration(found.seconds)} spent evenly", even)]
+    if found.even_all_um is not None:
+        rows.append(("the same, new rotations, too", f"{found.even_all_um:.3g} um"))
+    rows.append((f"after this list, {duration(found.spent_s)}", f"{found.proposed_um:.3g} um"))
+    if found.variance_ratio is not None:
+        rows.append(("variance over that of even times", f"{found.variance_ratio:.2f}"))
+    for label, value in rows:
+        print(f"  {label:<32} {value}")
+    print(f"{'rotation':>12} {'positions':>10} {'counting':>12} {'share':>6} {'dwell times':>20}")
+    for s in found.shares:
+        spread = f"{s.shortest_s:.3g} to {s.longest_s:.3g} s" if s.positions else "-"
+        print(
+            f"{s.rotation_deg:>8g} deg {s.positions:>10} {duration(s.seconds):>12} {s.share:>6.0%} {spread:>20}"
+            + ("" if s.is_present else "  (new)")
+        )
+    if found.variance_ratio is not None and found.variance_ratio > 1.0:
+        say("warning: even dwell times are expected to do as well: nothing is gained by this list")

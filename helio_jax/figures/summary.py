@@ -98,6 +98,15 @@ def _raster_row(stack: MicrographStack) -> tuple[str, str]:
 
 
 def _exposure(stack: MicrographStack) -> str:
+    per_pixel = _exposure_per_pixel(stack)
+    if stack.dwell_map is None:
+        return per_pixel
+    times = stack.dwell_map[stack.is_observed.any(0)]
+    low, high = (float(f(times)) for f in (np.min, np.max)) if times.size else (0.0, 0.0)
+    return f"{per_pixel}, scaled from dwell times of {low:.3g} to {high:.3g} s ({duration(float(times.sum()))} in all)"
+
+
+def _exposure_per_pixel(stack: MicrographStack) -> str:
     if stack.n_rays is not None:
         unit = "" if stack.unit in UNITS else f" (unit: {stack.unit})"
         return f"{plural(stack.n_rays, 'beam atom')} per pixel{unit}"

@@ -220,6 +220,8 @@ def _layers_of_stack(stack: MicrographStack, invalid: str) -> Layers:
             more.append(_layer(name, getattr(stack, name), axes, own))
     if stack.shadowed is not None:
         more.append(_layer("shadowed", stack.shadowed, ("y", "x")))
+    if stack.dwell_map is not None:
+        more.append(_layer("dwell_map", stack.dwell_map, ("y", "x"), "s"))
     if stack.positions is None:
         point_x, point_y = np.meshgrid(stack.x, stack.y)
     else:

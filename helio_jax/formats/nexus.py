@@ -61,6 +61,7 @@ STACK_FIELDS = (
     Field("parallax_height", "parallax_height", "um", "heights at which the images of several beams were read"),
     Field("n_rays", "n_rays", "", "simulated beam atoms per pixel"),
     Field("dwell", "dwell_time", "s", "dwell time per pixel"),
+    Field("dwell_map", "dwell_map", "s", "dwell time of every pixel; counts are scaled to dwell_time"),
     Field("sample_rotation", "sample_rotation", "rad", "rotation of the sample about the plate normal"),
     Field("fast_axis", "fast_axis", "", "axis along which the scan moves fastest"),
     Field("noise", "noise", "", "expected, poisson or measured counts"),

@@ -101,7 +101,17 @@ class AxisEdges:
         return np.sqrt(self.joined) / self.sigma
 
 
-def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, noise: float, cut: float) -> AxisEdges:
+def noise_of_edges(noise: float | np.ndarray, axis: int) -> float | np.ndarray:
+    """Return the slope noise of the edges along an axis: root mean square of that of their two ends, if it differs."""
+    if np.ndim(noise) == 0:
+        return noise
+    before, after = along(np.asarray(noise) ** 2, axis)
+    return np.sqrt(0.5 * (before + after))
+
+
+def find_edges(
+    height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, noise: float | np.ndarray, cut: float
+) -> AxisEdges:
     """Find kinks and jumps in all edges along one axis.
 
     With a kink uniformly within the edge, slopes s1 and s2 on its two sides, the trapezoid rule's error is
@@ -113,19 +123,20 @@ def find_edges(height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, n
         slope: slopes along this axis [y, x].
         pitch: um.
         axis: 0 (y) or 1 (x).
-        noise: slope noise of one pixel.
+        noise: slope noise of one pixel, or of every pixel [y, x].
         cut: misfit, in standard deviations, at which an edge has lost three quarters of its weight.
 
     Source: own derivation, tests/inverse/test_edges.py.
     """
     before, after = along(slope, axis)
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
-    sigma = np.sqrt((NOISE_FLOOR * noise) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
+    own = noise_of_edges(noise, axis)
+    sigma = np.sqrt((NOISE_FLOOR * own) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
     misfit = trapezoid_gap(height, slope, pitch, axis) / sigma
     return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2)
 
 
-def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float, axis: int) -> np.ndarray:
+def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float | np.ndarray, axis: int) -> np.ndarray:
     """Compute the weight of `fourth_order_slopes` in every pixel [y, x]: the smoothness of both of its edges.
 
     Beside a kink the correction errs by a 24th of it; it fades where that exceeds the least sigma of the edges.
@@ -133,9 +144,9 @@ def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float, axis:
     Args:
         joined: weight left of the edges.
         slope: slopes along `axis` [y, x].
-        noise: slope noise of one pixel.
+        noise: slope noise of one pixel, or of every pixel [y, x].
         axis: 0 (y) or 1 (x).
     """
-    smooth = joined * cauchy_weight(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise)
+    smooth = joined * cauchy_weight(kink_size(slope, axis) / 24.0, NOISE_FLOOR * noise_of_edges(noise, axis))
     previous, following = around(smooth, axis)
     return previous * following

@@ -24,7 +24,7 @@ from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
-from helio_jax.inverse.linear import parallax_of, signal_of, solve_known_albedo
+from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
@@ -162,6 +162,7 @@ class _Fits:
             patches=patches,
             anchors=anchors,
             parallax=parallax_of(self.stack),
+            noise_share=noise_share_of(self.stack),
         )
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:

@@ -7,7 +7,7 @@ robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is con
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,8 +97,40 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int, sums: Anc
 
     `sums` of heights above the substrate, which may be tilted: their covariance with all else is computed, too.
     """
-    s, shape = problem.settings, problem.signal.shape[1:]
-    stride = thinning(shape, MAX_PIXELS)
+    at = linearised_at(problem, state)
+    thin = (slice(None, None, at.stride),) * 2
+    of_sums = None if sums is None else derivative_of_sums(sums.thinned(thin), at.planes, at.linear)
+    known = {"error": at.error, "edge_error": at.edge_error, "sums": of_sums, "unfitted": at.unfitted}
+    found = sample_posterior(at.linear, n_samples, **known)
+    return inflated(found.levelled(at.planes), state).on_raster(problem.raster.shape, at.stride)
+
+
+class LinearisedFit(NamedTuple):
+    """A fit to first order at a state, on a thinned raster where the full one is too large.
+
+    Attributes:
+        linear: its residuals.
+        error, edge_error: what is assumed of errors that agree between neighbours.
+        planes: heights of the substrate for one prior standard deviation of each tilt [2, y, x], um.
+        problem, state: on the thinned raster.
+        stride: thinning.
+        unfitted: change of the residuals by numbers that are uncertain and not fitted (`sample_posterior`).
+    """
+
+    linear: Linearised
+    error: ModelError
+    edge_error: EdgeError
+    planes: np.ndarray
+    problem: FitProblem
+    state: FitState
+    stride: int
+    unfitted: np.ndarray | None
+
+
+def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
+    """Linearise a fit at a state."""
+    s = problem.settings
+    stride = thinning(problem.raster.shape, MAX_PIXELS)
     length = s.error_reach * float(np.ptp(state.surface.height))
     part = problem.thinned(stride)
     there = state.thinned(part, stride)
@@ -106,13 +138,15 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int, sums: Anc
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
-    linear, planes = linearise(unknowns, fixed), part.priors.tilt * part.position
-    thin = (slice(None, None, stride),) * 2
-    of_sums = None if sums is None else derivative_of_sums(sums.thinned(thin), planes, linear)
+    planes = part.priors.tilt * part.position
     unfitted = _incidence_error(part, there, unknowns, fixed)
-    found = sample_posterior(linear, n_samples, error=error, edge_error=edge_error, sums=of_sums, unfitted=unfitted)
-    found = found.levelled(planes).inflated(state.parameters, GEOMETRY)
-    return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO).on_raster(shape, stride)
+    return LinearisedFit(linearise(unknowns, fixed), error, edge_error, planes, part, there, stride, unfitted)
+
+
+def inflated(posterior: Posterior, state: FitState) -> Posterior:
+    """Inflate the error bars where a state's instrument contradicts what is stated."""
+    found = posterior.inflated(state.parameters, GEOMETRY)
+    return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO)
 
 
 def _incidence_error(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:

@@ -56,7 +56,7 @@ def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
     """Compute background-subtracted signal and its variance in units of the beam (counts / n_rays) [detector, y, x].
 
     Without a known number of beam atoms the unit is the mean signal, so that the albedo is relative. Without
-    a known variance every datum gets the same one: 1 % of the mean signal, squared.
+    a known variance every datum of the stack's dwell time gets the same one: 1 % of the mean signal, squared.
     """
     counts = np.where(stack.is_observed, stack.signal, np.nan)
     unit = _unit_of(stack)
@@ -65,6 +65,8 @@ def signal_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray]:
         variance = np.maximum(variance, 1e-9 * np.nanmean(counts**2))
     else:
         variance = np.where(stack.is_observed, (0.01 * np.nanmean(np.abs(counts))) ** 2, np.nan)
+        if stack.dwell_map is not None and stack.dwell is not None:
+            variance = variance * stack.dwell / np.where(stack.dwell_map > 0.0, stack.dwell_map, np.nan)
     return counts / unit, variance / unit**2
 
 
@@ -77,6 +79,16 @@ def parallax_of(stack: MicrographStack) -> tuple[np.ndarray, np.ndarray] | None:
     if stack.parallax is None or stack.parallax_height is None:
         return None
     return np.where(stack.is_observed, stack.parallax, 0.0) / _unit_of(stack), stack.parallax_height
+
+
+def noise_share_of(stack: MicrographStack) -> np.ndarray | None:
+    """Return the noise of every pixel over that of the median dwell time [y, x]; None: all alike."""
+    if stack.dwell_map is None:
+        return None
+    seen = stack.is_observed.any(0)
+    if not seen.any():
+        return None
+    return np.sqrt(np.where(seen, np.median(stack.dwell_map[seen]) / np.where(seen, stack.dwell_map, 1.0), 1.0))
 
 
 def _weighted_solve(phi: np.ndarray, signal: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ class FitProblem:
         parallax: how the signal changes per um that the surface is higher than `parallax_height` [detector, y, x], 0
             for one beam.
         parallax_height: at which the images of several beams were read [y, x], um.
+        noise_share: noise of every pixel over the typical one, by its dwell time [y, x]; None: all alike.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
@@ -75,6 +76,7 @@ class FitProblem:
     patches: AlbedoPatches
     parallax: np.ndarray
     parallax_height: np.ndarray
+    noise_share: np.ndarray | None = None
     instrument: Instrument | None = None
     stride: int = 1
 
@@ -93,6 +95,7 @@ class FitProblem:
         patches: AlbedoPatches | None = None,
         anchors: Anchors | None = None,
         parallax: tuple[np.ndarray, np.ndarray] | None = None,
+        noise_share: np.ndarray | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
@@ -116,7 +119,8 @@ class FitProblem:
             signal, variance, optics, math.radians(stated.tilt_deg), geometry, raster, settings, order, is_held,
             is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
-            patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))), given,
+            patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))),
+            noise_share, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -124,6 +128,11 @@ class FitProblem:
     def settings(self) -> RefineSettings:
         """Settings of the fit."""
         return self.reconstruct_settings.refine
+
+    @property
+    def pixel_noise(self) -> float | np.ndarray:
+        """Slope noise of one pixel, or of every pixel [y, x] where dwell times differ."""
+        return self.slope_noise if self.noise_share is None else self.slope_noise * self.noise_share
 
     @property
     def shift(self) -> np.ndarray:
@@ -262,6 +271,7 @@ class FitProblem:
             drift_modes=self.drift_modes[:, :, *thin],
             parallax=self.parallax[:, *thin],
             parallax_height=self.parallax_height[thin],
+            noise_share=None if self.noise_share is None else self.noise_share[thin],
             stride=stride,
         )
 

@@ -96,8 +96,8 @@ def edges_of(
 ) -> tuple[AxisEdges, AxisEdges]:
     """Find the edges of a surface along x and along y; those that are `occluded` count as depth jumps."""
     found = (
-        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.slope_noise, cut),
-        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.slope_noise, cut),
+        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut),
+        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.pixel_noise, cut),
     )
     if occluded is None:
         return found
@@ -185,8 +185,8 @@ def freeze(
         along_y.joined,
         along_x.weight * strictness,
         along_y.weight * strictness,
-        smoothness_weight(along_x.joined, slope_x, noise, 1),
-        smoothness_weight(along_y.joined, slope_y, noise, 0),
+        smoothness_weight(along_x.joined, slope_x, problem.pixel_noise, 1),
+        smoothness_weight(along_y.joined, slope_y, problem.pixel_noise, 0),
     )
     free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))

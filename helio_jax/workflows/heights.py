@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from helio_jax.alignment.rigid import Rigid
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.forward.form_factor import substrate_signal
@@ -17,7 +18,10 @@ from helio_jax.reconstruction import Reconstruction
 from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import this_run
-from helio_jax.workflows.several_scans import JoinedScans, Motions, join_scans, merged_heights
+from helio_jax.workflows.several_scans import JoinedScans, Motions, join_scans, merged_heights, stage_motions
+
+if TYPE_CHECKING:
+    from helio_jax.inverse.fit import Fit
 
 VERDICT_PATHS = 400_000
 """Paths of the multiple scattering by which a finished height map is tested against its data."""
@@ -26,6 +30,7 @@ MAX_FITS = 6
 FITTED = 0.1
 """They end where the places change by less than this, root mean square [pixels]."""
 Report = Callable[[int, int, str], None]
+Predictor = Callable[[MicrographStack], Predict]
 
 
 def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None, **changes: Any) -> MicrographStack:
@@ -37,13 +42,18 @@ def calibrate(stack: MicrographStack, settings: CalibrateSettings | None = None,
         changes: settings that replace those, e.g. drift=False.
 
     Raises:
-        SceneError: the stack is calibrated already, or its beam is known (simulated).
+        SceneError: the stack is calibrated already, its beam is known (simulated), or its dwell times differ.
         GuardError: a detector has no signal.
     """
     if stack.n_rays is not None:
         raise SceneError(
             f"{stack.name}: this stack is in units of a known beam ({stack.n_rays:g} atoms): it is simulated or "
             "calibrated already; calibrate the imported file itself"
+        )
+    if stack.dwell_map is not None:
+        raise SceneError(
+            f"{stack.name}: pixels of different dwell times have no common noise and drift: calibrate the scans that "
+            "it was added from, then add them"
         )
     return calibrate_on_border(
         stack, substrate_signal(Optics.of(stack.instrument)), (settings or CalibrateSettings()).changed(**changes)
@@ -139,6 +149,53 @@ def reconstruct_scans(
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()
     chosen = settings.changed(**_with_priors(settings, scans.stacks[0], wanted))
+    joined, work = _joined(scans, chosen, motions, report, workers)
+    rec = work.finish(joined.stack, report)
+    return replace(rec, warnings=(*rec.warnings, *joined.warnings)), joined
+
+
+def fit_scans(
+    scans: MicrographSet,
+    *,
+    settings: ReconstructSettings | None = None,
+    joins: bool = False,
+    report: Report | None = None,
+    workers: int | None = None,
+) -> "tuple[Fit, MicrographStack, tuple[Rigid, ...], Predictor]":
+    """Fit the heights of scans, without error bars or a test, for what follows from the fit itself.
+
+    Args:
+        scans: one of three or more images, or several as in `reconstruct_scans`; simulated or calibrated.
+        settings: table [reconstruct]; the method is `refine`.
+        joins: whether a single scan is brought into the frame of the unrotated sample, too, as several are.
+        report, workers: as in `reconstruct`.
+
+    Returns:
+        The fit, the stack that it explains, the motions of the scans from its frame (empty: the scan's own frame), and
+        what makes predictions for stacks of the same sample.
+
+    Raises:
+        GuardError, InputFileError, SceneError: as `reconstruct_scans`.
+    """
+    settings, first = settings or ReconstructSettings(), scans.stacks[0]
+    chosen = settings.changed(**_with_priors(settings, first, {"method": "refine"}))
+    if len(scans.stacks) > 1:
+        joined, work = _joined(scans, chosen, "stage", report, workers)
+        return work.fitted(joined.stack, report), joined.stack, joined.motions, work.predict
+    work = _Reconstructing(chosen, workers)
+    if not joins:
+        return work.fitted(first, report), first, (), work.predict
+    motions, height = stage_motions(scans), None
+    if scans.is_oblique:
+        height = merged_heights(scans, motions, lambda scan: work.fit(scan, report))
+    stack = JoinedScans.at(scans, motions, (0.0,), height).stack
+    return work.fitted(stack, report), stack, motions, work.predict
+
+
+def _joined(
+    scans: MicrographSet, chosen: ReconstructSettings, motions: Motions, report: Report | None, workers: int | None
+) -> "tuple[JoinedScans, _Reconstructing]":
+    """Join scans on the surface that is fitted to them; return what reconstructs, too."""
     for scan in scans.stacks:
         if scan.noise == "measured" and not scans.is_oblique:
             scans.only()  # says that they must be aligned
@@ -161,8 +218,7 @@ def reconstruct_scans(
             joined = joined.on(work.fit(joined.stack, report).height)
             if joined.change < FITTED:
                 break
-    rec = work.finish(joined.stack, report)
-    return replace(rec, warnings=(*rec.warnings, *joined.warnings)), joined
+    return joined, work
 
 
 @dataclass(frozen=True)
@@ -177,6 +233,16 @@ class _Reconstructing:
         refine = self.settings.refine.model_copy(update={"samples": 0})
         quick = self.settings.model_copy(update={"refine": refine})
         return reconstruct_stack(stack, quick, self._make_predict(stack), report, start=stack.parallax_height)
+
+    def fitted(self, stack: MicrographStack, report: Report | None) -> "Fit":
+        """Fit the heights without error bars."""
+        from helio_jax.inverse.explanations import explain
+
+        return explain(stack, self.settings, self._make_predict(stack), report, stack.parallax_height).fit
+
+    def predict(self, stack: MicrographStack) -> Predict:
+        """Return what predicts the masks and the multiple scattering of a stack."""
+        return self._make_predict(stack)(self.settings.refine.paths(stack.counts[0].size))
 
     def finish(self, stack: MicrographStack, report: Report | None) -> Reconstruction:
         """Reconstruct with error bars, and test the result against the data."""

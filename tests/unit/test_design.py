@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import helio_jax as hx
-import helio_jax.__main__  # noqa: F401 (registers the commands)
+import helio_jax.__main__
 from helio_jax.commands.app import app
 from helio_jax.commands.planning import DESIGN
 from helio_jax.errors import SceneError
