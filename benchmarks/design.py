@@ -132,8 +132,8 @@ def main() -> None:
         layouts = chosen(found.proposals)
         for i, p in enumerate(layouts, 1):
             what = f"layout {i}: {p.label}, weight {p.masked_weight:g}: {describe(p)}"
-            masked = "-" if p.masked_ratio is None else f"{p.masked_ratio:.2f}"
-            value = f"expected variance {p.variance_ratio:.3f}, masked {masked}, counts {p.count_ratio:.2f}"
+            hidden = "-" if p.masked_ratio is None else f"{p.masked_ratio:.2f}"
+            value = f"expected variance {p.variance_ratio:.3f}, masked {hidden}, counts {p.count_ratio:.2f}"
             keep(row("1", what, value, "-", None, instrument=p.instrument.model_dump(mode="json")))
         ratios: dict[int, list[float]] = {i: [] for i in range(1, len(layouts) + 1)}
         masked: dict[int, list[tuple[float, float]]] = {i: [] for i in ratios}

@@ -145,7 +145,7 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
 
 
-def steepness(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
+def steepness(slope_x: Any, slope_y: Any) -> Any:
     """Compute by how much more the slopes of a facet follow its normal than those of a level one [y, x]."""
     return 1.0 + slope_x**2 + slope_y**2
 

@@ -176,4 +176,6 @@ def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
     """Format triangles as a binary STL file, in the unit of the vertices [n, 3], single precision."""
     import trimesh
 
-    return bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl"))
+    found = trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl")
+    assert isinstance(found, bytes)  # as trimesh gives for this format
+    return found
