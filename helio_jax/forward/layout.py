@@ -15,7 +15,7 @@ from jaxtyping import Float
 from helio_jax.forward.optics import Optics
 
 N_WAYS = 360
-"""Directions in which two ellipses are told apart; their distance is known to 1 / 2 (pi / N_WAYS)^2 of itself."""
+"""Directions in which the distance of two ellipses is tried; it is known to 1 / 2 (pi / N_WAYS)^2 of itself."""
 
 
 class Layout(eqx.Module):

@@ -91,24 +91,24 @@ class _Bore:
         opening: its ellipse in the underside.
         outline: that ellipse as a polygon [n, 2].
         lean: lateral shift (x, y) per um of height.
-        widening: growth of the ellipse's size per um of height, relative.
+        growth: of the ellipse's size per um of height, relative.
     """
 
     name: str
     opening: Aperture
     outline: np.ndarray
     lean: tuple[float, float]
-    widening: float = 0.0
+    growth: float = 0.0
 
     def outline_at(self, z: float) -> np.ndarray:
         """Return the outline at a height [n, 3], um."""
         center = np.asarray(self.opening.center)
-        at = center + (self.outline - center) * (1.0 + z * self.widening) + z * np.asarray(self.lean)
+        at = center + (self.outline - center) * (1.0 + z * self.growth) + z * np.asarray(self.lean)
         return np.column_stack([at, np.full(len(at), z)])
 
     def opening_at(self, z: float) -> Aperture:
         """Return the ellipse at a height."""
-        (x, y), size = self.opening.center, 1.0 + z * self.widening
+        (x, y), size = self.opening.center, 1.0 + z * self.growth
         axes = self.opening.semi_axes[0] * size, self.opening.semi_axes[1] * size
         return Aperture((x + z * self.lean[0], y + z * self.lean[1]), axes, self.opening.rotation)
 
@@ -178,8 +178,8 @@ def _bores(instrument: Instrument, angle: float | None, is_conical: bool) -> lis
         far = math.hypot(x, y)
         slope = far / instrument.working_distance if angle is None else math.tan(angle)
         lean = (slope * x / far, slope * y / far) if far > 0.0 else (0.0, 0.0)
-        widening = 1.0 / instrument.working_distance if is_conical else 0.0
-        out.append(_Bore(detector.name, a, _polygon(a), lean, widening))
+        growth = 1.0 / instrument.working_distance if is_conical else 0.0
+        out.append(_Bore(detector.name, a, _polygon(a), lean, growth))
     if (r := instrument.beam.pinhole_radius_um) > 0.0:
         (x, y, _), (tx, ty) = instrument.pinhole_center, instrument.beam_shift
         opening = Aperture((x, y), (r, r), 0.0)
@@ -210,7 +210,7 @@ def _outline(instrument: Instrument, bores: list[_Bore], thickness: float, radiu
 def _tool(manifold3d: Any, bore: _Bore, low: float, high: float) -> Any:
     """Construct a channel between two heights: a sheared prism, or cone, whose section at z = 0 is the outline."""
     (x, y), (lean_x, lean_y) = bore.opening.center, bore.lean
-    at_low, at_high = (1.0 + z * bore.widening for z in (low, high))
+    at_low, at_high = (1.0 + z * bore.growth for z in (low, high))
     section = manifold3d.CrossSection([(bore.outline - np.array([x, y])) * at_low])
     upright = section.extrude(high - low, scale_top=(at_high / at_low,) * 2).translate([0.0, 0.0, low])
     return upright.transform(np.array([[1.0, 0.0, lean_x, x], [0.0, 1.0, lean_y, y], [0.0, 0.0, 1.0, 0.0]]))
