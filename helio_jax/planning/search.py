@@ -62,9 +62,7 @@ def minimise(
     kept = {"type": "ineq", "fun": room, "jac": room_slope}
     options = {"maxiter": max_steps, "ftol": TOLERANCE}
     limits = Bounds(*bounds)  # type: ignore[arg-type]  # SciPy's stubs know single numbers only
-    found = minimize(
-        followed, start, jac=True, method="SLSQP", bounds=limits, constraints=[kept], options=options
-    )
+    found = minimize(followed, start, jac=True, method="SLSQP", bounds=limits, constraints=[kept], options=options)
     status = {0: "converged", 9: f"stopped after {max_steps} steps: allow more"}.get(
         found.status, f"stopped early ({found.message}); the best point is kept"
     )

@@ -150,7 +150,7 @@ def _scores(p: Proposal) -> np.ndarray:
 def distinct(found: Sequence[Proposal]) -> list[Proposal]:
     """Return layouts by `height_std_um`, without those that equal a better one in number, incidence and results."""
     out: list[Proposal] = []
-    for p in sorted(found, key=lambda p: p.height_std_um):
+    for p in sorted(found, key=lambda p: (p.height_std_um, p.masked)):
         alike = (q for q in out if (q.n_apertures, q.instrument.beam) == (p.n_apertures, p.instrument.beam))
         if not any(np.all(abs(_scores(p) - _scores(q)) <= SAME * abs(_scores(q))) for q in alike):
             out.append(p)
