@@ -214,7 +214,7 @@ def test_files_of_a_design(tmp_path, scene, found):
     ("changes", "message"),
     [
         ({"reconstruct.border": "free"}, "needs reconstruct.border = 'flat'"),
-        ({"design.total_area_um2": 5e7}, "no layout of 3 apertures of 5e[+]07 um.2 in all keeps walls"),
+        ({"design.total_area_um2": 5e8}, "no layout of 3 apertures of 5e[+]08 um.2 in all keeps walls"),
         ({"scan.rotations_deg": [0.0, 90.0], "scan.rotate": "detectors"}, "a raster at one distance and rotation"),
         ({"design.polar_deg": [50.0, 20.0]}, "least, largest"),
         ({"design.apertures": [2]}, "greater than or equal to 3|>= 3"),
