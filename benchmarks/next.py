@@ -34,12 +34,12 @@ from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.micrograph import MicrographStack  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
-from helio_jax.workflows.truth import true_height  # noqa: E402
+from helio_jax.workflows.truth import true_surface  # noqa: E402
 
 DWELL = 0.1
 """Dwell time of a pixel of the first scan [s]."""
-COUNTS = 20.0
-"""Mean counts of a pixel of the first scan, about."""
+COUNTS = 200.0
+"""Mean counts of a pixel of the first scan; see `--counts`."""
 BACKGROUND = 0.05
 """Background, as a share of those."""
 DECISION_PATHS = 400_000
@@ -52,27 +52,30 @@ MIDDLE = 0.125
 
 @dataclass(frozen=True)
 class Case:
-    """A shape, traced: expected counts of the first scan's dwell time."""
+    """A shape, traced: expected counts of the first scan's dwell time, their mean, and the true heights [y, x], um."""
 
     name: str
     scene: SceneFile
     expected: MicrographStack
+    truth: np.ndarray
+    counts: float
 
     @classmethod
-    def of(cls, name: str, scene: SceneFile) -> "Case":
-        """Trace a scene for `COUNTS` counts per pixel."""
+    def of(cls, name: str, scene: SceneFile, counts: float) -> "Case":
+        """Trace a scene for so many counts per pixel."""
         traced = pipeline.simulate(scene).only()
-        factor = COUNTS / float(np.mean(traced.counts))
+        factor = counts / float(np.mean(traced.counts))
         assert traced.n_rays is not None  # simulated
         variance = None if traced.variance is None else factor**2 * traced.variance
         more = {"counts": factor * traced.counts, "variance": variance, "n_rays": factor * traced.n_rays}
-        return cls(name, scene, traced.replace(**more, dwell=DWELL, by_order=None))
+        truth = true_surface(scene, traced.x, traced.y).height
+        return cls(name, scene, traced.replace(**more, dwell=DWELL, by_order=None), truth, counts)
 
     def counted(self, dwell: np.ndarray, seed: int) -> MicrographStack:
         """Count for dwell times [y, x]: Poisson noise and background, on these pixels only."""
         seen = np.broadcast_to(dwell > 0.0, self.expected.shape)
         asked = self.expected.replace(dwell_map=dwell, is_observed=seen)
-        noise = self.scene.noise.changed(background_per_pixel=BACKGROUND * COUNTS, dwell_s=None)
+        noise = self.scene.noise.changed(background_per_pixel=BACKGROUND * self.counts, dwell_s=None)
         return add_noise(asked, noise, seed)
 
     def region(self, share: float | None) -> tuple[float, float, float, float] | None:
@@ -145,7 +148,7 @@ def loop_rows(
         spent.append(heights[0])
         even.append(heights[1])
         ratios += heights[2]
-    truth = true_height(case.scene, hx.reconstruct(case.expected, "nearfield", samples=0)).height
+    truth = case.truth
     use = scored(case, truth, region)
     square = np.array([[np.mean((h - truth)[use] ** 2) for h in arm] for arm in (spent, even)])  # [arm, seed]
     ratio = square[0] / square[1]
@@ -194,19 +197,19 @@ def expected_rows(case: Case, settings: ReconstructSettings, rotation: float | N
     return rows
 
 
-def sphere_a(size: int) -> Case:
+def sphere_a(size: int, counts: float) -> Case:
     """Trace sphere A on a raster of so many pixels a side."""
     changes = {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": 30.0 * 121 / size}
-    return Case.of("sphere A", load_scene("sphere_a", changes))
+    return Case.of("sphere A", load_scene("sphere_a", changes), counts)
 
 
-def mesa(size: int, seed: int) -> Case:
+def mesa(size: int, seed: int, counts: float) -> Case:
     """Trace the first mesa of one level without a hole; the family also has pits and rings."""
     for member in members("mesa", seed, range(100), (size, size)):
         kind = member.about["kind"]
         if kind.startswith("mesa") and "ring" not in kind and len(member.levels) == 1:
             with tempfile.TemporaryDirectory() as folder:
-                return Case.of(kind, load_scene(member.write(Path(folder))))
+                return Case.of(kind, load_scene(member.write(Path(folder))), counts)
     raise AssertionError("a hundred members of a family without one of its kinds")
 
 
@@ -216,6 +219,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--decisions", type=int, default=10)
     parser.add_argument("--size", type=int, default=31)
+    parser.add_argument("--counts", type=float, default=COUNTS, help="mean counts of a pixel of the first scan")
     parser.add_argument("--shapes", default="sphere,mesa")
     parser.add_argument("--regions", default="middle,all")
     parser.add_argument("--seed", type=int, default=5, help="of the mesa")
@@ -226,7 +230,7 @@ def main() -> None:
         args.seeds, args.decisions, args.size, args.shapes, args.regions = 1, 1, 11, "sphere", "middle"
     rows: list[Row] = []
     for shape in args.shapes.split(","):
-        case = sphere_a(args.size) if shape == "sphere" else mesa(args.size, args.seed)
+        case = sphere_a(args.size, args.counts) if shape == "sphere" else mesa(args.size, args.seed, args.counts)
         settings = case.scene.reconstruct
         if args.tiny:
             quick = {"max_rounds": 1, "rays": 20_000, "photometric_rounds": 1, "samples": 0}

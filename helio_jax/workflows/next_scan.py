@@ -42,6 +42,9 @@ LEAST_DWELL = 0.02
 FAR = 5.0
 """Heights of the region whose standard deviation exceeds this multiple of the region's median do not count: walls and
 floating parts, which hardly any counting determines, would else dominate the mean variance."""
+NOISY = 0.1
+"""Relative noise of a pixel's counts above which fits are not linear in it: in simulated loops (docs/next.md) the gain
+was that expected with 200 counts per pixel, and none with 20."""
 _SAME_DEG = 1e-3
 
 
@@ -246,6 +249,11 @@ def next_scan(
         raise KeyboardInterrupt
     for text in warnings_of(fit):
         say(f"warning: {text}")
+    if fit.problem.slope_noise > NOISY:
+        say(
+            f"warning: the counts of a pixel are known to {fit.problem.slope_noise:.0%} only (limit {NOISY:.0%}), where fits "
+            "are no longer linear in the noise: expected gains may not come true; scan evenly once more before"
+        )
     if further:
         say(f"expected images at {', '.join(f'{a:g}' for a in rotations_deg)} deg")
     orientations = _orientations(stack, present, further, motions, block)
