@@ -126,6 +126,14 @@ def test_dwell_time_must_be_known(first):
         hx.next_scan(first.replace(dwell=None), 10.0)
 
 
+def test_few_counts_are_warned_of():
+    """About 6 counts per pixel are known to 40 %. Catches a promise that simulated loops did not keep."""
+    said: list[str] = []
+    few = recorded("sphere_a", **{"scan.atoms_per_pixel": 500})
+    hx.next_scan(few, SECONDS, region_um=REGION, settings=QUICK, say=said.append)
+    assert any("known to" in text and "linear in the noise" in text for text in said)
+
+
 def test_scans_without_noise_or_time_of_their_own_are_refused(first):
     """Catches a variance that is the tracer's, and dwell times of a mixture."""
     with pytest.raises(SceneError, match="no counting noise to reduce"):
