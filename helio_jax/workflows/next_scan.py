@@ -252,8 +252,8 @@ def next_scan(
     noise = fit.problem.slope_noise
     if noise > NOISY:
         say(
-            f"warning: the counts of a pixel are known to {noise:.0%} only (limit {NOISY:.0%}), where fits are no longer "
-            "linear in the noise: expected gains may not come true; scan evenly once more before"
+            f"warning: the counts of a pixel are known to {noise:.0%} only (limit {NOISY:.0%}), where fits are no "
+            "longer linear in the noise: expected gains may not come true; scan evenly once more before"
         )
     if further:
         say(f"expected images at {', '.join(f'{a:g}' for a in rotations_deg)} deg")
