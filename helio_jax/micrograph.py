@@ -58,6 +58,10 @@ class ScanAlignment:
             object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
+SIMULATED_PARTS = "by_order", "effuse", "plate", "masked", "shadowed"
+"""Fields that only the simulation of one scan on its own raster has: what is made of scans has none of them."""
+
+
 @dataclass(frozen=True, repr=False)
 class MicrographStack(OnRaster):
     """Images of one scan, all detectors on one raster (frozen, checked when made).

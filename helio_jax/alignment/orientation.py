@@ -17,7 +17,7 @@ import numpy as np
 from helio_jax.detector import Aperture
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import SIMULATED_PARTS, MicrographStack
 
 MAX_PERMUTED = 4
 """Up to so many detectors all orders of the images are tried; with more only shifts and reversals along the ring."""
@@ -127,7 +127,7 @@ def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
     background = stack.background
     if background is not None and background.ndim == 3:
         background = of(background)
-    dropped = dict.fromkeys(("by_order", "effuse", "plate", "masked", "shadowed", "parallax", "parallax_height"))
+    dropped = dict.fromkeys((*SIMULATED_PARTS, "parallax", "parallax_height"))
     return stack.replace(
         counts=of(stack.counts),
         x=stack.x[: columns * n].reshape(columns, n).mean(1),
