@@ -151,13 +151,17 @@ class DwellInformation:
     def posterior(self, seconds: np.ndarray, n_samples: int) -> Posterior:
         """Compute the posterior that dwell times [detector, y, x] of the full raster would leave.
 
-        As that of a fit: prediction errors agree between neighbours, and error bars are inflated alike.
+        As that of a fit: prediction errors agree between neighbours, numbers that are not fitted err as before, and
+        error bars are inflated alike.
         """
         t = self.thinned(seconds)
         linear = self.linear_at(t, self.edge_factor(t))
         share = np.where(self.is_observed, self.model * t / (self.counting + self.model * t), 0.0)
         error = replace(self.at.error, share=share)
-        found = sample_posterior(linear, n_samples, error=error, edge_error=self.at.edge_error)
+        # of heavier data the same error is more standard deviations
+        heavier = np.sqrt(self.information(t)[0]).reshape(-1, 1)
+        unfitted = None if self.at.unfitted is None else heavier * self.at.unfitted
+        found = sample_posterior(linear, n_samples, error=error, edge_error=self.at.edge_error, unfitted=unfitted)
         return inflated(found.levelled(self.at.planes), self.state).on_raster(self.shape, self.at.stride)
 
 

@@ -8,8 +8,10 @@ import pytest
 
 import helio_jax as hx
 from helio_jax.forward.render import detection_probability, masking_corrections
+from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.dwell_information import EDGE_NOISE, DwellInformation, RegionVariance
 from helio_jax.inverse.edges import NOISE_FLOOR, find_edges
+from helio_jax.inverse.fit import posterior_at
 from helio_jax.inverse.further_images import noise_of_signal, parallax_of_image
 from helio_jax.inverse.posterior import exact_height_covariance
 from helio_jax.inverse.problem import FitProblem
@@ -38,14 +40,15 @@ def region(raster) -> np.ndarray:
     return np.hypot(*np.meshgrid(raster.x, raster.y)) < 500.0
 
 
-def posed(bshem, raster, height, seconds: np.ndarray) -> DwellInformation:
+def posed(bshem, raster, height, seconds: np.ndarray, uncertainty: Uncertainty | None = None) -> DwellInformation:
     """Linearise at the true heights, counted for dwell times [detector, y, x]."""
     optics, settings = hx.Optics.of(bshem), ReconstructSettings()
     surface = jax.tree.map(np.asarray, hx.surface_of_heights(height, raster))
     with jax.enable_x64(True):
         corrections = masking_corrections(surface, optics, raster)
         probability = np.asarray(detection_probability(surface, optics, corrections, 1.0))
-    problem = FitProblem.of(probability, probability / (DOSE * seconds), optics, raster, surface, settings)
+    known = optics, raster, surface, settings
+    problem = FitProblem.of(probability, probability / (DOSE * seconds), *known, uncertainty=uncertainty)
     state = set_corrections(problem, FitState.at(problem, surface), corrections, surface)
     return DwellInformation.of(problem, with_responses(problem, state), seconds, edge_noise=NOISE_FLOOR)
 
@@ -155,3 +158,18 @@ def test_parallax_of_an_image_on_a_slope():
     image = 2.0 * (x + height * shift[0]) + 0.7 * (y + height * shift[1])
     found = parallax_of_image(image, height, raster, shift)
     assert np.allclose(found, 2.0 * shift[0] + 0.7 * shift[1])
+
+
+def test_incidence_that_is_not_fitted_errs_at_all_dwell_times(bshem, raster, height, seconds):
+    """At the present dwell times the error bars are those of the fit; at longer ones the incidence's error stays.
+
+    Same random numbers: equal to rounding. With 100 times the time counting noise is a tenth: what 5 deg of incidence
+    do to heights is then more than half of the error bar. Rejects a posterior that forgets the incidence, and one whose
+    error falls with the counts.
+    """
+    about = posed(bshem, raster, height, seconds, Uncertainty(incidence_deg=5.0))
+    certain = posed(bshem, raster, height, seconds)
+    fit = posterior_at(about.at.problem, about.state, 100)
+    assert about.posterior(seconds, 100).height_std == pytest.approx(fit.height_std, rel=1e-6)
+    longer, without = (a.posterior(100.0 * seconds, 400).height_std.mean() for a in (about, certain))
+    assert longer > 1.15 * without
