@@ -151,13 +151,14 @@ class Uncertainty(Settings):
     """Of the azimuth of each aperture about the nominal spot [deg]."""
     plate_shift_um: float = Field(default=0.0, ge=0.0, le=1e5)
     """Of the shift of the plate with all its apertures against the beam, along each of x and y; used by `helio
-    calibrate --known`, as the next three [um]."""
+    calibrate --known`, as the next two [um]."""
     plate_scale: float = Field(default=0.0, ge=0.0, le=1.0)
     """Of the scale of the plate's plane, relative."""
     plate_rotation_deg: float = Field(default=0.0, ge=0.0, le=45.0)
     """Of the plate's rotation about its normal [deg]."""
     incidence_deg: float = Field(default=0.0, ge=0.0, le=20.0)
-    """Of the beam's incidence [deg]."""
+    """Of the beam's incidence: fitted by `helio calibrate --known`; elsewhere taken as stated, and its effect added to
+    the error bars of heights, by `refine` only for scans of one beam [deg]."""
 
     @property
     def is_stated(self) -> bool:
@@ -168,7 +169,8 @@ class Uncertainty(Settings):
 class Covariance(Settings):
     """How the errors of a calibrated geometry belong together: table `[covariance]` of an instrument file.
 
-    Written by `helio calibrate --known`; its parameters move the whole plate as `Optics.moved` does.
+    Written by `helio calibrate --known`; its parameters move the whole plate as `Optics.moved` does. Reconstructions
+    take their prior of distance and directions from it (`GeometryPrior`).
     """
 
     parameters: tuple[str, ...] = Field(min_length=1, max_length=300)

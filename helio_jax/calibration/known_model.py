@@ -23,6 +23,7 @@ from helio_jax.forward.surface import unit_normal
 RADIOSITY_PIXELS = 25
 """Pixels along the longer side of the raster on which the derivative of the multiple scattering is computed, about."""
 _LEAST_SHARE = 1e-15
+"""Added to shares and squares whose logarithm or root is taken."""
 
 
 class Multiple(eqx.Module):
@@ -133,8 +134,9 @@ class ScanModel(eqx.Module):
 
 
 class Seen(NamedTuple):
-    """Where the pixels of a scan lie, NumPy: heights [y, x], um; which lie on the object [y, x]; which apertures are
-    partly hidden [detector, y, x]; distance of the surface points from the object's axis or edge [y, x], um."""
+    """Where the pixels of a scan lie, NumPy: heights [y, x], um; which lie on the object [y, x]; from which pixels of
+    the substrate the object hides part of an aperture [detector, y, x]; distance of the surface points from the axis or
+    edge of the object [y, x], um."""
 
     height: np.ndarray
     is_object: np.ndarray
@@ -146,10 +148,8 @@ class Seen(NamedTuple):
 def _geometry(model: ScanModel, unknowns: Any) -> Any:
     optics, shape = model.moved_optics(unknowns), model.shape_of(unknowns)
     surface, is_object = shape.seen(model.raster, optics.beam_shift)
-    is_masked = jnp.zeros((optics.n_detectors, *model.raster.shape), bool)
-    for share, part, of_object in shape.parts(model.raster, optics.beam_shift):
-        masked = masked_by_shape(shape, optics, model.raster, part, of_object)
-        is_masked |= (share > 0.5) & (jnp.sum(masked**2, 1) > 0.0)
+    masked = masked_by_shape(shape, optics, model.raster, surface, is_object=False)
+    is_masked = (jnp.sum(masked**2, 1) > 0.0) & ~is_object
     x, y = jnp.meshgrid(model.raster.x, model.raster.y)
     dx = x - surface.height * optics.beam_shift[0] - shape.place[0]
     dy = y - surface.height * optics.beam_shift[1] - shape.place[1]

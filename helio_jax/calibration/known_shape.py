@@ -2,8 +2,8 @@
 
 The unknowns of `unknowns`, each with a prior, are fitted to one or several scans at once; plate, beam and apertures are
 common to all scans, each scan has its own object and read-out. Weights are robust (Cauchy); offsets of single scan
-lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering and excluded pixels
-are computed anew in every round, for the geometry of that round.
+lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering, and on which part of
+the scene every pixel lies (expectation-maximisation), are computed anew in every round, for its geometry.
 """
 
 from collections.abc import Callable
@@ -384,17 +384,18 @@ class _Fit:
         return out
 
     def update(self, number: int) -> None:
-        """Compute multiple scattering, weights, lines and excluded pixels, at the present unknowns."""
+        """Compute multiple scattering, parts, weights and lines, at the present unknowns."""
         instrument = self.fitted()
         for i, scan in enumerate(self.scans):
             at = self.layout.of_scan(i, self.x)
             own, seen = scan.model.object_of(at), see(scan.model, at)
             if scan.known.kind != "flat":
                 self.multiple[i] = self._scattered_again(i, at, seen, instrument)
-            self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * pitch(scan.model.raster.y)
+            step = pitch(scan.model.raster.y)
+            self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * step
             self.used[i] = scan.is_used & ~_ring(scan, own, seen, self.settings)
-            wide = OUTLINE[0] * pitch(scan.model.raster.y)
-            value, log_share = parts(scan.model, at, self.multiple[i], wide)
+            # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
+            value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
                 mean = np.sum(np.exp(log_share)[:, None] * value, 0)
@@ -455,7 +456,9 @@ def _membership(
 ) -> np.ndarray:
     """Compute the probability that a pixel lies on each part, by its data and by where the outline is [part, y, x].
 
-    One of several causes far off, as dust, makes no difference: residuals count as in the fit, robustly.
+    A detector that no part explains, as with dust, makes no difference: residuals count as in the fit, robustly.
+
+    Source: expectation step of a mixture: Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1.
     """
     limit = settings.robust_limit
     loss = np.zeros(log_share.shape)

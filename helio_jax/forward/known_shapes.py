@@ -18,13 +18,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from helio_jax.forward.optics import Optics, Raster, rotation_matrix
+from helio_jax.forward.optics import Raster, rotation_matrix
 from helio_jax.forward.surface import MIN_FACING, Surface
 
 NO_HORIZON = -1e9
 """Slope of a horizon where nothing rises."""
 _TINY = 1e-12
 _NEAR = 1e-6
+"""Share of a distance by which a point that the ball covers is put beyond its outline."""
 
 
 class Part(eqx.Module):
@@ -259,8 +260,3 @@ def _share(distance: Any, width: Any) -> Any:
     is_blurred = width > 0.0
     blurred = jax.nn.sigmoid(distance / jnp.where(is_blurred, width, 1.0))
     return jnp.where(is_blurred, blurred, (distance > 0.0).astype(blurred.dtype))
-
-
-def seen_surface(shape: PlacedShape, raster: Raster, optics: Optics) -> tuple[Surface, Any]:
-    """Compute the surface that the beam of `optics` sees, and which pixels lie on the object [y, x]."""
-    return shape.seen(raster, jnp.asarray(optics.beam_shift))
