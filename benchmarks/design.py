@@ -1,8 +1,8 @@
 """Designed layouts of apertures against the B-SHeM's, confirmed by traced data on samples that the search has not seen.
 
-    python benchmarks/design.py [--members 3] [--draws 2] [--seed 5] [--output benchmarks/out] [--tiny]
+    python benchmarks/design.py [--family smooth] [--seen 6] [--members 3] [--draws 3] [--seed 5] [--tiny]
 
-The search (`hx.design`) sees samples of the family `smooth` of `benchmarks/shapes.py` (one seed); layouts of 3 and 4
+The search (`hx.design`) sees samples of a family of `benchmarks/shapes.py` (one seed); layouts of 3 and 4
 apertures at 30 deg incidence, with the total area of the B-SHeM's. The rows: other samples of that family (the next
 seed), traced under each layout with equal dose, noise drawn, reconstructed by `refine`: variance of the height errors
 and masked area by the tracer's maps, over those of the B-SHeM.
@@ -97,8 +97,9 @@ def describe(p: Proposal) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--members", type=int, default=3, help="samples of the search, and samples of the rows")
-    parser.add_argument("--draws", type=int, default=2)
+    parser.add_argument("--seen", type=int, default=6, help="samples of the search")
+    parser.add_argument("--members", type=int, default=3, help="samples of the rows, which the search has not seen")
+    parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--family", default="smooth")
     parser.add_argument("--size", type=int, default=31)
     parser.add_argument("--pixels", type=int, default=13)
@@ -110,8 +111,9 @@ def main() -> None:
     parser.add_argument("--tiny", action="store_true")
     given = parser.parse_args()
     if given.tiny:
-        given.members, given.draws, given.size, given.pixels, given.steps, given.apertures = 1, 1, 16, 7, 2, "3"
-    size, n = (given.size, given.size), given.members
+        given.seen, given.members, given.draws, given.size = 1, 1, 1, 16
+        given.pixels, given.steps, given.apertures = 7, 2, "3"
+    size = given.size, given.size
     settings = DesignSettings(
         apertures=tuple(map(int, given.apertures.split(","))), pixels=given.pixels, starts=given.starts,
         steps=given.steps, masked_weights=(0.0,) if given.tiny else (0.0, 1.0),
@@ -125,8 +127,8 @@ def main() -> None:
         (given.output / "design.json").write_text(text + "\n", encoding="utf-8")
 
     with tempfile.TemporaryDirectory() as scratch:
-        seen = [of_instrument(m, Path(scratch)) for m in members(given.family, given.seed, range(n), size)]
-        unseen_members = list(members(given.family, given.seed + 1, range(n), size))
+        seen = [of_instrument(m, Path(scratch)) for m in members(given.family, given.seed, range(given.seen), size)]
+        unseen_members = list(members(given.family, given.seed + 1, range(given.members), size))
         unseen = [of_instrument(m, Path(scratch)) for m in unseen_members]
         found = design(seen[0], samples=seen[1:], settings=settings, say=lambda text: print(text, flush=True))
         layouts = chosen(found.proposals)

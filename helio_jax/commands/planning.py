@@ -172,6 +172,8 @@ def design(
     loaded = load_scene(scene, scene_overrides(changes, **options))
     found = design_layouts(loaded, samples=[load_scene(path) for path in sample or ()], say=say)
     files = found.write(output)
+    for text in found.warnings:
+        say(f"warning: {text}")
     if as_json:
         print(json.dumps({"files": [str(file) for file in files], **found.as_dict()}))
         return

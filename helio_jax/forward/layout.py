@@ -34,9 +34,10 @@ class Layout(eqx.Module):
     working_distance: Float[Any, ""]
 
     @property
-    def radius(self) -> Any:
-        """Radius of each channel, the ellipse's semi-axis across its azimuth [detector], um."""
-        return jnp.sqrt(self.area * jnp.cos(self.polar) / np.pi)
+    def semi_axes(self) -> Any:
+        """Of each ellipse, along and across its azimuth [detector, 2], um; the latter is the radius of its channel."""
+        across = jnp.sqrt(self.area * jnp.cos(self.polar) / np.pi)
+        return jnp.stack([across / jnp.cos(self.polar), across], -1)
 
     @property
     def center(self) -> Any:
@@ -46,8 +47,7 @@ class Layout(eqx.Module):
 
     def axes(self) -> Any:
         """Compute the semi-axes as columns: along the azimuth, across it [detector, 2, 2], um."""
-        cos, sin, across = jnp.cos(self.azimuth), jnp.sin(self.azimuth), self.radius
-        along = across / jnp.cos(self.polar)
+        cos, sin, (along, across) = jnp.cos(self.azimuth), jnp.sin(self.azimuth), self.semi_axes.T
         return jnp.stack([jnp.stack([along * cos, -across * sin], -1), jnp.stack([along * sin, across * cos], -1)], -2)
 
     def optics(self, beam_shift: Any, drop: Any) -> Optics:
@@ -81,7 +81,7 @@ class Layout(eqx.Module):
     def reach(self, thickness: Any) -> jax.Array:
         """Compute how far each channel reaches from the middle of the plate, at the upper side [detector], um."""
         far = self.working_distance * jnp.tan(self.polar) * (1.0 + thickness / self.working_distance)
-        return far + self.radius / jnp.cos(self.polar)
+        return far + self.semi_axes[:, 0]
 
 
 def _distance(apart: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:

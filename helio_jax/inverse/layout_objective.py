@@ -35,12 +35,16 @@ class Ties(eqx.Module):
     total_area: float
     working_distance: float
 
-    def layout(self, unknowns: np.ndarray) -> Layout:
-        """Make the layout of unknowns as NumPy arrays."""
+    def ellipses(self, unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """Compute the working distance [um] of a layout, and of its apertures centres [detector, 2] and semi-axes
+        along and across the azimuth [detector, 2], um, and azimuths [detector], rad."""
         with jax.enable_x64(True):
-            return jax.tree.map(np.asarray, _layout_of(*self._at(unknowns)))
+            layout = _layout_of(*self.at(unknowns))
+            shape = layout.center, layout.semi_axes, layout.azimuth
+            center, semi_axes, azimuth = (np.asarray(a) for a in shape)
+            return float(layout.working_distance), center, semi_axes, azimuth
 
-    def _at(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the vector of the layout, and what it refers to."""
         return self.base + self.matrix @ unknowns, np.array([self.total_area, self.working_distance])
 
@@ -125,7 +129,7 @@ class Goal(eqx.Module):
         found, slopes = self._assessed(at, masked_weight, is_smooth=True)
         with jax.enable_x64(True):
             by_vector = [
-                np.asarray(_pulled_back(*ties._at(unknowns), self.beam_shift, np.asarray(drop, float), slope))
+                np.asarray(_pulled_back(*ties.at(unknowns), self.beam_shift, np.asarray(drop, float), slope))
                 for drop, slope in zip(self.drops, slopes, strict=True)
             ]
         value = float(np.mean(np.log(found.variance) + masked_weight * found.masked))
@@ -133,7 +137,7 @@ class Goal(eqx.Module):
 
     def _optics(self, ties: Ties, unknowns: np.ndarray) -> list[Optics]:
         with jax.enable_x64(True):
-            at = [_optics_of(*ties._at(unknowns), self.beam_shift, np.asarray(d, float)) for d in self.drops]
+            at = [_optics_of(*ties.at(unknowns), self.beam_shift, np.asarray(d, float)) for d in self.drops]
             return jax.tree.map(np.asarray, at)
 
     def _assessed(
@@ -175,13 +179,20 @@ def _pulled_back(vector: Any, scale: Any, beam_shift: Any, drop: Any, slope: Opt
 def room_of(ties: Ties, unknowns: np.ndarray, beam_shift: Any, limits: Limits) -> np.ndarray:
     """Compute by how much a layout keeps every limit [limit], mm; negative: broken."""
     with jax.enable_x64(True):
-        return np.asarray(_room(*ties._at(unknowns), beam_shift, limits))
+        return np.asarray(_room(*ties.at(unknowns), beam_shift, limits))
+
+
+def keeps_limits(ties: Ties, many: np.ndarray, beam_shift: Any, limits: Limits) -> np.ndarray:
+    """Return which of many layouts [layout, unknown] keep every limit [layout]."""
+    scale = ties.at(np.zeros(many.shape[1]))[1]
+    with jax.enable_x64(True):
+        return np.asarray(_rooms(ties.base + many @ ties.matrix.T, scale, beam_shift, limits)).min(1) >= 0.0
 
 
 def room_slope_of(ties: Ties, unknowns: np.ndarray, beam_shift: Any, limits: Limits) -> np.ndarray:
     """Compute the derivative of `room_of` [limit, unknown]."""
     with jax.enable_x64(True):
-        return np.asarray(_room_slope(*ties._at(unknowns), beam_shift, limits)) @ ties.matrix
+        return np.asarray(_room_slope(*ties.at(unknowns), beam_shift, limits)) @ ties.matrix
 
 
 @eqx.filter_jit
@@ -192,3 +203,4 @@ def _room(vector: Any, scale: Any, beam_shift: Any, limits: Limits) -> jax.Array
 
 
 _room_slope = eqx.filter_jit(jax.jacfwd(_room))
+_rooms = eqx.filter_jit(eqx.filter_vmap(_room, in_axes=(0, None, None, None)))

@@ -19,7 +19,7 @@ from helio_jax.forward.optics import Raster as BeamPositions
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.criterion import Case, pose_case
-from helio_jax.inverse.layout_objective import Assessment, Goal, Limits, Ties, room_of, room_slope_of
+from helio_jax.inverse.layout_objective import Assessment, Goal, Limits, Ties, keeps_limits, room_of, room_slope_of
 from helio_jax.planning.design_settings import DesignSettings
 from helio_jax.planning.search import minimise
 from helio_jax.planning.starts import (
@@ -43,6 +43,8 @@ MIN_SIDE = 5
 """Least pixels along the shorter side of an assessed raster."""
 TRIES = 4000
 """Draws of random layouts in which one that keeps the walls must be found."""
+BATCH = 200
+"""Of these, so many are drawn at a time."""
 
 _OF_DETECTOR = "gain", "background_per_pixel"
 
@@ -92,14 +94,11 @@ def design(
             if not is_of_scene:
                 say(f"posing {len(scenes)} samples for {n} apertures, incidence {tried:g} deg")
                 even = ring(n, 0.0, _ranges(settings, instrument.working_distance))
-                posed = _instrument_of(
-                    scene, tried, _ties(even, np.zeros((3 * n + 1, 0)), area, instrument), np.zeros(0)
-                )
+                posed = _instrument_of(scene, tried, _still(even, area, instrument), np.zeros(0))
                 goal = _goal(scenes, scene, posed, settings)
             search = _Search(scene, settings, goal, reference, n, tried, area, own if is_of_scene else None)
             found += search.proposals(say)
-    still = _ties(own, np.zeros((len(own), 0)), area, instrument)
-    room = room_of(still, np.zeros(0), goal_of_scene.beam_shift, _limits(settings))
+    room = room_of(_still(own, area, instrument), np.zeros(0), goal_of_scene.beam_shift, _limits(settings))
     wall = 1e3 * float(room.min()) + settings.wall_um
     base = _assessed(reference, reference, instrument, "scene", 0.0, "as given", wall)
     first, *others = with_best([base, *distinct(found)])
@@ -113,6 +112,11 @@ def _goal(scenes: Sequence[SceneFile], scene: SceneFile, instrument: Instrument,
 
 def _ties(base: np.ndarray, matrix: np.ndarray, area: float, instrument: Instrument) -> Ties:
     return Ties(base, matrix, area, instrument.working_distance)
+
+
+def _still(layout: np.ndarray, area: float, instrument: Instrument) -> Ties:
+    """Make a layout without unknowns."""
+    return _ties(layout, np.zeros((len(layout), 0)), area, instrument)
 
 
 def _limits(s: DesignSettings) -> Limits:
@@ -129,15 +133,12 @@ def _ranges(s: DesignSettings, working_distance: float) -> Ranges:
 
 def _instrument_of(scene: SceneFile, incidence_deg: float, ties: Ties, x: np.ndarray, drop: float = 0.0) -> Instrument:
     """Make the instrument of a layout, apertures by azimuth, the substrate `drop` below the nominal spot [um]."""
-    layout, detectors = ties.layout(x), []
-    w = float(layout.working_distance)
-    for k, i in enumerate(np.argsort(np.mod(layout.azimuth, 2.0 * np.pi), kind="stable"), 1):
-        polar, azimuth = float(layout.polar[i]), math.remainder(float(layout.azimuth[i]), 2.0 * math.pi)
-        reach, across = w * math.tan(polar), math.sqrt(float(layout.area[i]) * math.cos(polar) / math.pi)
+    (w, center, semi_axes, azimuth), detectors = ties.ellipses(x), []
+    for k, i in enumerate(np.argsort(np.mod(azimuth, 2.0 * np.pi), kind="stable"), 1):
         ellipse = {
-            "center_um": (reach * math.cos(azimuth), reach * math.sin(azimuth)),
-            "axes_um": (2.0 * across / math.cos(polar), 2.0 * across),
-            "rotation_deg": math.degrees(azimuth),
+            "center_um": tuple(center[i].tolist()),
+            "axes_um": tuple((2.0 * semi_axes[i]).tolist()),
+            "rotation_deg": math.degrees(math.remainder(float(azimuth[i]), 2.0 * math.pi)),
         }
         detectors.append(Detector(name=f"d{k}", **ellipse))
     plate = scene.plate.model_copy(update={"working_distance_um": w, "sample_distance_um": w + drop})
@@ -250,13 +251,12 @@ class _Search:
             candidates.append((pattern, paired(n, pattern, single, ranges)))
         yield from (c for c in candidates if self._keeps(*c))
         rng, n_found = np.random.default_rng([self.settings.seed, n]), 0
-        for _ in range(TRIES):
-            x = free.unknowns_of(random_layout(n, ranges, rng))
-            if self._keeps(free, x):
+        for _ in range(TRIES // BATCH):
+            drawn = np.array([free.unknowns_of(random_layout(n, ranges, rng)) for _ in range(BATCH)])
+            is_kept = keeps_limits(self._ties(free), drawn, self.goal.beam_shift, _limits(self.settings))
+            for x in drawn[is_kept][: self.settings.starts - n_found]:
                 yield free, x
                 n_found += 1
-                if n_found == self.settings.starts:
-                    return
 
     def _keeps(self, pattern: Pattern, x: np.ndarray) -> bool:
         return bool(self._room(self._ties(pattern), x).min() >= 0.0)

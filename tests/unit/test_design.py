@@ -19,7 +19,7 @@ from helio_jax.planning.design_settings import MAX_KEPT, DesignSettings
 from helio_jax.planning.search import minimise
 from helio_jax.planning.starts import Ranges, free_pattern, paired, paired_pattern
 from helio_jax.workflows import design as designing
-from helio_jax.workflows.design_result import Proposal, distinct, kept, with_best
+from helio_jax.workflows.design_result import Design, Proposal, distinct, kept, with_best
 from helio_jax.workflows.scene_file import SceneFile, load_scene
 
 W = 4000.0
@@ -151,6 +151,13 @@ def test_ranking(scene):
     assert [p.height_std_um for p in marked] == [1.0, 2.0, 2.0, 3.0]
     assert [p.is_best for p in marked] == [True, True, False, True]
     assert [p.masked for p in kept(marked, 2)] == [0.1, 0.05] and len(kept(marked, 9)) == 4
+
+
+def test_masked_samples_are_warned_of(scene):
+    """Catches a gain promised in silence where traced samples did not confirm it, and a warning of unmasked samples."""
+    few, many = (proposal(scene, 1.0, masked, 1.0) for masked in (0.005, 0.05))
+    told = [Design("s", (), p, (), (), 1.0).warnings for p in (few, many)]
+    assert not told[0] and "walls" in told[1][0] and "5.0%" in told[1][0]
 
 
 def test_limits_hold_in_the_result(scene, found):
