@@ -106,8 +106,8 @@ class Design:
             return ()
         return (
             f"the samples mask {self.reference.masked:.1%} of the scene's apertures (limit {MASKED:.0%}): expected "
-            "variances take the walls for known, and traced samples did not confirm them; simulate and reconstruct with "
-            "a layout before it is made",
+            "variances take the walls for known, and traced samples did not confirm them: simulate and reconstruct "
+            "with a layout before it is made",
         )
 
     def as_dict(self) -> dict[str, Any]:
