@@ -1,4 +1,6 @@
-"""Bring a fit to what the user knows of the heights, and compare each anchor with all else that is known.
+"""Bring a fit to what is known of the heights beside its data, and compare each anchor with all else that is known.
+
+Known are what the user states, and the steps that mask bands measure.
 
 The joint posterior of a fit says how heights and instrument go with a sum of heights: known sums move all of them, as
 in a Kalman filter, and shrink their errors. Unlike a fit to data and anchors together this needs no gains that are free
@@ -7,7 +9,7 @@ first order: the data are tested on the heights as moved (`verdict`).
 """
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,9 +18,12 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, at_state, with_posterior
 from helio_jax.inverse.known_heights import anchor_name, anchors_of
+from helio_jax.inverse.measured_steps import anchors_of_steps
 from helio_jax.inverse.posterior import tilts_of
+from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import regions
 from helio_jax.inverse.solver import free_parameters
+from helio_jax.inverse.step_records import Steps
 
 LIMIT = 3.5
 """Deviation from everything else at which an anchor is said to contradict it [standard deviations]: 1 in 2000 of right
@@ -27,6 +32,8 @@ MAX_PLACINGS = 3
 """An oblique beam sees a place elsewhere on the heights as moved: how often the pixels of the anchors are found."""
 _ISLAND = 2, 4
 """Pixels of an anchored region that is an island at most: a factor of those anchored, and more."""
+MEASURED = "mask bands"
+"""Kind of an anchor that is measured."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class AnchorCheck:
     """What an anchor did; heights in um, of the sum of heights that it is about.
 
     Attributes:
-        name, kind: as stated; name: its number by default.
+        name, kind: as stated; name: its number by default. A measured step has the kind `MEASURED`.
         stated, stated_std: height and standard deviation that were stated, or follow from the length of the mask.
         fitted: height of the map.
         without, without_std: what data, priors and the other anchors say, those left out that contradict them.
@@ -54,6 +61,12 @@ class AnchorCheck:
 
     def sentence(self) -> str:
         """Write what to know of one that does not agree."""
+        if self.kind == MEASURED:
+            return (
+                f"{self.name} is {self.stated:.4g} +- {self.stated_std:.2g} um high by its mask bands and "
+                f"{self.without:.4g} +- {self.without_std:.2g} um by all else, {abs(self.pull):.1f} standard deviations "
+                "apart: not used, the error bars contain the difference"
+            )
         about = f"anchor {self.name!r} ({self.kind} {self.stated:.4g} +- {self.stated_std:.2g} um)"
         if abs(self.pull) <= LIMIT:
             return f"{about} is at pixels that depth jumps part from all around them: it determines little of the rest"
@@ -105,37 +118,68 @@ def pulls_of(leverage: np.ndarray, residual: np.ndarray) -> np.ndarray:
         wrong.append(max(left, key=lambda i: abs(found[2, i])))
 
 
-def with_anchors(fit: Fit) -> tuple[Fit, tuple[AnchorCheck, ...]]:
-    """Compute the error bars of a fit (`with_posterior`), and bring it to what the user knows, if anything.
+class _Known(NamedTuple):
+    """Anchors with their names and kinds, in their order."""
+
+    names: tuple[tuple[str, str], ...]
+    anchors: Anchors
+
+    @property
+    def is_measured(self) -> np.ndarray:
+        """Which are measured steps [anchor]."""
+        return np.array([kind == MEASURED for _, kind in self.names], bool)
+
+    @classmethod
+    def of(cls, problem: FitProblem, surface: Surface, steps: Steps | None) -> "_Known":
+        """Find the pixels of all anchors on a surface near the one sought."""
+        stated = problem.reconstruct_settings.anchor
+        detectors = () if problem.instrument is None else problem.instrument.detector_names
+        anchors = anchors_of(stated, problem.raster, problem.optics, surface, detectors)
+        names = [(anchor_name(i, one), one.kind) for i, one in enumerate(stated)]
+        if steps is not None:
+            is_known = np.any(problem.anchors.weight > 0, axis=0)
+            numbers, measured = anchors_of_steps(steps, surface, problem.raster, is_known)
+            anchors = anchors.and_also(measured)
+            names += [(f"step {number}", MEASURED) for number in numbers]
+        return cls(tuple(names), anchors)
+
+
+def with_anchors(fit: Fit, steps: Steps | None = None) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+    """Compute the error bars of a fit (`with_posterior`), and bring it to what is known beside its data, if anything.
 
     Without error bars (interrupted, or `samples = 0`) anchors are not used.
+
+    Args:
+        fit: without error bars.
+        steps: measured in its micrographs.
 
     Raises:
         SceneError: as `anchors_of`.
     """
-    stated, problem = fit.problem.reconstruct_settings.anchor, fit.problem
-    if not stated:
-        return with_posterior(fit), ()
-    names = () if problem.instrument is None else problem.instrument.detector_names
     here, found, anchors = fit, (), None
     for _ in range(MAX_PLACINGS):
-        placed = anchors_of(stated, problem.raster, problem.optics, here.surface, names)
-        if anchors is not None and np.array_equal(placed.weight, anchors.weight):
+        known = _Known.of(fit.problem, here.surface, steps)
+        if not known.names:
+            return with_posterior(fit), ()
+        if anchors is not None and np.array_equal(known.anchors.weight, anchors.weight):
             break
-        anchors = placed
+        anchors = known.anchors
         before = with_posterior(fit, anchors)
         if before.posterior is None:
             return before, ()
-        here, found = _moved(before, anchors)
+        here, found = _moved(before, known)
     return here, found
 
 
-def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
-    """Move a fit with error bars to anchors. Where one contradicts all else, what they changed is an error of its own.
+def _moved(fit: Fit, given: _Known) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+    """Move a fit with error bars to anchors.
+
+    Where a stated one contradicts all else, what they changed is an error of its own; a measured one that does is not
+    used, and what it would have changed is.
 
     Source: Kalman, J. Basic Eng. 82 (1960) 35; samples: Hoffman and Ribak, Astrophys. J. 380 (1991) L5.
     """
-    posterior = fit.posterior
+    posterior, anchors = fit.posterior, given.anchors
     assert posterior is not None and posterior.sums is not None
     sums, shape = posterior.sums, fit.surface.height.shape
     weight, n = anchors.weight.reshape(len(anchors.value), -1), len(anchors.value)
@@ -148,6 +192,11 @@ def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
     known = factor * sums.own + by_modes @ by_modes.T
     inverse = np.linalg.inv(known + np.eye(n))
     off = weight @ fit.surface.height.ravel() - anchors.value
+    found = _checks(fit, given, known - known @ inverse @ known, inverse @ off)
+    is_wrong = np.array([abs(one.pull) > LIMIT for one in found])
+    is_used = ~(is_wrong & given.is_measured)
+    of_all, inverse = inverse @ off, np.zeros((n, n))
+    inverse[np.ix_(is_used, is_used)] = np.linalg.inv((known + np.eye(n))[np.ix_(is_used, is_used)])
     answer = inverse @ off
 
     state = fit.state
@@ -173,9 +222,9 @@ def _moved(fit: Fit, anchors: Anchors) -> tuple[Fit, tuple[AnchorCheck, ...]]:
         instrument_covariance=(ways * np.maximum(of_instrument, 1e-6)) @ ways.T,
         common_modes=modes - np.einsum("ae,ab,byx->eyx", by_modes, inverse, heights.reshape(n, *shape)),
     )
-    found = _checks(fit, anchors, known - known @ inverse @ known, answer)
-    if any(abs(one.pull) > LIMIT for one in found):  # either the anchor is wrong, or all else
-        conditioned = conditioned.with_common_mode((answer @ heights).reshape(shape))
+    if is_wrong.any():  # either the anchor is wrong, or all else
+        change = of_all if (is_wrong & is_used).any() else of_all - answer
+        conditioned = conditioned.with_common_mode((change @ heights).reshape(shape))
     return at_state(fit, moved, conditioned), found
 
 
@@ -186,24 +235,26 @@ def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarra
     return height - np.einsum("at,tyx->ayx", instrument[:, tilts], planes[: len(tilts)])
 
 
-def _checks(fit: Fit, anchors: Anchors, leverage: np.ndarray, residual: np.ndarray) -> tuple[AnchorCheck, ...]:
+def _checks(fit: Fit, given: _Known, leverage: np.ndarray, residual: np.ndarray) -> tuple[AnchorCheck, ...]:
     """Compare every anchor with all else; arguments as in `leave_out`."""
-    off, std, pull = pulls_of(leverage, residual)
+    anchors, (off, std, pull) = given.anchors, pulls_of(leverage, residual)
     region, out = regions(fit.joined_x, fit.joined_y), []
-    for i, anchor in enumerate(fit.problem.reconstruct_settings.anchor):
+    for i, (name, kind) in enumerate(given.names):
         unit = 1.0 / float(np.maximum(anchors.weight[i], 0.0).sum())
         value = float(anchors.value[i]) * unit
         out.append(
             AnchorCheck(
-                name=anchor_name(i, anchor),
-                kind=anchor.kind,
+                name=name,
+                kind=kind,
                 stated=value,
                 stated_std=unit,
                 fitted=value + float(residual[i]) * unit,
                 without=value + float(off[i]) * unit,
                 without_std=float(std[i]) * unit,
                 pull=float(pull[i]),
-                agrees=bool(abs(pull[i]) <= LIMIT and not _is_island(region, anchors.weight[i])),
+                agrees=bool(
+                    abs(pull[i]) <= LIMIT and (kind == MEASURED or not _is_island(region, anchors.weight[i]))
+                ),
             )
         )
     return tuple(out)

@@ -30,6 +30,9 @@ _BASE_STD = 0.04
 """Prior standard deviation of a constant on the lower level, where it is not the pedestal [signal of the level]."""
 _SLOPE_STD = 0.1
 """Prior standard deviation of a slope of the lower level's signal, over the range of the data."""
+_WALL_STD = 0.3
+"""Prior standard deviations of the signal of a masked wall and of its change over the wall, beyond the prediction: what
+else the wall sees is not modelled [signal of the level]."""
 _OUTLIER = 3.0
 """Residual from which on a pixel loses weight [standard deviations]."""
 _PLACES = np.arange(-0.8, 0.81, 0.08)
@@ -140,11 +143,12 @@ def _columns(pixels: _Pixels, height: float, blur: float) -> np.ndarray:
     scattered, slope = is_low * s.on_level(d), is_low * np.maximum(u, 0.0) / (u.max() + 1e-9)
     if pixels.kind == "dark":
         direct = is_low * (1.0 - s.masked(d))
-        return np.stack([1.0 - below, direct, scattered + is_wall * s.on_wall(z), below, slope])
+        on_wall = [is_wall, is_wall * (z - 0.5)]
+        return np.stack([1.0 - below, direct, scattered + is_wall * s.on_wall(z), below, slope, *on_wall])
     return np.stack([1.0 - below, is_low, scattered, slope, is_wall, is_wall * (z - 0.5)])
 
 
-_CENTER = {"dark": np.array([1.0, 1.0, 1.0, 0.0, 0.0]), "lit": np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0])}
+_CENTER = {"dark": np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), "lit": np.array([1.0, 1.0, 1.0, 0.0, 1.0, 0.0])}
 """Prior means of the levels."""
 
 
@@ -163,7 +167,7 @@ def _residuals(
     for end in {0.0, s.strip * height}:
         error += ndtr(-np.abs(u - end) / blur) - ndtr(-np.abs(u - end) / spot)
     sigma = np.sqrt(pixels.variance + MODEL_ERROR**2 + error**2)
-    more = (pixels.base_std, _SLOPE_STD) if kind == "dark" else (_SLOPE_STD, 2.0, 1.0)
+    more = (pixels.base_std, _SLOPE_STD, _WALL_STD, _WALL_STD) if kind == "dark" else (_SLOPE_STD, 2.0, 1.0)
     std = np.array([0.3, 0.3, _SCATTER_STD[kind], *more])
     a = np.concatenate([(columns / sigma).T, np.diag(1.0 / std)])
     b = np.concatenate([pixels.data / sigma, _CENTER[kind] / std])

@@ -26,6 +26,7 @@ from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of, solve_known_albedo
 from helio_jax.inverse.mask_steps import find_steps
+from helio_jax.inverse.measured_steps import walls_of
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.pits import PitSearch
@@ -34,6 +35,7 @@ from helio_jax.inverse.quality import half_chi_square, squares
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
+from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.verdict import local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
@@ -61,6 +63,7 @@ class Explanation(NamedTuple):
         number: of the object or pit of every pixel, 0: flat substrate [y, x]; None: no flat substrate is assumed.
         kind: "objects on" or "pits in" the substrate.
         n_steps: number of regions that are held at the levels of measured steps.
+        steps: measured in the micrographs; None where none can be.
     """
 
     fit: Fit
@@ -68,6 +71,7 @@ class Explanation(NamedTuple):
     number: np.ndarray | None = None
     kind: str = ""
     n_steps: int = 0
+    steps: Steps | None = None
 
     @property
     def assumed(self) -> str:
@@ -97,11 +101,11 @@ def explain(
         best, others = fits.from_heights(start, none), (fits.from_albedo_patches,)
     for other in others:
         if best.fit.is_interrupted:
-            return best
+            break
         try:
             residuals = fits.residuals(best.fit)
             if fits.contradicted(residuals) < MIN_CONTRADICTED:
-                return best
+                break
             found = other(best, residuals)
             if found is None:
                 continue
@@ -111,7 +115,7 @@ def explain(
                 best = found
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
-    return best
+    return best._replace(steps=fits.steps)
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,19 @@ class _Fits:
     @property
     def n_pixels(self) -> int:
         return self.stack.counts[0].size
+
+    @cached_property
+    def steps(self) -> Steps | None:
+        """Steps that mask bands show; None where steps cannot be measured."""
+        try:
+            return find_steps(self.stack)
+        except SceneError:
+            return None
+
+    @cached_property
+    def walls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges between pixels that cross a wall."""
+        return walls_of(self.steps, Raster.of(self.stack))
 
     @cached_property
     def predict(self) -> Predict:
@@ -163,6 +180,7 @@ class _Fits:
             anchors=anchors,
             parallax=parallax_of(self.stack),
             noise_share=noise_share_of(self.stack),
+            walls=self.walls,
         )
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
@@ -236,7 +254,7 @@ class _Fits:
         start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
-        if steps := measured_regions(self.stack, start):
+        if steps := measured_regions(self.steps, start):
             raster = Raster.of(self.stack)
             try:
                 found = search_levels(
@@ -251,8 +269,10 @@ class _Fits:
                 )
                 start, is_undecided = found.surface, covered(steps, found.undecided)
                 if moved := [steps[i] for i in found.moved]:
-                    labels = labelled(moved)
-                    anchors = level_anchors(labels, moved, start)
+                    all_labels = labelled(moved)
+                    anchors = level_anchors(all_labels, moved, start)
+                    # masks on the raster, whose edges lie on pixels, would pull measured levels off
+                    labels = np.where(np.isin(all_labels, measured_among(moved)), 0, all_labels)
             except PredictionError as e:  # the fit begins at a smoother start
                 self.say(f"levels of measured steps are given up: {e}")
         fit = self.fitted(start, smoothed, patches, labels, anchors)
@@ -362,14 +382,12 @@ def scan_order(stack: MicrographStack) -> ScanOrder:
     return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
 
 
-def measured_regions(stack: MicrographStack, start: Surface) -> list[Region]:
-    """Find the patches whose steps the mask bands show, the largest first; none where steps cannot be measured.
+def measured_regions(found: Steps | None, start: Surface) -> list[Region]:
+    """List the patches between measured steps, the largest first.
 
     Steps are measured from the substrate, which the start puts at any height where the border is free.
     """
-    try:
-        found = find_steps(stack)
-    except SceneError:
+    if found is None:
         return []
     substrate = float(np.median(start.height[found.patch == 0]))
     return [
@@ -391,6 +409,11 @@ def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -
     is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
     known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
     return Anchors.of_levels(labels, known, is_level, SKIRT)
+
+
+def measured_among(regions: list[Region]) -> list[int]:
+    """Return the numbers, from 1, of the regions whose heights are measured."""
+    return [i for i, region in enumerate(regions, 1) if region.height is not None]
 
 
 def labelled(regions: list[Region]) -> np.ndarray:

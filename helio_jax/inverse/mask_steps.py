@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
-from helio_jax.arrays import pitch
+from helio_jax.arrays import border_mask, pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
 from helio_jax.inverse.band_fit import Band, disturbance, fit_band, kind_of, place_edge
@@ -44,6 +44,8 @@ _PLACE_STD = 0.03
 """Standard deviation of the edge's place beside the gap between lit and dark pixels [pixels]."""
 _SMALLEST = 8
 """Smallest raster [pixels]."""
+_SPLIT = 0.2
+"""Share of the border from which on a patch may be the substrate."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,9 @@ def find_steps(stack: MicrographStack) -> Steps:
     edges, measured = [edge for edge, _ in shown], [m.numbered(i) for i, (_, m) in enumerate(shown, 1)]
     patch = _patches(measured, images, levels)
     result = _joined(measured, patch, scan, levels)
-    # once more with the directions as seen from the lower level of each step
-    low = [result.patches[s.below].level_um for s in result.steps]
+    # once more with the directions as seen from the lower level of each step, above most of the border
+    ground = result.patches[int(np.argmax(_border_shares(patch)))].level_um
+    low = [result.patches[s.below].level_um - ground for s in result.steps]
     moved = [z if math.isfinite(z) else 0.0 for z in low]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
         measured = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
@@ -335,15 +338,24 @@ def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
     return out
 
 
+def _border_shares(patch: np.ndarray) -> np.ndarray:
+    """Compute the share of every patch in the outermost ring of pixels [patch]."""
+    count = np.bincount(patch[border_mask((patch.shape[0], patch.shape[1]), 1.0 / max(patch.shape))])
+    return np.pad(count, (0, int(patch.max()) + 1 - count.size)) / count.sum()
+
+
 def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: SignalLevels) -> Steps:
     """Solve for the levels of the patches."""
     images = scan.images
     steps = []
+    # where two patches share the border, either may stand at the stated distance
+    is_split = np.sum(_border_shares(patch) > _SPLIT) > 1
     for m in measured:
         above, below = sides_of(m.edge, patch, images.place, images.side)
         step = replace(m.step, above=above, below=below)
-        if above == below:  # the level from which the detectors are seen is not known
-            unknown = 0.5 * step.height_um**2 / scan.stack.instrument.sample_distance
+        if above == below or is_split:  # the level from which the detectors are seen is not known
+            range_of_error = step.height_um**2 / scan.stack.instrument.sample_distance
+            unknown = range_of_error / (math.sqrt(3.0) if is_split else 2.0)
             step = replace(step, height_std_um=math.hypot(step.height_std_um, unknown))
         steps.append(step)
     n = int(patch.max()) + 1

@@ -171,7 +171,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         )
     check_places(settings.anchor, Raster.of(stack), Optics.of(stack.instrument), stack.instrument.detector_names)
     found = explain(stack, settings, make_predict, report, start)
-    (fit, anchors), is_floating = with_anchors(found.fit), found.is_undecided
+    (fit, anchors), is_floating = with_anchors(found.fit, found.steps), found.is_undecided
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:
         region = regions(fit.joined_x, fit.joined_y)

@@ -53,6 +53,7 @@ class FitProblem:
             for one beam.
         parallax_height: at which the images of several beams were read [y, x], um.
         noise_share: noise of every pixel over the typical one, by its dwell time [y, x]; None: all alike.
+        walls: whether a wall parts neighbours along x and y [y, x - 1], [y - 1, x]; None: no wall is known.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
@@ -77,6 +78,7 @@ class FitProblem:
     parallax: np.ndarray
     parallax_height: np.ndarray
     noise_share: np.ndarray | None = None
+    walls: tuple[np.ndarray, np.ndarray] | None = None
     instrument: Instrument | None = None
     stride: int = 1
 
@@ -96,6 +98,7 @@ class FitProblem:
         anchors: Anchors | None = None,
         parallax: tuple[np.ndarray, np.ndarray] | None = None,
         noise_share: np.ndarray | None = None,
+        walls: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
@@ -120,7 +123,7 @@ class FitProblem:
             is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
             patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))),
-            noise_share, given,
+            noise_share, walls, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -272,6 +275,7 @@ class FitProblem:
             parallax=self.parallax[:, *thin],
             parallax_height=self.parallax_height[thin],
             noise_share=None if self.noise_share is None else self.noise_share[thin],
+            walls=None if self.walls is None else thinned_walls(*self.walls, stride),
             stride=stride,
         )
 
@@ -288,3 +292,11 @@ def _border_weight(shape: tuple[int, ...], settings: ReconstructSettings) -> np.
     else:
         weight[:] = 1e-3 / settings.border_std_um / np.sqrt(weight.size)
     return weight
+
+
+def thinned_walls(along_x: np.ndarray, along_y: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the walls between every `stride`-th pixel of every `stride`-th row or column."""
+    x, y = along_x[::stride], along_y[:, ::stride]
+    x, y = x[:, : (x.shape[1] // stride) * stride], y[: (y.shape[0] // stride) * stride]
+    by_x, by_y = x.reshape(len(x), -1, stride), y.reshape(-1, stride, y.shape[1])
+    return by_x.any(2), by_y.any(1)

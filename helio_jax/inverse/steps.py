@@ -94,15 +94,16 @@ _expected = compiled(lambda unknowns, fixed: expected_data(surface_of(unknowns, 
 def edges_of(
     problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[AxisEdges, AxisEdges]:
-    """Find the edges of a surface along x and along y; those that are `occluded` count as depth jumps."""
+    """Find the edges of a surface along x and along y; those at walls or `occluded` count as depth jumps."""
     found = (
         find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut),
         find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.pixel_noise, cut),
     )
-    if occluded is None:
-        return found
-    along_x, along_y = (replace(e, joined=np.where(o, 0.0, e.joined)) for e, o in zip(found, occluded, strict=True))
-    return along_x, along_y
+    for cuts in (problem.walls, occluded):
+        if cuts is not None:
+            along_x, along_y = (replace(e, joined=np.where(c, 0.0, e.joined)) for e, c in zip(found, cuts, strict=True))
+            found = along_x, along_y
+    return found
 
 
 class PixelTerms(NamedTuple):

@@ -1,0 +1,118 @@
+"""Steps that mask bands show (`mask_steps`): edges of the raster that they cut, and sums of heights that they measure.
+
+A band's length tells the height of an upper edge above the lower surface at the band's far end, whatever gain and law
+are; a fit, which holds its masks fixed in every iteration, learns little of it.
+"""
+
+import math
+
+import numpy as np
+
+from helio_jax.forward.optics import Raster
+from helio_jax.forward.surface import Surface
+from helio_jax.forward.surface import along as along_axis
+from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.step_records import Step, Steps
+
+ABOVE = -2.6, -0.6
+"""Pixels that show the height of an upper edge: their distances from it [pixels]."""
+BEYOND = 2.6
+"""Pixels that show the lower surface: so far beyond the far end of the longest band [pixels]."""
+MIN_PIXELS = 3
+"""Fewer pixels show no height."""
+WALL = 0.9
+"""Least probability that the signal falls abruptly, for a wall that parts pixels."""
+PLACES = -0.3, 0.0, 0.3
+"""Places of an edge that are allowed for: pixels may be on either side of it [pixels]."""
+MODEL_STD = 0.006
+"""Standard deviation of heights from what the model of a band neglects, as a fraction."""
+
+
+def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarray]:
+    """Find the edges between neighbouring pixels, along x and along y, that cross the upper edge of a wall.
+
+    A fit that joins the pixels on both sides bridges a low wall where no pixel shows its mask.
+
+    Args:
+        found: steps, or None.
+        raster: of the heights.
+
+    Returns:
+        Whether a wall parts pixels [y, x - 1], [y - 1, x].
+    """
+    ny, nx = raster.shape
+    cuts = np.zeros((ny, nx - 1), bool), np.zeros((ny - 1, nx), bool)
+    side = math.sqrt(float(raster.dx) * float(raster.dy))
+    for step in () if found is None else found.steps:
+        if step.p_wall < WALL or step.above == step.below:
+            continue
+        distance, along, length = _beside(step, raster)
+        is_beside = np.abs(along) <= 0.5 * length + side
+        for shift in PLACES:
+            is_low = distance > shift * side
+            for axis, cut in zip((1, 0), cuts, strict=True):
+                cut |= np.diff(is_low, axis=axis) & np.logical_and(*along_axis(is_beside, axis))
+    return cuts
+
+
+def anchors_of_steps(
+    found: Steps, surface: Surface, raster: Raster, is_known: np.ndarray
+) -> tuple[tuple[int, ...], Anchors]:
+    """Express the heights of measured steps by the heights of the pixels beside them.
+
+    The sum of heights is that of the upper edge above the far end of the band, to which the slopes of the surface
+    carry the heights of the pixels.
+
+    Args:
+        found: steps.
+        surface: near the one sought.
+        raster: of the heights.
+        is_known: pixels whose level has been taken from steps before [y, x].
+
+    Returns:
+        Numbers of the steps, and an anchor for each.
+    """
+    numbers, weight, value = [], [], []
+    for step in found.steps:
+        sides = _sides(step, found, raster) if step.is_used and step.above != step.below else None
+        if sides is None:
+            continue
+        upper, lower, distance, end = sides
+        if (is_known & (upper | lower)).any():
+            continue
+        falls = math.radians(step.falls_deg)
+        slope = surface.slope_x * math.cos(falls) + surface.slope_y * math.sin(falls)
+        rise = np.mean((slope * distance)[upper]) - np.mean((slope * (distance - end))[lower])
+        std = math.hypot(step.height_std_um, MODEL_STD * step.height_um)
+        numbers.append(step.number)
+        weight.append((upper / upper.sum() - lower / lower.sum()) / std)
+        value.append((step.height_um + float(rise)) / std)
+    if not numbers:
+        return (), Anchors.none(raster.shape)
+    return tuple(numbers), Anchors(np.stack(weight), np.array(value))
+
+
+def _sides(step: Step, found: Steps, raster: Raster) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+    """Find the pixels above and below a step [y, x], the distance of all from its edge [y, x], and that of the band's
+    end [um]; None where too few pixels show a side."""
+    bands = [b for b in found.bands if b.step == step.number and b.kind == "dark" and b.note == ""]
+    if not bands:
+        return None
+    side = math.sqrt(float(raster.dx) * float(raster.dy))
+    end = max(b.length_um * abs(math.cos(math.radians(b.runs_deg - step.falls_deg))) for b in bands)
+    distance, along, length = _beside(step, raster)
+    beside = np.abs(along) <= 0.5 * length
+    upper = beside & (distance > ABOVE[0] * side) & (distance < ABOVE[1] * side) & (found.patch == step.above)
+    is_low = beside & (distance > 0.5 * side) & (distance < end + BEYOND * side) & (found.patch == step.below)
+    lower = is_low & (distance > end)
+    lower = lower if lower.sum() >= MIN_PIXELS else is_low
+    return (upper, lower, distance, end) if min(upper.sum(), lower.sum()) >= MIN_PIXELS else None
+
+
+def _beside(step: Step, raster: Raster) -> tuple[np.ndarray, np.ndarray, float]:
+    """Compute the distance of every pixel from an edge, towards the lower side, and its place along the edge from the
+    middle [y, x]; and the length of the edge; um."""
+    falls, middle = math.radians(step.falls_deg), 0.5 * np.add(step.start, step.end)
+    x, y = np.asarray(raster.x)[None, :] - middle[0], np.asarray(raster.y)[:, None] - middle[1]
+    distance, along = x * math.cos(falls) + y * math.sin(falls), y * math.cos(falls) - x * math.sin(falls)
+    return distance, along, math.hypot(*np.subtract(step.end, step.start))
