@@ -20,7 +20,6 @@ from helio_jax.inverse.fit import Fit, at_state, with_posterior
 from helio_jax.inverse.known_heights import anchor_name, anchors_of
 from helio_jax.inverse.measured_steps import anchors_of_steps
 from helio_jax.inverse.posterior import tilts_of
-from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import regions
 from helio_jax.inverse.solver import free_parameters
 from helio_jax.inverse.step_records import Steps
@@ -64,8 +63,8 @@ class AnchorCheck:
         if self.kind == MEASURED:
             return (
                 f"{self.name} is {self.stated:.4g} +- {self.stated_std:.2g} um high by its mask bands and "
-                f"{self.without:.4g} +- {self.without_std:.2g} um by all else, {abs(self.pull):.1f} standard deviations "
-                "apart: not used, the error bars contain the difference"
+                f"{self.without:.4g} +- {self.without_std:.2g} um by all else, {abs(self.pull):.1f} standard "
+                "deviations apart: not used, the error bars contain the difference"
             )
         about = f"anchor {self.name!r} ({self.kind} {self.stated:.4g} +- {self.stated_std:.2g} um)"
         if abs(self.pull) <= LIMIT:
@@ -130,24 +129,44 @@ class _Known(NamedTuple):
         return np.array([kind == MEASURED for _, kind in self.names], bool)
 
     @classmethod
-    def of(cls, problem: FitProblem, surface: Surface, steps: Steps | None) -> "_Known":
+    def of(cls, fit: Fit, surface: Surface, steps: Steps | None) -> "_Known":
         """Find the pixels of all anchors on a surface near the one sought."""
+        problem = fit.problem
         stated = problem.reconstruct_settings.anchor
         detectors = () if problem.instrument is None else problem.instrument.detector_names
         anchors = anchors_of(stated, problem.raster, problem.optics, surface, detectors)
         names = [(anchor_name(i, one), one.kind) for i, one in enumerate(stated)]
+        levels = problem.anchors
         if steps is not None:
-            is_known = np.any(problem.anchors.weight > 0, axis=0)
-            numbers, measured = anchors_of_steps(steps, surface, problem.raster, is_known)
+            numbers, measured = anchors_of_steps(steps, surface, problem.raster, regions(fit.joined_x, fit.joined_y))
             anchors = anchors.and_also(measured)
             names += [(f"step {number}", MEASURED) for number in numbers]
-        return cls(tuple(names), anchors)
+            is_shown = np.any(measured.weight != 0.0, axis=0)
+            levels = levels.taken([not is_shown[inside].any() for inside in levels.weight > 0])
+        names += [(f"level {number}", MEASURED) for number in range(1, 1 + len(levels.value))]
+        return cls(tuple(names), anchors.and_also(levels))
 
 
-def with_anchors(fit: Fit, steps: Steps | None = None) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+class Anchored(NamedTuple):
+    """A fit that was brought to anchors.
+
+    Attributes:
+        fit: with error bars.
+        checks: what each anchor did.
+        used: the anchors that it was brought to.
+    """
+
+    fit: Fit
+    checks: tuple[AnchorCheck, ...]
+    used: Anchors
+
+
+def with_anchors(fit: Fit, steps: Steps | None = None) -> Anchored:
     """Compute the error bars of a fit (`with_posterior`), and bring it to what is known beside its data, if anything.
 
-    Without error bars (interrupted, or `samples = 0`) anchors are not used.
+    Without error bars (interrupted, or `samples = 0`) anchors are not used. Levels that the fit was held at are taken
+    for what they are, measured steps: error bars of a fit that holds them would be those of its own data, which it
+    trusts too much beside walls.
 
     Args:
         fit: without error bars.
@@ -156,22 +175,23 @@ def with_anchors(fit: Fit, steps: Steps | None = None) -> tuple[Fit, tuple[Ancho
     Raises:
         SceneError: as `anchors_of`.
     """
-    here, found, anchors = fit, (), None
+    found, anchors = Anchored(fit, (), fit.problem.anchors), None
     for _ in range(MAX_PLACINGS):
-        known = _Known.of(fit.problem, here.surface, steps)
+        known = _Known.of(fit, found.fit.surface, steps)
         if not known.names:
-            return with_posterior(fit), ()
+            return found._replace(fit=with_posterior(fit))
         if anchors is not None and np.array_equal(known.anchors.weight, anchors.weight):
             break
         anchors = known.anchors
-        before = with_posterior(fit, anchors)
+        free = replace(fit, problem=replace(fit.problem, anchors=Anchors.none(fit.problem.raster.shape)))
+        before = with_posterior(free, anchors)
         if before.posterior is None:
-            return before, ()
-        here, found = _moved(before, known)
-    return here, found
+            return found._replace(fit=before)
+        found = _moved(before, known)
+    return found
 
 
-def _moved(fit: Fit, given: _Known) -> tuple[Fit, tuple[AnchorCheck, ...]]:
+def _moved(fit: Fit, given: _Known) -> Anchored:
     """Move a fit with error bars to anchors.
 
     Where a stated one contradicts all else, what they changed is an error of its own; a measured one that does is not
@@ -225,7 +245,7 @@ def _moved(fit: Fit, given: _Known) -> tuple[Fit, tuple[AnchorCheck, ...]]:
     if is_wrong.any():  # either the anchor is wrong, or all else
         change = of_all if (is_wrong & is_used).any() else of_all - answer
         conditioned = conditioned.with_common_mode((change @ heights).reshape(shape))
-    return at_state(fit, moved, conditioned), found
+    return Anchored(at_state(fit, moved, conditioned), found, anchors.taken(is_used))
 
 
 def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:
@@ -252,9 +272,7 @@ def _checks(fit: Fit, given: _Known, leverage: np.ndarray, residual: np.ndarray)
                 without=value + float(off[i]) * unit,
                 without_std=float(std[i]) * unit,
                 pull=float(pull[i]),
-                agrees=bool(
-                    abs(pull[i]) <= LIMIT and (kind == MEASURED or not _is_island(region, anchors.weight[i]))
-                ),
+                agrees=bool(abs(pull[i]) <= LIMIT and (kind == MEASURED or not _is_island(region, anchors.weight[i]))),
             )
         )
     return tuple(out)

@@ -1,6 +1,6 @@
 """What is known of many heights together: levels of regions, a held mean height, what the user states."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +50,11 @@ class Anchors:
     def and_also(self, other: "Anchors") -> "Anchors":
         """Join with others."""
         return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))
+
+    def taken(self, which: Sequence[bool] | np.ndarray) -> "Anchors":
+        """Take some of them."""
+        is_taken = np.asarray(which, bool)
+        return Anchors(self.weight[is_taken], self.value[is_taken])
 
     def padded(self, block: int) -> "Anchors":
         """Fill up with empty ones to a multiple of `block`: one compilation serves different numbers of them."""

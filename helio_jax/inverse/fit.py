@@ -226,6 +226,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
             for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
                 state, found = step(problem, state, limit, cut, number >= n_fixed, occluded)
+            state = replace(state, surface=problem.within_neighbours(state.surface))
         except KeyboardInterrupt:
             if not changes:
                 raise
@@ -264,6 +265,7 @@ def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:
     Predicted masks and multiple scattering stay as they are.
     """
     problem = fit.problem
+    state = replace(state, surface=problem.within_neighbours(state.surface))
     residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
     weight = cauchy_weight(residuals, problem.settings.robust_limits[-1])
     state = replace(state, residuals=residuals)

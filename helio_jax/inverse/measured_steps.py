@@ -23,7 +23,7 @@ MIN_PIXELS = 3
 WALL = 0.9
 """Least probability that the signal falls abruptly, for a wall that parts pixels."""
 PLACES = -0.3, 0.0, 0.3
-"""Places of an edge that are allowed for: pixels may be on either side of it [pixels]."""
+"""Places of an edge that are allowed for: a pixel nearer to it may be on either side; it is joined to none [pixels]."""
 MODEL_STD = 0.006
 """Standard deviation of heights from what the model of a band neglects, as a fraction."""
 
@@ -47,7 +47,7 @@ def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarra
         if step.p_wall < WALL or step.above == step.below:
             continue
         distance, along, length = _beside(step, raster)
-        is_beside = np.abs(along) <= 0.5 * length + side
+        is_beside = np.abs(along) <= 0.5 * (length + side)
         for shift in PLACES:
             is_low = distance > shift * side
             for axis, cut in zip((1, 0), cuts, strict=True):
@@ -56,7 +56,7 @@ def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarra
 
 
 def anchors_of_steps(
-    found: Steps, surface: Surface, raster: Raster, is_known: np.ndarray
+    found: Steps, surface: Surface, raster: Raster, region: np.ndarray
 ) -> tuple[tuple[int, ...], Anchors]:
     """Express the heights of measured steps by the heights of the pixels beside them.
 
@@ -67,19 +67,18 @@ def anchors_of_steps(
         found: steps.
         surface: near the one sought.
         raster: of the heights.
-        is_known: pixels whose level has been taken from steps before [y, x].
+        region: number of the region of every pixel (`quality.regions`): single pixels that jumps part from all others
+            show no height [y, x].
 
     Returns:
         Numbers of the steps, and an anchor for each.
     """
     numbers, weight, value = [], [], []
     for step in found.steps:
-        sides = _sides(step, found, raster) if step.is_used and step.above != step.below else None
+        sides = _sides(step, found, raster, region) if step.is_used and step.above != step.below else None
         if sides is None:
             continue
         upper, lower, distance, end = sides
-        if (is_known & (upper | lower)).any():
-            continue
         falls = math.radians(step.falls_deg)
         slope = surface.slope_x * math.cos(falls) + surface.slope_y * math.sin(falls)
         rise = np.mean((slope * distance)[upper]) - np.mean((slope * (distance - end))[lower])
@@ -92,7 +91,9 @@ def anchors_of_steps(
     return tuple(numbers), Anchors(np.stack(weight), np.array(value))
 
 
-def _sides(step: Step, found: Steps, raster: Raster) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+def _sides(
+    step: Step, found: Steps, raster: Raster, region: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
     """Find the pixels above and below a step [y, x], the distance of all from its edge [y, x], and that of the band's
     end [um]; None where too few pixels show a side."""
     bands = [b for b in found.bands if b.step == step.number and b.kind == "dark" and b.note == ""]
@@ -106,7 +107,13 @@ def _sides(step: Step, found: Steps, raster: Raster) -> tuple[np.ndarray, np.nda
     is_low = beside & (distance > 0.5 * side) & (distance < end + BEYOND * side) & (found.patch == step.below)
     lower = is_low & (distance > end)
     lower = lower if lower.sum() >= MIN_PIXELS else is_low
+    upper, lower = (side & (region == _most_frequent(region[side])) for side in (upper, lower))
     return (upper, lower, distance, end) if min(upper.sum(), lower.sum()) >= MIN_PIXELS else None
+
+
+def _most_frequent(numbers: np.ndarray) -> int:
+    """Return the most frequent of some numbers; 0 of none."""
+    return int(np.argmax(np.bincount(numbers))) if numbers.size else 0
 
 
 def _beside(step: Step, raster: Raster) -> tuple[np.ndarray, np.ndarray, float]:

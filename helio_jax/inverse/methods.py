@@ -51,6 +51,7 @@ UNUSED = "the anchors, {n} in number, were not used: {why}"
 """Warning of a height map that was not moved to what the user knows."""
 
 if TYPE_CHECKING:
+    from helio_jax.inverse.anchors import Anchors
     from helio_jax.inverse.fit import Fit, Report
     from helio_jax.inverse.state import Predict
 
@@ -84,12 +85,12 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result, misfit_of = _refined(stack, settings, make_predict, report, start)
+        result, misfit_of, anchors = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)
         if not trace:
             return result
         tested, misfit = _tested(stack, partial(misfit_of, trace), result)
-        return with_path_error(tested, misfit, stack, settings) if misfit else tested
+        return with_path_error(tested, misfit, stack, settings, anchors) if misfit else tested
 
     predict = make_predict and make_predict(settings.refine.start_paths(stack.counts[0].size))
     test = None
@@ -158,8 +159,10 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstruction, Callable[[Trace], Misfit]]:
-    """Reconstruct by the fit; return what computes its misfit from a trace, too."""
+def _refined(
+    stack, settings, make_predict, report, start
+) -> tuple[Reconstruction, Callable[[Trace], Misfit], "Anchors"]:
+    """Reconstruct by the fit; return what computes its misfit from a trace, and the anchors that it was brought to."""
     from helio_jax.inverse.anchoring import as_records, with_anchors
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.instrument_report import describe_instrument
@@ -171,7 +174,7 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
         )
     check_places(settings.anchor, Raster.of(stack), Optics.of(stack.instrument), stack.instrument.detector_names)
     found = explain(stack, settings, make_predict, report, start)
-    (fit, anchors), is_floating = with_anchors(found.fit, found.steps), found.is_undecided
+    (fit, anchors, used), is_floating = with_anchors(found.fit, found.steps), found.is_undecided
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:
         region = regions(fit.joined_x, fit.joined_y)
@@ -220,4 +223,4 @@ def _refined(stack, settings, make_predict, report, start) -> tuple[Reconstructi
             "anchors": as_records(anchors),
         },
     )
-    return rec, partial(misfit_of_state, fit.problem, fit.state)
+    return rec, partial(misfit_of_state, fit.problem, fit.state), used

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from helio_jax.arrays import border_mask
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import slopes_of_normal
+from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.edges import neighbour_links, ranked
 from helio_jax.inverse.quality import MIN_REGION, floating
 from helio_jax.inverse.samples import add_common_modes
@@ -61,7 +62,9 @@ def excess_slope_errors(errors: np.ndarray, chi_square: np.ndarray, expected: fl
     return np.sqrt(uniform_filter(errors**2, 3, mode="nearest") * share)
 
 
-def accumulated(slope_error: np.ndarray, raster: Raster, is_reference: np.ndarray) -> np.ndarray:
+def accumulated(
+    slope_error: np.ndarray, raster: Raster, is_reference: np.ndarray, anchors: Anchors | None = None
+) -> np.ndarray:
     """Compute the height error that slope errors add up to along the best path from the reference [y, x], um.
 
     Systematic slope errors of neighbours have one sign: they add up. Of all paths over the raster, to the eight
@@ -71,6 +74,7 @@ def accumulated(slope_error: np.ndarray, raster: Raster, is_reference: np.ndarra
         slope_error: [y, x].
         raster: of the scan.
         is_reference: where the error is 0 [y, x]; somewhere at least.
+        anchors: what fixes heights of pixels relative to one another, whatever lies between.
 
     Source: shortest paths: Dijkstra, Numer. Math. 1 (1959) 269; that errors accumulate along them: own derivation,
         benchmarks/families.py.
@@ -79,7 +83,14 @@ def accumulated(slope_error: np.ndarray, raster: Raster, is_reference: np.ndarra
     length = np.array([raster.dx, raster.dy, np.hypot(raster.dx, raster.dy)], float)[way]
     error = slope_error.ravel()
     least = 1e-12 * length  # a stored zero is no edge
-    graph = coo_matrix((0.5 * (error[start] + error[end]) * length + least, (start, end)), shape=(error.size,) * 2)
+    cost = 0.5 * (error[start] + error[end]) * length + least
+    for weight in () if anchors is None else anchors.weight:
+        sides = [np.flatnonzero(weight > 0), np.flatnonzero(weight < 0)]
+        if all(side.size for side in sides):  # a known difference of heights, of those pixels that are right
+            tied = np.concatenate([side[error[side] <= np.median(error[side])] for side in sides])
+            start, end = np.append(start, np.full(tied.size - 1, tied[0])), np.append(end, tied[1:])
+            cost = np.append(cost, np.full(tied.size - 1, 1e-12 * raster.dx))
+    graph = coo_matrix((cost, (start, end)), shape=(error.size,) * 2)
     found = dijkstra(graph.tocsr(), directed=False, indices=np.flatnonzero(is_reference.ravel()), min_only=True)
     return found.reshape(slope_error.shape)
 
@@ -92,7 +103,12 @@ def valid_regions(is_valid: np.ndarray) -> np.ndarray:
 
 
 def path_error(
-    rec: Reconstruction, misfit: Misfit, raster: Raster, expected: float, settings: ReconstructSettings
+    rec: Reconstruction,
+    misfit: Misfit,
+    raster: Raster,
+    expected: float,
+    settings: ReconstructSettings,
+    anchors: Anchors | None = None,
 ) -> np.ndarray:
     """Compute the common-mode error by slopes that the data contradict, relative to the reference [y, x], um.
 
@@ -104,19 +120,23 @@ def path_error(
     frame = border_mask(rec.height.shape, settings.border_fraction)
     if settings.border == "flat":
         known = frame & rec.is_valid
-        return accumulated(errors, raster, known if known.any() else frame) / np.sqrt(3.0)
-    found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0)
+        return accumulated(errors, raster, known if known.any() else frame, anchors) / np.sqrt(3.0)
+    found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0, anchors)
     return (found - np.median(found[frame])) / np.sqrt(3.0)
 
 
 def with_path_error(
-    rec: Reconstruction, misfit: Misfit, stack: MicrographStack, settings: ReconstructSettings
+    rec: Reconstruction,
+    misfit: Misfit,
+    stack: MicrographStack,
+    settings: ReconstructSettings,
+    anchors: Anchors | None = None,
 ) -> Reconstruction:
     """Widen the error bars of a tested map by `path_error`, as a common-mode error, and flag what then floats."""
     if rec.height_samples is None or rec.chi_square is None:
         return rec
     expected = expected_chi_square(stack, rec, rec.chi_square)
-    error = path_error(rec, misfit, Raster.of(stack), expected, settings)
+    error = path_error(rec, misfit, Raster.of(stack), expected, settings, anchors)
     samples = add_common_modes(rec.height_samples, [error], SEED)
     std = np.sqrt(np.mean(samples**2, axis=0))
     return flag_floating(rec.replace(height_samples=samples, height_std=std))

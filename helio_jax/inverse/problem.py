@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
 from helio_jax.forward.optics import Optics, Raster
@@ -20,6 +21,7 @@ from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.linear import MIN_IMAGES
+from helio_jax.inverse.quality import MIN_REGION, regions
 from helio_jax.inverse.residuals import Parameters, Priors, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
@@ -256,6 +258,25 @@ class FitProblem:
         assert self.instrument is not None  # of a measurement
         moves = self.moves(parameters)
         return self.instrument.moved(moves[1:].T, float(moves[0, 0])) if len(moves) else self.instrument
+
+    @property
+    def is_parted(self) -> np.ndarray:
+        """Pixels that walls part from all but a few others [y, x]."""
+        if self.walls is None:
+            return np.zeros(self.raster.shape, bool)
+        region = regions(*(~wall for wall in self.walls))
+        return np.bincount(region.ravel())[region] < MIN_REGION
+
+    def within_neighbours(self, surface: Surface) -> Surface:
+        """Keep the heights of parted pixels, which little determines, between those of their neighbours."""
+        is_parted = self.is_parted
+        if not is_parted.any():
+            return surface
+        low, high = (np.where(is_parted, outside, surface.height) for outside in (np.inf, -np.inf))
+        low, high = minimum_filter(low, 3, mode="nearest"), maximum_filter(high, 3, mode="nearest")
+        is_bounded = is_parted & (low <= high)
+        height = np.where(is_bounded, np.clip(surface.height, low, np.maximum(low, high)), surface.height)
+        return Surface(height, surface.slope_x, surface.slope_y)
 
     def thinned(self, stride: int) -> "FitProblem":
         """Keep every `stride`-th row and column, each standing for stride^2 data."""

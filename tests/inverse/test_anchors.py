@@ -275,7 +275,7 @@ def test_right_anchors_sharpen_and_a_wrong_one_is_named(hills):
 
     def moved(anchors):
         settings = fit.problem.reconstruct_settings.changed(anchor=anchors)
-        return with_anchors(replace(fit, problem=replace(fit.problem, reconstruct_settings=settings)))
+        return with_anchors(replace(fit, problem=replace(fit.problem, reconstruct_settings=settings)))[:2]
 
     step = {"name": "step", "kind": "step", "at_um": place(top), "from_um": place(low), "std_um": 1.0}
     right = [step | {"height_um": float(true[top] - true[low])}]
