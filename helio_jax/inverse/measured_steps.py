@@ -29,9 +29,10 @@ MODEL_STD = 0.006
 
 
 def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarray]:
-    """Find the edges between neighbouring pixels, along x and along y, that cross the upper edge of a wall.
+    """Find the edges between neighbouring pixels, along x and along y, that cross the upper edge of a measured wall.
 
-    A fit that joins the pixels on both sides bridges a low wall where no pixel shows its mask.
+    A fit that joins the pixels on both sides bridges a low wall where no pixel shows its mask. Edges whose height is
+    not measured may be those of steep facets.
 
     Args:
         found: steps, or None.
@@ -44,7 +45,7 @@ def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarra
     cuts = np.zeros((ny, nx - 1), bool), np.zeros((ny - 1, nx), bool)
     side = math.sqrt(float(raster.dx) * float(raster.dy))
     for step in () if found is None else found.steps:
-        if step.p_wall < WALL or step.above == step.below:
+        if not step.is_used or step.p_wall < WALL or step.above == step.below:
             continue
         distance, along, length = _beside(step, raster)
         is_beside = np.abs(along) <= 0.5 * (length + side)
