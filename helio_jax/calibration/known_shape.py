@@ -319,6 +319,7 @@ class _Fit:
         self.used = [s.is_used for s in scans]
         self.outlined = [s.is_used.any(0) for s in scans]  # pixels that tell where the outline lies [y, x]
         start = [probability(s.model, self.layout.of_scan(i, self.x), self.multiple[i]) for i, s in enumerate(scans)]
+        self.is_beside = [np.zeros(s.counts.shape[1:], bool) for s in scans]  # pixels too close to an outline [y, x]
         self.member: list[np.ndarray] = [np.zeros(0)] * len(scans)
         self.linear = [
             _linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
@@ -399,8 +400,10 @@ class _Fit:
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             self.outlined[i] = used.any(0)
-            is_near = log_share.max(0) < -np.logaddexp(0.0, -self.width[i] / (OUTLINE[0] * step))
-            self.used[i] = used & ~is_near
+            is_beside = log_share.max(0) < -np.logaddexp(0.0, -self.width[i] / (OUTLINE[0] * step))
+            # once the outline is narrow, what was left out stays so: else a pixel may go in and out for ever
+            self.is_beside[i] = is_beside | (self.is_beside[i] & (number >= len(OUTLINE)))
+            self.used[i] = used & ~self.is_beside[i]
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
                 mean = np.sum(np.exp(log_share)[:, None] * value, 0)
