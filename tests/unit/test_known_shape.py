@@ -103,9 +103,9 @@ def test_data_beside_the_outline_are_left_out(bshem):
     def reached(step: float) -> np.ndarray:
         """Find the pixels that change sides when the object moves by a step in any direction [y, x]."""
         moved = [at + step * (np.eye(len(at))[place].T @ [np.cos(t), np.sin(t)]) for t in turns]
-        return np.any([see(scan.model, m).is_object != see(scan.model, at).is_object for m in moved], 0)
+        return np.any(np.array([see(scan.model, m).is_object != see(scan.model, at).is_object for m in moved]), 0)
 
-    left_out, scale = ~fit.used[0].all(0), OUTLINE[2] * (AXIS[1] - AXIS[0])
+    left_out, scale = np.any(~fit.used[0], 0), OUTLINE[2] * (AXIS[1] - AXIS[0])
     assert left_out[reached(0.9 * scale)].all() and reached(0.9 * scale).sum() > 5
     assert not left_out[~reached(1.2 * scale)].any()
     assert fit.outlined[0].all()
