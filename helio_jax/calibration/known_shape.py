@@ -401,7 +401,7 @@ class _Fit:
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             self.outlined[i] = used.any(0)
             is_beside = log_share.max(0) < -np.logaddexp(0.0, -self.width[i] / (OUTLINE[0] * step))
-            # once the outline is narrow, what was left out stays so: else a pixel may go in and out for ever
+            # once the outline is narrow, such a pixel stays out: else it may go in and out for ever
             self.is_beside[i] = is_beside | (self.is_beside[i] & (number >= len(OUTLINE)))
             self.used[i] = used & ~self.is_beside[i]
             if number == 0:
