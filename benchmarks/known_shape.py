@@ -1,7 +1,8 @@
 """Calibration by known shapes: are the instruments found, within the stated errors? On twins made by the tracer.
 
 python benchmarks/known_shape.py [--instruments N] [--first SEED] [--pixels N] [--tiny]
-python benchmarks/known_shape.py --collect      (rows over all twins in the output folder so far)
+python benchmarks/known_shape.py --then-refine      (then heights of another sample, by the calibrated instrument)
+python benchmarks/known_shape.py --collect          (rows over all twins in the output folder so far)
 
 A twin is a scan of a ball of known radius whose burial is not known, traced (`hx.simulate`, never `hx.render`) by an
 instrument drawn at random: plate shift up to 0.25 D, rotation +-2 deg, scale +-5 %, distance +-10 %, tilt +-3 deg,
@@ -9,6 +10,10 @@ incidence +-1 deg, gains x0.5 to x2, offsets 1 to 3 times the signal, albedo rat
 (the substrate's signal is 25 times that of one pixel), a pedestal over the stage, drift and offsets of scan lines. The
 fit is told the instrument as stated, the ball's radius and the variance of the noise, nothing else. Printed: root mean
 square of the pulls (value - true) / stated s.d. of every parameter that the scans determine, chi-square per pixel.
+
+With `--then-refine` a pyramid is traced with the same drawn instrument, untilted, and read out like a measured scan,
+other gains and offsets included. `hx.reconstruct` makes heights of it by the calibrated instrument, and for comparison
+by the instrument as stated.
 """
 
 import argparse
@@ -27,12 +32,13 @@ sys.path.insert(0, str(ROOT))
 import helio_jax as hx  # noqa: E402
 from benchmarks import rows  # noqa: E402
 from helio_jax.calibration.known_objects import KnownObject  # noqa: E402
-from helio_jax.calibration.known_report import as_record  # noqa: E402
+from helio_jax.calibration.known_report import as_record, calibrated_instrument  # noqa: E402
 from helio_jax.calibration.unknowns import OBJECT  # noqa: E402
 from helio_jax.forward.readout import pedestal_modes  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
 from helio_jax.workflows.calibrate_known import calibrate_known  # noqa: E402
 from helio_jax.workflows.known_scene import known_scene  # noqa: E402
+from helio_jax.workflows.scene_file import SceneFile  # noqa: E402
 
 RADIUS, FIELD, SUBSTRATE = 1000.0, 3630.0, 8000.0
 SNR, SIGNAL = 25.0, 3000.0
@@ -40,6 +46,8 @@ PEDESTAL, DRIFT, LINES = 0.05, 0.03, 0.01
 """Pedestal, drift and offsets of scan lines over the signal."""
 TWIN_RAYS = 512
 KNOWN = "ball radius=1000"
+PYRAMID = {"kind": "pyramid", "size_um": SUBSTRATE, "base_um": 700.0, "top_um": 300.0, "height_um": 140.0}
+PYRAMID_PITCH = 30.0
 
 
 def draw(seed: int, stated: Instrument) -> tuple[Instrument, dict[str, float]]:
@@ -75,6 +83,14 @@ def scan(seed: int, size: int, rays: int) -> tuple[hx.MicrographStack, dict[str,
     numbers |= {name: math.radians(truth[name]) for name in ("tilt x", "tilt y")}
     axis = (np.arange(size) - 0.5 * (size - 1)) * FIELD / size
     scene = known_scene(KnownObject.parse(KNOWN), numbers, true, axis, axis, substrate_um=SUBSTRATE)
+    return read_out(scene, axis, stated, rays, seed, "poisson"), truth
+
+
+def read_out(
+    scene: SceneFile, axis: np.ndarray, stated: Instrument, rays: int, seed: int, noise: str
+) -> hx.MicrographStack:
+    """Trace a scene; return what a real detector would read, the variance known where the noise is "poisson"."""
+    size = axis.size
     beam = scene.beam.model_copy(update={"source": "uniform"})  # a spot of finite size, which the fit does not know
     traced = hx.simulate(scene.model_copy(update={"beam": beam}), rays=rays, seed=seed + 1, maps=False).only()
     probability = traced.counts.reshape(-1, size, size)
@@ -88,22 +104,43 @@ def scan(seed: int, size: int, rays: int) -> tuple[hx.MicrographStack, dict[str,
         reading += rng.normal(0.0, LINES * signal, (size, 1))
         images.append(reading + rng.normal(0.0, signal / SNR, image.shape))
         variance.append(np.full(image.shape, (signal / SNR) ** 2))
-    counts = np.array(images)
-    stack = hx.MicrographStack(
-        counts, axis, axis, stated, variance=np.array(variance), noise="poisson", name=f"twin {seed}"
-    )
-    return stack, truth
+    known = np.array(variance) if noise == "poisson" else None
+    return hx.MicrographStack(np.array(images), axis, axis, stated, variance=known, noise=noise, name=f"twin {seed}")
 
 
-def evaluate(seed: int, size: int, twin_rays: int, **changes: Any) -> dict[str, Any]:
-    """Calibrate on the twin of a seed: pulls of all parameters, which are determined, chi-square."""
+def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument]) -> dict[str, dict[str, float | None]]:
+    """Refine a pyramid that the drawn instrument of a seed has scanned, by each of some instruments."""
+    true, _ = draw(seed, hx.load_scene(str(ROOT / "scenes" / "measured_sphere_a.toml")).instrument)
+    axis = (np.arange(size) - 0.5 * (size - 1)) * PYRAMID_PITCH
+    tables = true.idealised().model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
+    tables |= {"name": "pyramid", "sample": PYRAMID | {"azimuth_deg": 20.0}}
+    tables["scan"] = {"nx": size, "ny": size, "pixel_size_um": PYRAMID_PITCH, "pitch": "sample"}
+    region = {"region_radius_um": 0.75 * PYRAMID["base_um"], "height_um": PYRAMID["height_um"]}
+    scene, out = SceneFile.model_validate(tables | {"truth": region}), {}
+    points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).tolist()
+    as_list = SceneFile.model_validate(tables | {"scan": {"kind": "list", "points_um": points}})
+    for name, instrument in instruments.items():
+        rec = hx.reconstruct(read_out(as_list, axis, instrument, rays, seed + 5000, "measured"), method="refine")
+        score = hx.evaluate(rec, hx.true_height(scene, rec))
+        wanted = "recovered_height", "rms_region", "pull_mean", "pull_std", "coverage_1", "coverage_2", "valid_fraction"
+        out[name] = {key: getattr(score, key) for key in wanted}
+    return out
+
+
+def evaluate(seed: int, size: int, twin_rays: int, then_refine: bool, **changes: Any) -> dict[str, Any]:
+    """Calibrate on the twin of a seed: pulls of all parameters, which are determined, chi-square; then heights."""
     stack, truth = scan(seed, size, twin_rays)
     begin = time.time()
-    record = as_record(calibrate_known([stack], [KNOWN], **changes))
+    fit = calibrate_known([stack], [KNOWN], **changes)
+    record = as_record(fit)
     pulls = {r["name"]: (r["value"] - truth.get(r["name"], 0.0)) / r["std"] for r in record["table"]}
     determined = [r["name"] for r in record["table"] if r["is_determined"]]
     about = {name: record[name] for name in ("chi_square", "robust_chi_square", "inflation", "is_converged", "rounds")}
-    return {"seed": seed, "pixels": size, "pulls": pulls, "determined": determined, "s": time.time() - begin, **about}
+    about |= {"seed": seed, "pixels": size, "pulls": pulls, "determined": determined, "s": time.time() - begin}
+    if then_refine:
+        instruments = {"calibrated": calibrated_instrument(fit), "as stated": fit.stated}
+        about["heights"] = heights(seed, size, twin_rays, instruments)
+    return about
 
 
 def collect(found: list[dict[str, Any]]) -> list[rows.Row]:
@@ -120,6 +157,25 @@ def collect(found: list[dict[str, Any]]) -> list[rows.Row]:
     out.append(rows.row("1", "chi-square per pixel", text, "0.95 to 1.1", bool(0.95 <= np.median(chi) <= 1.1)))
     lost = [f["seed"] for f in found if not f["is_converged"]]
     out.append(rows.row("1", "fits that have not converged", f"{len(lost)} of {len(found)} {lost}", "0", not lost))
+    for name in ("calibrated", "as stated"):
+        of = [f["heights"][name] for f in found if "heights" in f]
+        if not of:
+            continue
+        error, pull, one, two = (
+            np.array([np.nan if h[key] is None else h[key] for h in of])
+            for key in ("recovered_height", "pull_std", "coverage_1", "coverage_2")
+        )
+        error, size = np.abs(error - 1.0), np.sqrt(pull**2 + np.array([h["pull_mean"] for h in of]) ** 2)
+        text = f"median {np.median(error):.1%}, worst {error.max():.1%}, {len(of)} twins"
+        reached = bool(np.median(error) <= 0.01 and error.max() <= 0.04)
+        out.append(rows.row("2", f"height of a pyramid, instrument {name}", text, "median 1 %, worst 4 %", reached))
+        text = f"median {np.median(size):.2f}, largest {size.max():.2f}"
+        inside = bool(0.8 <= np.median(size) <= 1.25)
+        out.append(rows.row("2", "  pulls of its heights, root mean square", text, "0.8 to 1.25", inside))
+        text = f"mean {one.mean():.0%}, {two.mean():.0%}"
+        out.append(
+            rows.row("2", "  heights within 1 and 2 s.d.", text, "58 to 78 %, -", bool(0.58 <= one.mean() <= 0.78))
+        )
     seconds = float(np.median([f["s"] for f in found]))
     out.append(rows.row("1", "time of a fit, compilation included", f"median {seconds:.0f} s", "-", None))
     return out
@@ -132,6 +188,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=100, help="seed of the first twin")
     parser.add_argument("--pixels", type=int, default=41)
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
+    parser.add_argument("--then-refine", action="store_true", help="then reconstruct another sample")
     parser.add_argument("--collect", action="store_true", help="only tabulate what is there")
     parser.add_argument("--tiny", action="store_true", help="one twin, few rays and pixels")
     args = parser.parse_args()
@@ -141,7 +198,7 @@ def main() -> None:
         n, size, rays = (1, 17, 64) if args.tiny else (args.instruments, args.pixels, TWIN_RAYS)
         changes = {"max_rounds": 2, "rays": 32, "drift_degree": 3} if args.tiny else {}
         for seed in range(args.first, args.first + n):
-            found = evaluate(seed, size, rays, **changes)
+            found = evaluate(seed, size, rays, args.then_refine, **changes)
             (args.output / f"{name}_twin_{seed}.json").write_text(json.dumps(found))
             print(f"twin {seed}: chi-square {found['chi_square']:.3f}, {found['rounds']} rounds, {found['s']:.0f} s")
     files = sorted(args.output.glob(f"{name}_twin_*.json"))

@@ -20,8 +20,6 @@ from helio_jax.forward.radiosity import plan_radiosity, radiosity
 from helio_jax.forward.render import Corrections, detection_probability
 from helio_jax.forward.surface import unit_normal
 
-RADIOSITY_PIXELS = 25
-"""Pixels along the longer side of the raster on which the derivative of the multiple scattering is computed, about."""
 _LEAST_SHARE = 1e-15
 """Added to shares and squares whose logarithm or root is taken."""
 
@@ -227,13 +225,18 @@ def no_multiple(model: ScanModel, unknowns: np.ndarray, free: np.ndarray) -> Mul
 
 
 def expand_multiple(
-    model: ScanModel, unknowns: np.ndarray, free: np.ndarray, substrate_um: float, traced: np.ndarray | None = None
+    model: ScanModel,
+    unknowns: np.ndarray,
+    free: np.ndarray,
+    substrate_um: float,
+    pixels: int,
+    traced: np.ndarray | None = None,
 ) -> Multiple:
     """Compute the multiple scattering and its derivatives at unknowns, by radiosity; `traced` replaces the value.
 
-    Derivatives are those on a thinned raster, each pixel's taken for its neighbours.
+    Derivatives are those on a raster of about `pixels` along its longer side, each pixel's taken for its neighbours.
     """
-    stride = max(1, round(max(model.raster.shape) / RADIOSITY_PIXELS))
+    stride = max(1, round(max(model.raster.shape) / pixels))
     thin = model.thinned(stride)
     with jax.enable_x64(True):
         at = jnp.asarray(unknowns)

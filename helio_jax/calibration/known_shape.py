@@ -43,16 +43,21 @@ from helio_jax.robust import cauchy_weight
 
 OUTLINE = 0.6, 0.3, 0.15
 """Scale of the logistic function by which a pixel changes from object to substrate, over the pitch: in the first rounds
-and all later ones. A wide outline finds the object from farther away, a narrow one places it better."""
+and all later ones. A wide outline finds the object from farther away, a narrow one places it better. Data of a pixel
+that is closer to an outline than this are left out: its masks and its multiple scattering change too fast with the
+object's place for a linear step, and differ between the parts. They still tell on which part it lies."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
 CONVERGED = 0.1
 """The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
+RADIOSITY_PIXELS = 25, 25, 61
+"""Pixels along the longer side of the raster on which multiple scattering is derived, about: in the
+first rounds and all later ones. On a coarse raster they are wrong about an object's foot, where it is strongest."""
 STALE = 8.0
 """Change of an unknown [standard deviations] after which derivatives of the multiple scattering are computed anew."""
 SPIKE = 6.0
 """A pixel that differs from all its neighbours by so many standard deviations is left out."""
-_STEPS = 20
+_STEPS = 8
 _SEARCH_PIXELS = 31
 _SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
 """First search: pixels of the thinned raster, reach over the width of the image, points along each axis."""
@@ -312,7 +317,9 @@ class _Fit:
         self.deviation = np.ones(len(self.x))
         self.weights = [np.ones(s.counts.shape) for s in scans]
         self.used = [s.is_used for s in scans]
+        self.outlined = [s.is_used.any(0) for s in scans]  # pixels that tell where the outline lies [y, x]
         start = [probability(s.model, self.layout.of_scan(i, self.x), self.multiple[i]) for i, s in enumerate(scans)]
+        self.is_beside = [np.zeros(s.counts.shape[1:], bool) for s in scans]  # pixels too close to an outline [y, x]
         self.member: list[np.ndarray] = [np.zeros(0)] * len(scans)
         self.linear = [
             _linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
@@ -350,12 +357,8 @@ class _Fit:
             inverse = self.inverse(i)
             misfit = (_expected(scan, linear[i], image) - scan.counts) * inverse
             out.append(line_whitening(misfit, inverse, self.lines[i], scan.slow_axis).ravel())
-            outlines.append((outline * self.is_outlined(i)).ravel())
+            outlines.append((outline * self.outlined[i]).ravel())
         return np.concatenate([*out, *outlines, z])
-
-    def is_outlined(self, i: int) -> np.ndarray:
-        """Find the pixels that tell where the outline lies [y, x]: those with data."""
-        return np.any(self.used[i], 0)
 
     def derivatives(self, z: np.ndarray) -> np.ndarray:
         """Compute the derivatives of the residuals [residual, unknown]."""
@@ -366,14 +369,14 @@ class _Fit:
         for i, scan in enumerate(self.scans):
             about = self.layout.of_scan(i, x), self.multiple[i], self.width[i], self.member[i]
             (value, _), (slopes, outline_slopes) = fitted_and_derivative(scan.model, *about)
-            inverse, is_outlined = self.inverse(i), self.is_outlined(i)
+            inverse = self.inverse(i)
 
             def put(column: int, image: np.ndarray, i=i, scan=scan, inverse=inverse) -> None:
                 out[rows[i], column] = line_whitening(image * inverse, inverse, self.lines[i], scan.slow_axis).ravel()
 
             for column, slope, of_outline in zip(self.layout.place[i], slopes, outline_slopes, strict=True):
                 put(column, linear[i][:, 0, None, None] * slope * self.layout.scale[column])
-                moved = of_outline * is_outlined * self.layout.scale[column]
+                moved = of_outline * self.outlined[i] * self.layout.scale[column]
                 out[rows[len(self.scans) + i], column] = moved.ravel()
             for k in range(len(value)):
                 for c, mode in enumerate((value[k], *scan.columns.modes)):
@@ -390,17 +393,22 @@ class _Fit:
             at = self.layout.of_scan(i, self.x)
             own, seen = scan.model.object_of(at), see(scan.model, at)
             if scan.known.kind != "flat":
-                self.multiple[i] = self._scattered_again(i, at, seen, instrument)
+                self.multiple[i] = self._scattered_again(number, i, at, seen, instrument)
             step = pitch(scan.model.raster.y)
             self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * step
-            self.used[i] = scan.is_used & ~_ring(scan, own, seen, self.settings)
+            used = scan.is_used & ~_ring(scan, own, seen, self.settings)
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
+            self.outlined[i] = used.any(0)
+            is_beside = log_share.max(0) < -np.logaddexp(0.0, -self.width[i] / (OUTLINE[0] * step))
+            # once the outline is narrow, such a pixel stays out: else it may go in and out for ever
+            self.is_beside[i] = is_beside | (self.is_beside[i] & (number >= len(OUTLINE)))
+            self.used[i] = used & ~self.is_beside[i]
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
                 mean = np.sum(np.exp(log_share)[:, None] * value, 0)
                 self.linear[i] = _linear_start(scan, mean, inverse, self.settings)
-            self.member[i] = _membership(scan, self.used[i], self.linear[i], value, log_share, self.settings)
+            self.member[i] = _membership(scan, used, self.linear[i], value, log_share, self.settings)
             image = np.sum(self.member[i][:, None] * value, 0)
             misfit = np.where(self.used[i], scan.counts - _expected(scan, self.linear[i], image), np.nan)
             scale = max(1.0, float(robust_std(misfit / scan.sigma)))
@@ -410,7 +418,7 @@ class _Fit:
             if number > 0:
                 self.lines[i] = _line_std(scan, misfit, self.weights[i])
 
-    def _scattered_again(self, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
+    def _scattered_again(self, number: int, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
         """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
         scan, traced = self.scans[i], None
         if self.trace is not None:
@@ -419,10 +427,11 @@ class _Fit:
             albedo = np.where(seen.is_object, np.exp(own["log albedo ratio"]), 1.0) / bright
             traced = self.trace(i, instrument, own) / albedo * bright
         moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
-        if traced is not None and np.max(moved) < STALE:
+        if traced is not None and number >= len(RADIOSITY_PIXELS) and np.max(moved) < STALE:
             return self.multiple[i].shifted(traced, at)
         self.expanded_at[i] = self.x
-        return expand_multiple(scan.model, at, self.layout.free[i], self.settings.substrate_um, traced)
+        pixels = RADIOSITY_PIXELS[min(number, len(RADIOSITY_PIXELS) - 1)]
+        return expand_multiple(scan.model, at, self.layout.free[i], self.settings.substrate_um, pixels, traced)
 
     def fitted(self) -> Instrument:
         """Move the instrument by the present unknowns."""

@@ -80,8 +80,9 @@ class KnownShapeSettings(Settings):
     """How often multiple scattering and weights are computed anew."""
     substrate_um: float = Field(default=8000.0, gt=0.0, le=1e6)
     """Side of the substrate about the image's middle, as far as it scatters [um]."""
-    rays: int = Field(default=128, ge=0, le=100_000)
-    """Paths per pixel by which the multiple scattering is traced; 0: it is computed by radiosity alone."""
+    rays: int = Field(default=512, ge=0, le=100_000)
+    """Paths per pixel by which the multiple scattering is traced; 0: it is computed by radiosity alone. Few of them
+    make its fitted factor too small, as noise in a regressor does."""
 
 
 class Unknown(NamedTuple):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from helio_jax.calibration.known_objects import KnownObject
-from helio_jax.calibration.known_report import TOO_NARROW, as_record, calibrated_instrument, robust_chi_square
+from helio_jax.calibration.known_report import ON_TWINS, as_record, calibrated_instrument, robust_chi_square
 from helio_jax.calibration.known_shape import KnownFit, fit_known_shapes
 from helio_jax.calibration.unknowns import KnownShapeSettings
 from helio_jax.errors import SceneError
@@ -69,6 +69,6 @@ def calibrate_known_files(
     what = f"Instrument calibrated by helio calibrate --known {' '.join(map(repr, shapes))} on {names}."
     about = f"Robust chi-square {robust_chi_square(fit):.2f} per pixel, standard deviations x {fit.inflation:.2f}."
     where = "sample_distance_um is that of these scans' stage height. [covariance]: how the errors belong together."
-    write_calibrated(calibrated_instrument(fit), output, "\n".join((what, about, f"{TOO_NARROW.capitalize()}.", where)))
+    write_calibrated(calibrated_instrument(fit), output, "\n".join((what, about, f"{ON_TWINS.capitalize()}.", where)))
     save_known_shape(fit, picture)
     return record | {"files": [str(output), str(picture)]}

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from helio_jax.calibration.known_model import see
 from helio_jax.calibration.known_objects import KnownObject, Stated
 from helio_jax.calibration.known_report import calibrated_instrument, table
-from helio_jax.calibration.known_shape import fit_known_shapes, line_whitening
+from helio_jax.calibration.known_shape import OUTLINE, _Fit, fit_known_shapes, line_whitening, prepare_scan
 from helio_jax.calibration.unknowns import OBJECT, KnownShapeSettings
 from helio_jax.errors import SceneError
 from helio_jax.formats.toml import write_calibrated
@@ -82,6 +83,32 @@ def test_instrument_moves_as_optics_do(bshem):
         assert getattr(written, name) == pytest.approx(np.asarray(getattr(fitted, name)), rel=1e-6, abs=1e-6)
     areas = [np.cross(o.axes[..., 0], o.axes[..., 1])[:, 2] for o in (written, fitted)]
     assert areas[0] == pytest.approx(np.asarray(areas[1]), rel=1e-6)
+
+
+def test_data_beside_the_outline_are_left_out(bshem):
+    """Left out is every pixel that the object reaches or leaves when it moves by the outline's scale, and no other.
+
+    Such pixels once held the fit off the right place by 5 to 15 deviations. Catches a distance in wrong units, and an
+    outline that no longer counts these pixels. No chance is involved.
+    """
+    counts = np.random.default_rng(4).normal(1000.0, 10.0, (3, AXIS.size, AXIS.size))
+    stack = MicrographStack(counts, AXIS, AXIS, bshem, variance=np.full(counts.shape, 100.0), noise="poisson")
+    settings = KnownShapeSettings(rays=0)
+    scan = prepare_scan(stack, KnownObject.parse("ball radius=1000 height=680"), settings)
+    fit = _Fit(bshem, [scan], settings, None)
+    fit.update(2)
+    at, turns = fit.layout.of_scan(0, fit.x), np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    place = len(at) - len(OBJECT) + np.arange(2)
+
+    def reached(step: float) -> np.ndarray:
+        """Find the pixels that change sides when the object moves by a step in any direction [y, x]."""
+        moved = [at + step * (np.eye(len(at))[place].T @ [np.cos(t), np.sin(t)]) for t in turns]
+        return np.any(np.array([see(scan.model, m).is_object != see(scan.model, at).is_object for m in moved]), 0)
+
+    left_out, scale = np.any(~fit.used[0], 0), OUTLINE[2] * (AXIS[1] - AXIS[0])
+    assert left_out[reached(0.9 * scale)].all() and reached(0.9 * scale).sum() > 5
+    assert not left_out[~reached(1.2 * scale)].any()
+    assert fit.outlined[0].all()
 
 
 @pytest.fixture(scope="module")
