@@ -19,13 +19,14 @@ from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import Parameters
+from helio_jax.inverse.residuals import Parameters, moved_optics
 from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
 from helio_jax.inverse.settings import RefineSettings
 
 Predict = Callable[..., Corrections]
-"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and
-the albedo [y, x], by its name, where it is not 1. The corrections are per albedo of the own pixel."""
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and by
+their names the albedo [y, x] where it is not 1, and the law where it is not the cosine law. The corrections are per
+albedo of the own pixel."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) 
     surface, p = state.surface, state.parameters
     is_geometry_known = not p.distance.size and not p.aim.size
     instrument = () if is_geometry_known else (problem.fitted_instrument(p),)
-    known = problem.patches_at(p).known
+    known = problem.patches_at(p).known | problem.known_law(p)
     corrections = predict(surface.height, surface.normals(problem.shift), *instrument, **known)
     return set_corrections(problem, state, corrections, surface)
 
@@ -189,11 +190,6 @@ def with_responses(problem: FitProblem, state: FitState) -> FitState:
         known = problem.has_enough_images, float(problem.optics.sample_distance)
         responses += relief_responses(surface, normals, optics, raster, *known)
     return replace(state, held=replace(state.held, responses=responses))
-
-
-def moved_optics(optics: Optics, moves: Any) -> Optics:
-    """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
-    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
 
 
 @compiled

@@ -65,7 +65,9 @@ def stated(bshem):
 def unknown(bshem):
     """All of the instrument is unknown, as with measured data."""
     sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
-    return make_problem(bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law_std=0.1)
+    return make_problem(
+        bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law="power", law_std=0.1
+    )
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +81,7 @@ def turned(bshem):
         "level_std_um": 200.0,
         "drift_std": 0.2,
         "line_std": 0.02,
+        "law": "power",
         "law_std": 0.1,
     }
     return make_problem(bshem.model_copy(update={"uncertainty": sure}), **about)
