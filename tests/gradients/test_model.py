@@ -47,7 +47,7 @@ def make_problem(instrument, order=ScanOrder(1), border="flat", **settings):
     problem = FitProblem.of(signal, variance, instrument, raster, surface, chosen, region, order)
     known = np.nan_to_num(signal)
     corrections = Corrections(rng.uniform(0, 0.1, (3, 3, *SHAPE)) * phi, 0.2 * known, 0.05 * known)
-    state = update_corrections(problem, FitState.at(problem, surface), lambda *_: corrections)
+    state = update_corrections(problem, FitState.at(problem, surface), lambda *_, **__: corrections)
     if settings:
         drawn = jax.tree.map(lambda v: 0.5 * rng.normal(size=v.shape), state.parameters)
         state = replace(state, parameters=drawn)
