@@ -175,6 +175,24 @@ class CommonModes(eqx.Module):
         return jnp.einsum("myx,yx->m", self.weights, height)
 
 
+class LawResponse(eqx.Module):
+    """How the multiple scattering follows the numbers of the law: alike in all pixels, as an exponential.
+
+    Attributes:
+        multiple: multiple scattering as predicted [detector, y, x].
+        at: numbers of its law, in prior standard deviations from their means [number].
+        rate: derivative of its logarithm by them [number].
+    """
+
+    multiple: Any
+    at: Any
+    rate: Any
+
+    def change(self, numbers: jax.Array) -> jax.Array:
+        """Compute the change of the multiple scattering [detector, y, x] at other numbers."""
+        return self.multiple * jnp.expm1(jnp.sum(self.rate * (numbers - self.at)))
+
+
 class Edges(eqx.Module):
     """The edges between neighbouring pixels along x [y, x - 1] and y [y - 1, x], see `edges`.
 
@@ -219,6 +237,7 @@ class FixedTerms(eqx.Module):
         slope_scale_x, slope_scale_y: scale of the whitened slopes [y, x].
         priors: of the parameters.
         optics: as stated.
+        law_response: how the multiple scattering follows the law; None where that is the cosine law.
         dx, dy: raster pitch, um.
         slow_axis: of the scan, static.
     """
@@ -247,6 +266,7 @@ class FixedTerms(eqx.Module):
     optics: Optics
     dx: Any
     dy: Any
+    law_response: LawResponse | None
     slow_axis: int = eqx.field(static=True, default=0)
 
 
@@ -327,7 +347,10 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     if law is not None:
         single = single * mean_over_aperture(law, moved_optics(fixed.optics, moves), surface.height, normal)
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
-    multiple = fixed.multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
+    multiple = fixed.multiple
+    if fixed.law_response is not None:
+        multiple = multiple + fixed.law_response.change(parameters.law)
+    multiple = multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
     if parameters.surroundings.size:
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
