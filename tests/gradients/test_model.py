@@ -81,7 +81,7 @@ def turned(bshem):
         "level_std_um": 200.0,
         "drift_std": 0.2,
         "line_std": 0.02,
-        "law": "power",
+        "law": "broad_specular",
         "law_std": 0.1,
     }
     return make_problem(bshem.model_copy(update={"uncertainty": sure}), **about)
