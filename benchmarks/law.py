@@ -131,7 +131,8 @@ def main() -> None:
         refine = {"max_rounds": 2, "rays": 20_000, "samples": 8}
     chosen = [name for name in LAWS if name.replace(", by", " by") in given.laws.split(",")]
     rows: list[Any] = []
-    for member in members(given.family, given.seed, range(given.first, given.first + given.members), tuple(given.size)):
+    size, numbers = (given.size[0], given.size[1]), range(given.first, given.first + given.members)
+    for member in members(given.family, given.seed, numbers, size):
         for name in chosen:
             rows.append(run(member, name, refine, given.dose))
             write(given.output / "law.json", rows, given.seed)

@@ -158,7 +158,7 @@ Law = PowerLaw | LobeLaw | RoughLaw | MonotoneLaw
 """Any law but the cosine law, which is None."""
 
 
-def mean_over_aperture(law: Law, optics: Optics, height: jax.Array, normal: jax.Array) -> jax.Array:
+def mean_over_aperture(law: Law, optics: Optics, height: Any, normal: Any) -> jax.Array:
     """Compute a law's value averaged over what each aperture subtends [detector, ...].
 
     The weights are those of the cosine law, so that n . Phi times this is the detection probability.

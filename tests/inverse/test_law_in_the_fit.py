@@ -57,7 +57,7 @@ def fitted(law: str, kind: str = "cosine") -> Fit:
     surface, rng, true = hills(), np.random.default_rng(1), TRUE[kind][0] if kind in TRUE else None
     signal = np.asarray(hx.render(surface, hx.Optics.of(INSTRUMENT), RASTER, corrections="none", law=true))
     std = np.sqrt(signal * np.median(signal)) / SNR
-    settings = ReconstructSettings(refine=RefineSettings(law=law))
+    settings = ReconstructSettings(refine=RefineSettings.model_validate({"law": law}))
     data = signal + std * rng.normal(size=signal.shape)
     problem = FitProblem.of(data, std**2, INSTRUMENT, RASTER, surface, settings)
     flat = hx.Surface(*np.zeros((3, N, N)))
@@ -99,6 +99,7 @@ def test_cosine_micrographs_give_the_cosine_law(kind):
     assert describe_instrument(fit)["law"]["cosine_probability"] > 1e-4
     cos = np.cos(np.radians([20.0, 30.0, 40.0, 50.0, 60.0]))
     law = fit.problem.law_at(fit.parameters)
+    assert law is not None
     with jax.enable_x64(True):
         value = np.asarray(law.relative(1.0, cos, -cos))
     assert np.abs(value / value.mean() - 1.0).max() < 0.02
@@ -135,10 +136,12 @@ def test_probability_of_the_cosine_law():
     The width of a lobe does not count. Catches a wrong number of degrees of freedom.
     """
     rng, prior = np.random.default_rng(4), law_prior(RefineSettings(law="monotone"))
+    assert prior is not None
     root = 0.1 * rng.normal(size=(7, 7))
     draws = [cosine_probability(prior, root @ rng.normal(size=7), root @ root.T) for _ in range(10_000)]
     assert np.mean(np.array(draws) < 0.05) == pytest.approx(0.05, abs=0.011)
     lobe = law_prior(RefineSettings(law="broad_specular"))
+    assert lobe is not None
     assert cosine_probability(lobe, np.array([0.0, 5.0]), np.eye(2)) == 1.0
 
 

@@ -1,5 +1,7 @@
 """Scattering laws of the render model: closed forms, and the tracer, whose densities and norms are its own."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from helio_jax.trace.lawtable import make_law_table
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
 
-LAWS = {
+LAWS: dict[str, Any] = {
     "power": hx.PowerLaw(0.4),
     "lobe": hx.LobeLaw(0.15, 30.0),
     "narrow lobe": hx.LobeLaw(0.5, 12.0),
@@ -26,7 +28,7 @@ LAWS = {
 COSINE = hx.PowerLaw(0.0), hx.LobeLaw(0.0, 30.0), hx.RoughLaw(0.0), hx.MonotoneLaw(np.zeros(7))
 
 
-def traced_density(law, d: np.ndarray, n: np.ndarray, out: np.ndarray) -> np.ndarray:
+def traced_density(law: Any, d: np.ndarray, n: np.ndarray, out: np.ndarray) -> np.ndarray:
     """Compute the tracer's density per steradian of directions [n, 3]."""
     terms = law.terms()
     table, cosine = make_law_table([terms]), sum(t.share for t in terms if t.shape == Shape.COSINE)
@@ -146,7 +148,7 @@ def test_against_traced_counts(instrument, name):
     x, y = np.arange(-300.0, 301.0, 75.0) + 120.0, np.arange(-300.0, 301.0, 75.0) + 80.0
     body, optics = SpheresSample(spheres=(cap,), size_um=4000.0).build(), hx.Optics.of(instrument)
     settings = TraceSettings(rays=1024, n_orders=1, max_events=1)
-    laws = dict.fromkeys(body.materials, law.terms())
+    laws = {name: law.terms() for name in body.materials}
     grid_x, grid_y = (g.ravel() for g in np.meshgrid(x, y))
     tally = trace_pixels(make_experiment(body, instrument, settings, laws), grid_x, grid_y)
     traced = tally.probability()[0][0].reshape(-1, y.size, x.size)
