@@ -11,7 +11,7 @@ Public names are loaded on first use, so that `import helio_jax` is instant.
 
 Where is ... the shadow mask? trace/masks (maps of a simulation), forward/masking (in a reconstruction). The integration
 of slopes? inverse/integrate. A new scattering law? Its table in scene/scattering, its density in trace/lobes, its
-draws in trace/laws.
+draws in trace/laws; in a fit, forward/laws.
 
 Module map (one line each, complete: tests/unit/test_project_files.py):
 
@@ -84,12 +84,13 @@ forward/              heights and optics -> expected counts, differentiable (JAX
   surface             Surface: heights and slopes in the beam frame, normals
   known_shapes        ball, step and wedge in closed form: heights, normals, horizons
   form_factor         vector form factor of an elliptical aperture
+  laws                scattering laws of single scattering: power, lobe, rough, monotone
   horizon             horizon search along a march over the surface
   masking             masked part of each form factor: the shadow mask of a reconstruction
   radiosity           multiple scattering by radiosity
   layout              layouts of apertures as optics; walls between them
   readout             Readout: gain, offset, drift, pedestal, scan lines
-  render              hx.render: the render model; the single-scattering law
+  render              hx.render: the render model; single scattering
 inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   settings            the [reconstruct] table
   methods             entry: runs linear, nearfield or refine
@@ -117,6 +118,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   band_fit            length of the band beside an edge, and the height from it
   mask_patches        surface patches between steps, and their levels
   step_records        records of steps, bands and patches
+  law_prior           what is unknown of the scattering law; its test against the cosine law
   residuals           residuals of the fit as a function of its unknowns
   problem             FitProblem: data, priors, all that is constant in a fit
   state               FitState and its corrections: all that changes
@@ -339,6 +341,10 @@ _HOME = {
     "drift_modes": "forward.readout",
     "pedestal_modes": "forward.readout",
     "Corrections": "forward.render",
+    "PowerLaw": "forward.laws",
+    "LobeLaw": "forward.laws",
+    "RoughLaw": "forward.laws",
+    "MonotoneLaw": "forward.laws",
     "render": "forward.render",
     "plan_radiosity": "forward.radiosity",
     "Information": "inverse.fisher",

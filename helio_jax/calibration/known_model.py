@@ -14,6 +14,7 @@ import numpy as np
 from helio_jax.calibration.unknowns import OBJECT, PLATE
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.known_shapes import Ball, Flat, PlacedShape, Ramp, Shape
+from helio_jax.forward.laws import PowerLaw
 from helio_jax.forward.masking import masked_by_shape
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity, radiosity
@@ -99,7 +100,7 @@ class ScanModel(eqx.Module):
         for share, surface, is_object in shape.parts(self.raster, optics.beam_shift, width):
             albedo = jnp.exp(o["log albedo ratio"]) if is_object else 1.0
             corrections = Corrections(masked_by_shape(shape, optics, self.raster, surface, is_object), albedo * again)
-            values.append(detection_probability(surface, optics, corrections, albedo, o["exponent"]))
+            values.append(detection_probability(surface, optics, corrections, albedo, PowerLaw(o["exponent"])))
             shares.append(jnp.log(share + _LEAST_SHARE))
         return jnp.stack(values), jnp.stack(shares)
 

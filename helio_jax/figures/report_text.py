@@ -142,8 +142,7 @@ def assumptions(rec: Reconstruction) -> list[str]:
     flat = "the border of the image lies on the substrate, from which heights count"
     found.append(flat if rec.border == "flat" else "nothing in the image is on the substrate: the level is unknown")
     is_fit = rec.method == "refine"
-    law = numbers(fit).get("law_std", 0.0)
-    found.append("surfaces scatter by the cosine law" + (f", exponent free within {law:g}" if is_fit and law else ""))
+    found.append(law_of(rec))
     if not is_fit:
         return [*found, "the albedo of each pixel is free; gains and offsets are as stated or calibrated"]
     known = {name: numbers(fit).get(name, 0.0) for name in ("gain_std", "offset_std", "albedo_std", "drift_std")}
@@ -152,6 +151,19 @@ def assumptions(rec: Reconstruction) -> list[str]:
     gain, offset = share(known["gain_std"]), share(known["offset_std"])
     found.append(f"gains are right within {gain}, offsets within {offset} of the signal")
     return found
+
+
+def law_of(rec: Reconstruction) -> str:
+    """Say by which law the sample was taken to scatter, and whether it came out as the cosine law."""
+    law = table(rec.provenance, "instrument", "law")
+    if not law:
+        return "surfaces scatter by the cosine law"
+    kind, judged = str(law.get("kind")).replace("_", " "), "compatible" if law.get("is_cosine") else "NOT compatible"
+    chance = numbers(law).get("cosine_probability", math.nan)
+    return (
+        f"surfaces scatter by a {kind} law, whose numbers were fitted: {judged} with the cosine law (probability "
+        f"{chance:.2g})"
+    )
 
 
 def made(rec: Reconstruction, stack: MicrographStack | None) -> str:

@@ -16,14 +16,12 @@ from jaxtyping import Float
 from helio_jax.errors import SceneError
 from helio_jax.forward.compiling import batched_in_chunks, compiled
 from helio_jax.forward.form_factor import form_factor_at
+from helio_jax.forward.laws import Law, mean_over_aperture
 from helio_jax.forward.masking import N_SLICES, choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast, in_own_precision
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
 from helio_jax.forward.readout import Readout
 from helio_jax.forward.surface import Surface, surface_of_heights, unit_normal
-
-MIN_COS = 0.05
-"""Facets seen under a smaller cosine take the law's power of this one: it has no slope at the horizon."""
 
 
 class Corrections(eqx.Module):
@@ -63,19 +61,17 @@ def single_scattering(form_factor: Any, normal: Any) -> Any:
 
 
 def detection_probability(
-    surface: Surface, optics: Optics, corrections: Corrections, albedo: Any = 1.0, exponent: Any = None
+    surface: Surface, optics: Optics, corrections: Corrections, albedo: Any = 1.0, law: Law | None = None
 ) -> jax.Array:
     """Compute the detection probability per beam atom [detector, y, x] of a surface with given corrections.
 
-    `exponent` is m of a law cos^(1 + m), not normalised, the cosine that of the angle between the normal and the
-    aperture's mean direction; None: the cosine law.
+    `law`: of the single scattering; None: the cosine law.
     """
     phi = form_factor_at(optics, surface.height)
     normal = unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift)
     single = single_scattering(phi - corrections.masked, normal)
-    if exponent is not None:
-        cos = single_scattering(phi, normal) / jnp.sqrt(jnp.sum(phi**2, axis=1))
-        single = single * jnp.maximum(cos, MIN_COS) ** exponent
+    if law is not None:
+        single = single * mean_over_aperture(law, optics, surface.height, normal)
     return albedo * single + corrections.multiple
 
 
@@ -88,13 +84,13 @@ def render(
     readout: Readout | None = None,
     corrections: Corrections | Plan | Literal["none", "masking", "radiosity"] = "masking",
     albedo: Any = 1.0,
-    exponent: Any = None,
+    law: Law | None = None,
     edges: tuple[Any, Any] | None = None,
     n_slices: int = N_SLICES,
 ) -> jax.Array:
     """Compute the expected micrographs of a surface [detector, y, x].
 
-    The cosine law, a spot much smaller than a pixel, nothing outside of the raster but the substrate. Works under
+    A spot much smaller than a pixel, nothing outside of the raster but the substrate. Works under
     `jax.jit`, `grad`, `jvp`, `vmap`, `jacfwd` and `jacrev` in every argument that is a number; one compilation serves
     every geometry, surface and read-out of the same shapes. Float64 NumPy heights are computed in float64, JAX arrays
     in their own precision. More: docs/gradients.md.
@@ -111,7 +107,8 @@ def render(
             the optics); a plan of `hx.plan_radiosity`: the same, differentiable; `Corrections`: masks and multiple
             scattering as given.
         albedo: relative reflectivity of single scattering, scalar or [y, x].
-        exponent: m of a law cos^(1 + m), not normalised, instead of the cosine law.
+        law: of the single scattering, `hx.PowerLaw`, `hx.LobeLaw`, `hx.RoughLaw` or `hx.MonotoneLaw`; default: the
+            cosine law, which the radiosity takes in either case.
         edges: weights of the edges between pixels along x [y, x - 1] and y [y - 1, x], 1 joined, 0 a depth jump, for
             the slopes of heights alone.
         n_slices: vertical slices per aperture by which masks are integrated.
@@ -134,7 +131,7 @@ def render(
         corrections = _planned(surface, optics, raster)
     kind = corrections if isinstance(corrections, str) else ""
     given = None if kind else corrections
-    return _rendered(surface, optics, raster, readout, given, albedo, exponent, kind, n_slices)
+    return _rendered(surface, optics, raster, readout, given, albedo, law, kind, n_slices)
 
 
 def _planned(surface: Surface, optics: Optics, raster: Raster) -> Plan:
@@ -177,19 +174,19 @@ def radiosity_corrections(surface: Surface, optics: Optics, raster: Raster, plan
 
 
 @eqx.filter_jit
-def _rendered(surface, optics, raster, readout, corrections, albedo, exponent, kind: str, n_slices: int) -> jax.Array:
+def _rendered(surface, optics, raster, readout, corrections, albedo, law, kind: str, n_slices: int) -> jax.Array:
     dtype = jnp.asarray(surface.height).dtype
     given, plan = (corrections, None) if isinstance(corrections, Corrections) else (None, corrections)
     is_masked = given is None and kind != "none"
     horizons = choose_horizons(surface, optics, raster, n_slices) if is_masked else None
 
-    def probability_of(surface, optics, raster, given, plan, albedo, exponent, horizons):
+    def probability_of(surface, optics, raster, given, plan, albedo, law, horizons):
         if given is None:
             given = _corrections(surface, optics, raster, plan, kind, n_slices, horizons)
-        return detection_probability(surface, optics, given, albedo, exponent)
+        return detection_probability(surface, optics, given, albedo, law)
 
-    surface, optics, raster, given, plan, albedo, exponent = (
-        cast(part, dtype) for part in (surface, optics, raster, given, plan, albedo, exponent)
+    surface, optics, raster, given, plan, albedo, law = (
+        cast(part, dtype) for part in (surface, optics, raster, given, plan, albedo, law)
     )
-    probability = batched_in_chunks(probability_of)(surface, optics, raster, given, plan, albedo, exponent, horizons)
+    probability = batched_in_chunks(probability_of)(surface, optics, raster, given, plan, albedo, law, horizons)
     return probability if readout is None else cast(readout, dtype)(probability)

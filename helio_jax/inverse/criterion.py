@@ -356,7 +356,7 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
     inverse_sigma = 1.0 / jnp.sqrt(variance + assumed)
     slopes = jnp.asarray(surface.slope_x), jnp.asarray(surface.slope_y)
     bias = second_order_noise_bias(
-        *slopes, factors.terms[0], optics.beam_shift, inverse_sigma, NOISY * noise * steepness(*slopes)
+        surface, factors.terms[0], optics, None, inverse_sigma, NOISY * noise * steepness(*slopes)
     )
     priors = replace(f.priors, offset=s.offset_std * median, drift=s.drift_std * median, lines=s.line_std * median)
     fixed = replace(
@@ -367,7 +367,7 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
         noise_bias=bias,
         priors=priors,
         edges=_edges_at(case, noise),
-        beam_shift=optics.beam_shift,
+        optics=optics,
     )
     share = (assumed / (variance + assumed)).reshape(len(signal), -1)
     own = factors.terms[0] + masked

@@ -90,7 +90,7 @@ def fisher(
     deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance @ matrix.T))
     numbers, priors = tuple(map(str, range(optics.n_detectors))), np.linalg.norm(matrix, axis=1)
     parameters = {
-        plain_name(name, numbers): (float(std), float(prior), unit)
+        plain_name(name, numbers, problem.priors.law): (float(std), float(prior), unit)
         for name, std, prior, unit in zip(posterior.names, deviation, priors, units, strict=True)
         if prior > 0.0
     }

@@ -26,7 +26,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Parameters, Unknowns, data_by_incidence, smooth_albedo
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.state import FitState, Predict, moved_optics, predict_corrections, update_corrections
+from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
@@ -139,7 +139,7 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
     planes = part.priors.tilt * part.position
-    unfitted = _incidence_error(part, there, unknowns, fixed)
+    unfitted = _incidence_error(part, unknowns, fixed)
     return LinearisedFit(linearise(unknowns, fixed), error, edge_error, planes, part, there, stride, unfitted)
 
 
@@ -149,14 +149,13 @@ def inflated(posterior: Posterior, state: FitState) -> Posterior:
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO)
 
 
-def _incidence_error(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
+def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
     """Compute what one standard deviation of the incidence, which is not fitted, does to the data [residual, 1]."""
     std = problem.geometry.incidence_std
     if not std or problem.optics.beam_shifts is not None:
         return None
     with jax.enable_x64(True):
-        optics = jax.tree.map(jnp.asarray, moved_optics(problem.optics, problem.moves(state.parameters)))
-        return std * np.asarray(_data_by_incidence(unknowns, fixed, optics)).reshape(-1, 1)
+        return std * np.asarray(_data_by_incidence(*jax.tree.map(jnp.asarray, (unknowns, fixed)))).reshape(-1, 1)
 
 
 _data_by_incidence = compiled(data_by_incidence)

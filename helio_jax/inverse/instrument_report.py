@@ -10,13 +10,19 @@ from typing import Any
 import numpy as np
 
 from helio_jax.inverse.fit import Fit
+from helio_jax.inverse.law_prior import cosine_probability, numbers_of
+from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.residuals import LawPrior
 
 WEAK = 0.5
 """A combination is weak when the data leave more than this share of its prior standard deviation."""
 _MAX_LISTED = 6
 _MAX_TERMS = 4
 """Weak combinations that are listed at most, and parameters that are named in each."""
+LEAST_PROBABILITY = 0.01
+"""A law whose numbers deviate from the cosine law's with a smaller probability is not the cosine law."""
+_OTHER = 1.0, "prior standard deviations"
 _PRIOR_DOMINATED = 1.0 - 1e-6
 """A parameter that keeps all of its prior standard deviation affects no datum, and so no height."""
 
@@ -32,15 +38,14 @@ def units_of(problem: FitProblem, names: tuple[str, ...]) -> tuple[np.ndarray, l
         "offset": (s.offset_std, "of the signal"),
         "log_multiple": (s.multiple_error, "relative"),
         "drift": (s.drift_std, "of the signal"),
-        "law": (s.law_std, "of the exponent"),
         "patch": (s.patch_albedo_std, "natural logarithm"),
         "tilt": (math.degrees(problem.tilt_std), "deg"),
         "distance": (1.0, "um"),
         "polar": (math.degrees(1.0), "deg"),
         "azimuth": (math.degrees(1.0), "deg"),
     }
-    kinds = [kind_of(name) for name in names]
-    found = [priors.get(kind, (1.0, "prior standard deviations")) for kind in kinds]
+    kinds, law = [kind_of(name) for name in names], iter(numbers_of(problem.priors.law))
+    found = [((number := next(law)).std, number.unit) if kind == "law" else priors.get(kind, _OTHER) for kind in kinds]
     matrix = np.diag([size for size, _ in found])
     of_geometry = [i for i, kind in enumerate(kinds) if kind in ("distance", "polar", "azimuth")]
     if of_geometry:
@@ -54,13 +59,15 @@ def kind_of(name: str) -> str:
     return head if head != "aim" else ("polar", "azimuth")[int(index.rstrip("]").split(",")[1])]
 
 
-def plain_name(name: str, detectors: tuple[str, ...]) -> str:
-    """Make the name that is shown: "polar forward" for "aim[0, 0]"."""
+def plain_name(name: str, detectors: tuple[str, ...], law: LawPrior | None = None) -> str:
+    """Make the name that is shown: "polar forward" for "aim[0, 0]"; `law`: whose numbers the names may be of."""
     _, _, index = name.partition("[")
     parts = [int(i) for i in index.rstrip("]").replace(" ", "").split(",") if i]
     kind = kind_of(name)
-    if kind in ("distance", "occluded", "surroundings", "law"):
+    if kind in ("distance", "occluded", "surroundings"):
         return kind
+    if kind == "law":
+        return numbers_of(law)[parts[0]].name
     if kind == "tilt":
         return f"tilt {'xy'[parts[0]]}"
     if kind == "albedo":
@@ -78,20 +85,28 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     changes of what stack and instrument state. `weak`: combinations of which the data leave more than `WEAK` of their
     prior standard deviation: `share` is what they leave, `of` the largest terms of the (unit) combination. `inflation`:
     Birge ratio by which all error bars are enlarged. `common_mode_um`: largest common-mode error that was added for an
-    instrument that contradicts the file or a fit that has not converged.
+    instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, where one was fitted.
     """
     posterior = fit.posterior
     if posterior is None:
         return {}
     detectors = fit.instrument.detector_names
     matrix, units = units_of(fit.problem, posterior.names)
+    law = fit.problem.priors.law
     flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])
     covariance, prior = posterior.instrument_covariance, np.linalg.norm(matrix, axis=1)
+    means = iter(number.mean for number in numbers_of(law))
+    mean = np.array([next(means) if kind_of(name) == "law" else 0.0 for name in posterior.names])
     found = zip(
-        posterior.names, matrix @ flat, np.sqrt(np.diag(matrix @ covariance @ matrix.T)), prior, units, strict=True
+        posterior.names,
+        mean + matrix @ flat,
+        np.sqrt(np.diag(matrix @ covariance @ matrix.T)),
+        prior,
+        units,
+        strict=True,
     )
     values = {
-        plain_name(name, detectors): [float(value), float(std), float(own), unit]
+        plain_name(name, detectors, law): [float(value), float(std), float(own), unit]
         for name, value, std, own, unit in found
         if own > 0.0
     }
@@ -104,7 +119,24 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
             break
         combination = relative @ vector[:, i]
         terms = np.argsort(-np.abs(combination))[:_MAX_TERMS]
-        of = {plain_name(posterior.names[determined[t]], detectors): round(float(combination[t]), 3) for t in terms}
+        of = {
+            plain_name(posterior.names[determined[t]], detectors, law): round(float(combination[t]), 3) for t in terms
+        }
         weak.append({"share": float(np.sqrt(size[i])), "of": of})
     common = 0.0 if posterior.common_modes is None else float(np.sqrt((posterior.common_modes**2).sum(0)).max())
-    return {"values": values, "weak": weak, "inflation": posterior.inflation, "common_mode_um": common}
+    found = {"values": values, "weak": weak, "inflation": posterior.inflation, "common_mode_um": common}
+    return found if law is None else found | {"law": describe_law(fit, posterior)}
+
+
+def describe_law(fit: Fit, posterior: Posterior) -> dict[str, Any]:
+    """Test whether the fitted scattering law is compatible with the cosine law.
+
+    `kind`: of the law; `cosine_probability`: `law_prior.cosine_probability`; `is_cosine`: whether it exceeds
+    `LEAST_PROBABILITY`.
+    """
+    prior, whitened = fit.problem.priors.law, np.ravel(fit.parameters.law)
+    of_law = [i for i, name in enumerate(posterior.names) if kind_of(name) == "law"]
+    assert prior is not None
+    probability = cosine_probability(prior, whitened, posterior.instrument_covariance[np.ix_(of_law, of_law)])
+    kind = fit.problem.settings.law
+    return {"kind": kind, "cosine_probability": probability, "is_cosine": probability > LEAST_PROBABILITY}

@@ -111,7 +111,7 @@ class Goal(eqx.Module):
     @property
     def beam_shift(self) -> Any:
         """Of the beam [2]."""
-        return self.cases[0].fixed.beam_shift
+        return self.cases[0].fixed.optics.beam_shift
 
     def assess_optics(self, optics: Optics) -> Assessment:
         """Assess optics, whose distance to the substrate is each sample's, as NumPy arrays [sample]."""

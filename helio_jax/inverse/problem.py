@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
+from helio_jax.forward.laws import Law
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
 from helio_jax.forward.surface import Surface
@@ -20,9 +21,10 @@ from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.law_prior import check_images, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.quality import MIN_REGION, regions
-from helio_jax.inverse.residuals import Parameters, Priors, moves_of
+from helio_jax.inverse.residuals import Parameters, Priors, law_of, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 LEVEL_STD = 0.1
@@ -114,6 +116,7 @@ class FitProblem:
         else:
             geometry = GeometryPrior.of(given)
         s, shape = settings.refine, signal.shape[1:]
+        check_images(s, len(signal))
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
         modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
@@ -204,12 +207,11 @@ class FitProblem:
             "albedo": s.albedo_std,
             "drift": s.drift_std * median,
             "lines": s.line_std * median,
-            "law": s.law_std,
             "geometry": self.geometry_prior.factor()[np.ix_(free, free)],
             "tilt": self.tilt_std,
             "patch": s.patch_albedo_std,
         }
-        return Priors(**{name: np.asarray(value, float) for name, value in numbers.items()})
+        return Priors(law=law_prior(s), **{name: np.asarray(value, float) for name, value in numbers.items()})
 
     def prior_means(self) -> Parameters:
         """Make the parameters at their prior means, all 0; those that are known have no entries."""
@@ -225,7 +227,7 @@ class FitProblem:
             "albedo": (n, n),
             "drift": (k, self.drift_modes.shape[1]),
             "lines": (k, lines),
-            "law": 1 if s.law_std else 0,
+            "law": len(numbers_of(law_prior(s))),
             "distance": 1 if s.geometry and self.distance_std else 0,
             "tilt": 2 if s.geometry and self.tilt_std else 0,
             "aim": (k, 2) if s.geometry and self.geometry.is_aimed else 0,
@@ -241,6 +243,16 @@ class FitProblem:
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""
         return self.patches.with_albedo(self.settings.patch_albedo_std * np.asarray(parameters.patch))
+
+    def law_at(self, parameters: Parameters) -> Law | None:
+        """Return the scattering law of parameters, of NumPy numbers; None: the cosine law."""
+        with jax.enable_x64(True):
+            return jax.tree.map(np.asarray, law_of(parameters, self.priors))
+
+    def known_law(self, parameters: Parameters) -> dict[str, Law]:
+        """Keywords by which a prediction is given the law; none for the cosine law."""
+        law = self.law_at(parameters)
+        return {} if law is None else {"law": law}
 
     @property
     def is_instrument_unknown(self) -> bool:

@@ -11,12 +11,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jax.scipy.fft import idctn
 
 from helio_jax.forward.form_factor import form_factor_at
+from helio_jax.forward.laws import Law, mean_over_aperture
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.readout import Readout
-from helio_jax.forward.render import MIN_COS, single_scattering
+from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface, one_sided, unit_normal
 from helio_jax.inverse.edges import fourth_order_slopes, trapezoid_gap
 
@@ -37,7 +39,7 @@ class Parameters(eqx.Module):
         albedo: cosine modes of the smooth albedo [mode, mode].
         drift: slow drift [detector, mode].
         lines: offsets of the scan lines [detector, line].
-        law: exponent m of the law cos^(1 + m) [1].
+        law: numbers of the scattering law [number].
         distance: of the sample from the plate [1].
         tilt: of the substrate [2: x, y].
         aim: polar angle and azimuth of the apertures [detector, 2].
@@ -83,10 +85,23 @@ class Unknowns(eqx.Module):
     parameters: Parameters
 
 
+class LawPrior(eqx.Module):
+    """What is known of the numbers of a scattering law: means and standard deviations, each in the form of a law."""
+
+    mean: Law
+    std: Law
+
+    def at(self, whitened: jax.Array) -> Law:
+        """Return the law of numbers in standard deviations from their means [number]."""
+        mean, restore = ravel_pytree(self.mean)
+        return restore(mean + ravel_pytree(self.std)[0] * whitened)
+
+
 class Priors(eqx.Module):
     """Prior standard deviations: relative gain; offset [detector]; scale of multiple scattering; albedo; drift and line
-    offsets [detector]; exponent of the law; tilt [rad]; log albedo of patches. Of the geometry, a factor of the prior
-    covariance of what is unknown of distance [um] and directions [rad] (`GeometryPrior`) [parameter, parameter]."""
+    offsets [detector]; tilt [rad]; log albedo of patches. Of the geometry, a factor of the prior covariance of what is
+    unknown of distance [um] and directions [rad] (`GeometryPrior`) [parameter, parameter]. Of the law, None where it is
+    the cosine law."""
 
     gain: Any
     offset: Any
@@ -94,7 +109,7 @@ class Priors(eqx.Module):
     albedo: Any
     drift: Any
     lines: Any
-    law: Any
+    law: LawPrior | None
     geometry: Any
     tilt: Any
     patch: Any
@@ -107,19 +122,17 @@ class FormFactors(eqx.Module):
         height: about which [y, x], um.
         terms: visible form factor, and first and second derivative of the unmasked one by the height
             [3, detector, 3, y, x].
-        direction: unit vectors of the unmasked form factors [detector, 3, y, x].
         moves: derivative of the visible form factor by distance, polar angle, azimuth, each detector by its own
             [move, detector, 3, y, x]; no moves where the geometry is known.
         moved: the moves about which [move, detector], um, rad.
         level_height: mean height about which a level facet's form factor is expanded [um].
-        level: horizontal parts of that form factor and of its derivatives by the height [3, detector, 2].
-        level_moves: its derivative by the moves [move, detector, 2].
-        stated: the same at the substrate, by the optics as stated [detector, 2].
+        level: that form factor and its derivatives by the height [3, detector, 3].
+        level_moves: its derivative by the moves [move, detector, 3].
+        stated: its horizontal part at the substrate, by the optics as stated [detector, 2].
     """
 
     height: Any
     terms: Any
-    direction: Any
     moves: Any
     moved: Any
     level_height: Any
@@ -134,7 +147,7 @@ class FormFactors(eqx.Module):
         return value + jnp.einsum("mk,mkiyx->kiyx", moves - self.moved, self.moves)
 
     def level_at(self, height: jax.Array, moves: jax.Array) -> jax.Array:
-        """Compute the horizontal part of a level facet's form factor [detector, 2] at another mean height and moves."""
+        """Compute a level facet's form factor [detector, 3] at another mean height and moves."""
         rise = height - self.level_height
         value = self.level[0] + rise * (self.level[1] + 0.5 * rise * self.level[2])
         return value + jnp.einsum("mk,mki->ki", moves - self.moved, self.level_moves)
@@ -160,6 +173,24 @@ class CommonModes(eqx.Module):
     def amplitudes(self, height: Any) -> Any:
         """Compute the amplitudes [mode] of heights."""
         return jnp.einsum("myx,yx->m", self.weights, height)
+
+
+class LawResponse(eqx.Module):
+    """How the multiple scattering follows the numbers of the law: alike in all pixels, as an exponential.
+
+    Attributes:
+        multiple: multiple scattering as predicted [detector, y, x].
+        at: numbers of its law, in prior standard deviations from their means [number].
+        rate: derivative of its logarithm by them [number].
+    """
+
+    multiple: Any
+    at: Any
+    rate: Any
+
+    def change(self, numbers: jax.Array) -> jax.Array:
+        """Compute the change of the multiple scattering [detector, y, x] at other numbers."""
+        return self.multiple * jnp.expm1(jnp.sum(self.rate * (numbers - self.at)))
 
 
 class Edges(eqx.Module):
@@ -205,7 +236,8 @@ class FixedTerms(eqx.Module):
         whitening: standard deviation of each cosine mode of the heights [y, x], um.
         slope_scale_x, slope_scale_y: scale of the whitened slopes [y, x].
         priors: of the parameters.
-        beam_shift: of the optics [2].
+        optics: as stated.
+        law_response: how the multiple scattering follows the law; None where that is the cosine law.
         dx, dy: raster pitch, um.
         slow_axis: of the scan, static.
     """
@@ -231,9 +263,10 @@ class FixedTerms(eqx.Module):
     slope_scale_x: Any
     slope_scale_y: Any
     priors: Priors
-    beam_shift: Any
+    optics: Optics
     dx: Any
     dy: Any
+    law_response: LawResponse | None
     slow_axis: int = eqx.field(static=True, default=0)
 
 
@@ -283,6 +316,16 @@ def moves_of(parameters: Parameters, priors: Priors, n_detectors: int) -> jax.Ar
     )
 
 
+def moved_optics(optics: Optics, moves: Any) -> Optics:
+    """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
+    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
+
+
+def law_of(parameters: Parameters, priors: Priors) -> Law | None:
+    """Make the scattering law of parameters; None: the cosine law."""
+    return None if priors.law is None else priors.law.at(parameters.law)
+
+
 def readout_of(parameters: Parameters, priors: Priors, drift_modes: Any, slow_axis: int) -> Readout:
     """Make the read-out of parameters."""
     return Readout(
@@ -298,14 +341,16 @@ def readout_of(parameters: Parameters, priors: Priors, drift_modes: Any, slow_ax
 def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
     """Compute the expected data [detector, y, x] in units of the beam."""
     p, factors = fixed.priors, fixed.form_factors
-    visible = factors.visible(surface.height, moves_of(parameters, p, len(fixed.data)))
-    normal = unit_normal(surface.slope_x, surface.slope_y, fixed.beam_shift)
-    single = single_scattering(visible, normal)
-    if parameters.law.size:
-        cos = jnp.maximum(single_scattering(factors.direction, normal), MIN_COS)
-        single = single * cos ** jnp.sum(p.law * parameters.law)
+    moves, law = moves_of(parameters, p, len(fixed.data)), law_of(parameters, p)
+    normal = unit_normal(surface.slope_x, surface.slope_y, fixed.optics.beam_shift)
+    single = single_scattering(factors.visible(surface.height, moves), normal)
+    if law is not None:
+        single = single * mean_over_aperture(law, moved_optics(fixed.optics, moves), surface.height, normal)
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
-    multiple = fixed.multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
+    multiple = fixed.multiple
+    if fixed.law_response is not None:
+        multiple = multiple + fixed.law_response.change(parameters.law)
+    multiple = multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
     if parameters.surroundings.size:
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
@@ -317,7 +362,7 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
 
 
 def second_order_noise_bias(
-    slope_x: Any, slope_y: Any, visible: Any, shift: Any, inverse_sigma: Any, largest: Any
+    surface: Surface, visible: Any, optics: Optics, law: Law | None, inverse_sigma: Any, largest: Any
 ) -> jax.Array:
     """Compute the bias of the mean signal of facets by the noise of their fitted slopes [detector, y, x].
 
@@ -326,9 +371,10 @@ def second_order_noise_bias(
     that the facet's own data leave, times `GRADIENT_SHARE`.
 
     Args:
-        slope_x, slope_y: fitted [y, x].
+        surface: fitted.
         visible: form factors [detector, 3, y, x].
-        shift: of the beam [2].
+        optics: of these.
+        law: of the scattering; None: the cosine law.
         inverse_sigma: of the data [detector, y, x].
         largest: standard deviation of the slopes that more noise does not exceed [y, x].
 
@@ -336,12 +382,15 @@ def second_order_noise_bias(
     """
 
     def signal(x: jax.Array, y: jax.Array) -> jax.Array:
-        return single_scattering(visible, unit_normal(x, y, shift))
+        normal = unit_normal(x, y, optics.beam_shift)
+        single = single_scattering(visible, normal)
+        return single if law is None else single * mean_over_aperture(law, optics, surface.height, normal)
 
     def along(function, way):
         return lambda *slopes: jax.jvp(function, slopes, way)[1]
 
-    at, one = (slope_x, slope_y), jnp.ones_like(slope_x)
+    surface = Surface(*(jnp.asarray(part) for part in (surface.height, surface.slope_x, surface.slope_y)))
+    at, one = (surface.slope_x, surface.slope_y), jnp.ones_like(surface.slope_x)
     ways = (one, 0.0 * one), (0.0 * one, one)
     first = [along(signal, way) for way in ways]
     c_xx, c_xy, c_yy = (along(first[i], ways[j])(*at) for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -355,18 +404,20 @@ def data_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) 
     return (expected_data(surface, parameters, fixed) - fixed.data) * fixed.inverse_sigma
 
 
-def data_by_incidence(unknowns: Unknowns, fixed: FixedTerms, optics: Optics) -> jax.Array:
+def data_by_incidence(unknowns: Unknowns, fixed: FixedTerms) -> jax.Array:
     """Compute the derivative of the data's residuals by the beam's incidence [detector, y, x], per rad.
 
     Heights and slopes at the beam positions stay; what they mean turns with the beam. Masks are held.
     """
     surface, factors = surface_of(unknowns, fixed), fixed.form_factors
+    moves = moves_of(unknowns.parameters, fixed.priors, len(fixed.data))
+    optics = moved_optics(fixed.optics, moves)
 
     def at(step: jax.Array) -> jax.Array:
         moved = optics.moved(incidence=step)
         change = form_factor_at(moved, surface.height) - form_factor_at(optics, surface.height)
-        terms = factors.terms.at[0].add(change)
-        there = eqx.tree_at(lambda f: (f.form_factors.terms, f.beam_shift), fixed, (terms, moved.beam_shift))
+        terms, stated = factors.terms.at[0].add(change), fixed.optics.moved(incidence=step)
+        there = eqx.tree_at(lambda f: (f.form_factors.terms, f.optics), fixed, (terms, stated))
         return data_residuals(surface, unknowns.parameters, there)
 
     return jax.jvp(at, (jnp.zeros(()),), (jnp.ones(()),))[1]
@@ -378,16 +429,31 @@ def edge_scale(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> j
     Edges count in units of the slope noise that the data's noise makes, which falls with the gain and, near the
     plate, with the height: else a larger gain or level would explain the noise by smaller slopes, which the edges
     would prefer, however many pixels there are. For a level facet at the mean height, whose signal changes with its
-    slopes by the horizontal part of the form factor. So does the mean albedo of patches.
+    slopes by the horizontal part of the form factor, and by the law. So does the mean albedo of patches.
     """
     weight = jnp.sqrt(jnp.mean(fixed.inverse_sigma**2, (1, 2)))[:, None]
     gain = jnp.exp(fixed.priors.gain * parameters.log_gain)[:, None]
     moves = moves_of(parameters, fixed.priors, len(fixed.data))
-    here = fixed.form_factors.level_at(jnp.mean(surface.height), moves)
+    here = _level_sensitivity(jnp.mean(surface.height), moves, law_of(parameters, fixed.priors), fixed)
     scale = jnp.sqrt(jnp.sum((weight * gain * here) ** 2) / jnp.sum((weight * fixed.form_factors.stated) ** 2))
     if parameters.patch.size:
         scale = scale * jnp.mean(albedo_of_patches(parameters.patch, fixed.priors.patch, fixed.patches))
     return scale
+
+
+def _level_sensitivity(height: jax.Array, moves: jax.Array, law: Law | None, fixed: FixedTerms) -> jax.Array:
+    """Compute by how much a level facet's signal falls with its slopes [detector, 2]."""
+    factor = fixed.form_factors.level_at(height, moves)
+    if law is None:
+        return factor[:, :2]
+    optics = moved_optics(fixed.optics, moves)
+
+    def value(slopes: jax.Array) -> jax.Array:
+        normal = unit_normal(slopes[:1], slopes[1:], optics.beam_shift)
+        return mean_over_aperture(law, optics, height[None], normal)[:, 0]
+
+    level = jnp.zeros(2, height.dtype)
+    return factor[:, :2] * value(level)[:, None] - factor[:, 2:] * jax.jacfwd(value)(level)
 
 
 def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> tuple[jax.Array, jax.Array]:

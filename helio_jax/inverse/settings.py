@@ -34,8 +34,17 @@ class RefineSettings(Settings):
     """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
     """Prior standard deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
-    law_std: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Prior standard deviation of m in a scattering law cos^(1 + m); 0: the cosine law."""
+    law: Literal["cosine", "power", "broad_specular", "rough_diffuse", "monotone"] = "cosine"
+    """Scattering law of the sample. `cosine`: known; the others have unknown numbers, about those of the cosine law.
+    `power`: exponent m of cos^(1 + m); `broad_specular`: share and width of a lobe about the mirror's direction, the
+    rest by the cosine law; `rough_diffuse`: roughness r of the energy-preserving Oren-Nayar model; `monotone`: any
+    density that falls with the angle to the normal, by its exponent at 7 angles (needs 5 or more images)."""
+    law_std: float = Field(default=0.3, gt=0.0, le=1.0)
+    """Prior standard deviation of m, of the lobe's share, of r, or of the logarithm of each of the 7 exponents."""
+    law_width_deg: float = Field(default=30.0, ge=5.0, le=90.0)
+    """Prior mean of the lobe's width [deg]."""
+    law_width_std_deg: float = Field(default=10.0, gt=0.0, le=90.0)
+    """Prior standard deviation of the lobe's width [deg]."""
     geometry: bool = True
     """Whether distance, tilt and aperture angles are unknowns where the instrument's [uncertainty] states them."""
     level_std_um: float | None = Field(default=None, gt=0.0, le=1e5)
@@ -101,6 +110,17 @@ class RefineSettings(Settings):
     def search_paths(self, n_pixels: int) -> int:
         """Number of paths of a prediction in a search and in the test of a fit."""
         return max(self.paths(n_pixels) // SEARCH_THRIFT, 1000)
+
+    @model_validator(mode="after")
+    def _has_law(self) -> "RefineSettings":
+        for key in ("law_std", "law_width_deg", "law_width_std_deg"):
+            if self.law == "cosine" and getattr(self, key) != RefineSettings.model_fields[key].default:
+                raise ValueError(f"{key} has no use with the known cosine law: set law, too, e.g. law = 'power'")
+        if self.law != "cosine" and self.multiple == "radiosity":
+            raise ValueError(
+                "multiple = 'radiosity' knows the cosine law only: set it to 'traced' where a law is fitted"
+            )
+        return self
 
     @model_validator(mode="after")
     def _has_matching_stages(self) -> "RefineSettings":

@@ -5,7 +5,7 @@ but follow, to first order, the geometry, the own normal, and common changes of 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -19,13 +19,16 @@ from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import Parameters
+from helio_jax.inverse.residuals import Parameters, moved_optics
 from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
 from helio_jax.inverse.settings import RefineSettings
 
+LAW_STEP = 0.5
+"""Step of a number of the law by which the derivative of the multiple scattering is taken [prior s.d.]."""
 Predict = Callable[..., Corrections]
-"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and
-the albedo [y, x], by its name, where it is not 1. The corrections are per albedo of the own pixel."""
+"""(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and by
+their names the albedo [y, x] where it is not 1, and the law where it is not the cosine law. The corrections are per
+albedo of the own pixel."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Held:
         moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
         moved: the moves at which they were made [move, detector].
         responses: how they follow common changes of the heights.
+        law_rate: how the logarithm of the multiple scattering follows the numbers of the law [number].
+        law_at: numbers of the law of the corrections, in prior standard deviations from their means [number].
     """
 
     corrections: Corrections
@@ -51,6 +56,8 @@ class Held:
     moves: np.ndarray
     moved: np.ndarray
     responses: tuple[Response, ...] = ()
+    law_rate: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    law_at: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,8 @@ class FitState:
             moves=h.moves[..., *thin],
             moved=h.moved,
             responses=tuple(r.thinned(thin, stride) for r in h.responses),
+            law_rate=h.law_rate,
+            law_at=h.law_at,
         )
         lines = self.parameters.lines[:, ::stride]
         surface = jax.tree.map(lambda f: f[thin], self.surface)
@@ -150,7 +159,8 @@ def _held(problem: FitProblem, corrections: Corrections, surface: Surface, param
     variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
     moves = np.zeros((len(moved), *corrections.masked.shape))
-    return Held(corrections, surface, masked, multiple, sigma, moves, moved)
+    law = np.asarray(parameters.law)
+    return Held(corrections, surface, masked, multiple, sigma, moves, moved, (), np.zeros(law.size), law)
 
 
 def set_corrections(problem: FitProblem, state: FitState, corrections: Corrections, surface: Surface) -> FitState:
@@ -165,17 +175,32 @@ def set_corrections(problem: FitProblem, state: FitState, corrections: Correctio
 
 def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
     """Predict masks and multiple scattering on the current surface, which follow no common changes of heights."""
-    surface, p = state.surface, state.parameters
-    is_geometry_known = not p.distance.size and not p.aim.size
+    corrections = _predicted(problem, state, predict, state.parameters)
+    return set_corrections(problem, state, corrections, state.surface)
+
+
+def _predicted(problem: FitProblem, state: FitState, predict: Predict, p: Parameters) -> Corrections:
+    surface, is_geometry_known = state.surface, not p.distance.size and not p.aim.size
     instrument = () if is_geometry_known else (problem.fitted_instrument(p),)
-    known = problem.patches_at(p).known
-    corrections = predict(surface.height, surface.normals(problem.shift), *instrument, **known)
-    return set_corrections(problem, state, corrections, surface)
+    known = problem.patches_at(p).known | problem.known_law(p)
+    return predict(surface.height, surface.normals(problem.shift), *instrument, **known)
 
 
 def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
-    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights."""
-    return with_responses(problem, predict_corrections(problem, state, predict))
+    """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights and
+    the law.
+
+    Multiple scattering that did not follow the law would drive it away: a narrower law has less of it, and what is then
+    missing the next solve would take for a still narrower one.
+    """
+    state = with_responses(problem, predict_corrections(problem, state, predict))
+    p, base = state.parameters, np.mean(state.held.corrections.multiple)
+    rate = np.zeros(p.law.size)
+    for i in range(rate.size if base > 0.0 else 0):
+        stepped = p.replaced(law=p.law + LAW_STEP * (np.arange(rate.size) == i))
+        found = np.mean(_predicted(problem, state, predict, stepped).multiple)
+        rate[i] = np.log(max(found / base, LAW_STEP)) / LAW_STEP
+    return replace(state, held=replace(state.held, law_rate=rate))
 
 
 def with_responses(problem: FitProblem, state: FitState) -> FitState:
@@ -189,11 +214,6 @@ def with_responses(problem: FitProblem, state: FitState) -> FitState:
         known = problem.has_enough_images, float(problem.optics.sample_distance)
         responses += relief_responses(surface, normals, optics, raster, *known)
     return replace(state, held=replace(state.held, responses=responses))
-
-
-def moved_optics(optics: Optics, moves: Any) -> Optics:
-    """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
-    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
 
 
 @compiled

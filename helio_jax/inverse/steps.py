@@ -24,13 +24,15 @@ from helio_jax.inverse.residuals import (
     Edges,
     FixedTerms,
     FormFactors,
+    LawResponse,
     Unknowns,
     expected_data,
+    moved_optics,
     second_order_noise_bias,
     surface_of,
 )
 from helio_jax.inverse.solver import Solution, solve, whitened_parameters
-from helio_jax.inverse.state import FitState, Held, moved_optics
+from helio_jax.inverse.state import FitState, Held
 from helio_jax.robust import cauchy_weight
 
 MODE_BLOCK = 4
@@ -72,17 +74,15 @@ def expand_form_factors(optics: Optics, moved: Any, height: Any, held: tuple) ->
 
     mean = jnp.mean(height)
     terms, level = derivatives(moved, height), derivatives(moved, mean[None])
-    direction = terms[0] / jnp.sqrt(jnp.sum(terms[0] ** 2, 1, keepdims=True))
     masked = masked + jnp.einsum("mk,mkiyx->kiyx", moved - masked_at, masked_moves)
     return FormFactors(
         height,
         terms.at[0].add(-masked),
-        direction,
         by_moves(height) - masked_moves,
         moved,
         mean,
-        level[:, :, :2, 0],
-        by_moves(mean[None])[:, :, :2, 0],
+        level[..., 0],
+        by_moves(mean[None])[..., 0],
         form_factor_at(optics, jnp.zeros(1))[:, :2, 0],
     )
 
@@ -121,7 +121,6 @@ class PixelTerms(NamedTuple):
         factors = FormFactors(
             f.height[thin],
             f.terms[thin],
-            f.direction[thin],
             f.moves[thin],
             f.moved,
             f.level_height,
@@ -137,12 +136,11 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
     largest = NOISY * noise * steepness(*slopes)
     inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
-    corrections = held.masked, held.moves, held.moved
+    corrections, moves = (held.masked, held.moves, held.moved), problem.moves(state.parameters)
     with jax.enable_x64(True):
-        factors = expand_form_factors(
-            problem.optics, problem.moves(state.parameters), state.surface.height, corrections
-        )
-        bias = _noise_bias(*slopes, factors.terms[0], problem.shift, inverse_sigma, largest)
+        factors = expand_form_factors(problem.optics, moves, state.surface.height, corrections)
+        known = moved_optics(problem.optics, moves), problem.law_at(state.parameters)
+        bias = _noise_bias(state.surface, factors.terms[0], *known, inverse_sigma, largest)
     return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
 
 
@@ -222,7 +220,8 @@ def freeze(
         slope_scale_x=scale_x,
         slope_scale_y=scale_y,
         priors=priors,
-        beam_shift=problem.shift,
+        optics=problem.optics,
+        law_response=None if priors.law is None else LawResponse(held.corrections.multiple, held.law_at, held.law_rate),
         dx=dx,
         dy=dy,
         slow_axis=problem.order.slow_axis,
@@ -259,7 +258,7 @@ def step(
     start, fixed = freeze(problem, state, limit, cut, occluded)
     free = np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
-        is_mixed = problem.is_instrument_unknown or problem.is_level_free
+        is_mixed = problem.is_instrument_unknown or problem.is_level_free or problem.priors.law is not None
         if (is_instrument_free and is_mixed) or start.parameters.patch.size:
             mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)), free)
         else:  # as they are, where they are held or little is unknown

@@ -16,6 +16,7 @@ import numpy as np
 
 from helio_jax.arrays import pitch, substrate_level
 from helio_jax.errors import GuardError, PredictionError, SceneError
+from helio_jax.forward.laws import Law
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.render import Corrections, masking_corrections, radiosity_corrections, single_scattering
@@ -24,7 +25,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.border import extend_border, mirror_border
-from helio_jax.scene.scattering import CosineLaw, Term
+from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
@@ -77,8 +78,9 @@ def make_predictor(
     `masks_by` rays, masks are traced on the mesh instead of computed by the horizon march, for a test of the result
     that shares neither with the fit.
 
-    Seeds are fixed, so that successive predictions differ by the surface, not by noise. A scattering plate is part of
-    what is traced, by the cosine law.
+    Seeds are fixed, so that successive predictions differ by the surface, not by noise. All of the sample scatters by
+    the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law. Radiosity knows
+    the cosine law only.
 
     Images of several beams are predicted beam by beam on the same surface, with masks by rays.
 
@@ -110,6 +112,7 @@ def make_predictor(
         instrument: Instrument = stack.instrument,
         *,
         albedo: np.ndarray | None = None,
+        law: Law | None = None,
     ) -> Corrections:
         optics, rasters = prepared(instrument.model_dump_json())
         surface = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2])
@@ -118,7 +121,8 @@ def make_predictor(
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
         smooth = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
-        found = [trace_beam(raster, *smooth, surface, normals, optics, albedo) for raster, _ in rasters]
+        terms = COSINE_LAW if law is None else law.terms()
+        found = [trace_beam(raster, *smooth, surface, normals, optics, albedo, terms) for raster, _ in rasters]
         return found[0] if len(found) == 1 else _joined(found, [of_beam for _, of_beam in rasters])
 
     def trace_beam(
@@ -129,6 +133,7 @@ def make_predictor(
         normals: np.ndarray,
         optics: Optics,
         albedo: np.ndarray | None,
+        law: tuple[Term, ...],
     ) -> Corrections:
         """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
         height = surface.height
@@ -139,7 +144,7 @@ def make_predictor(
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
         images = np.array(
             [
-                [smooth_along_surface(s.multiple(settings, limit, albedo), smooth_normals, passes) for s in way]
+                [smooth_along_surface(s.multiple(settings, limit, albedo, law), smooth_normals, passes) for s in way]
                 for way in either_way
             ]
         )
@@ -217,13 +222,19 @@ class SurfaceHypothesis:
     grid_shape: tuple[int, ...]
     intersector: Intersector
 
-    def multiple(self, settings: TraceSettings, max_buried: float, albedo: np.ndarray | None = None) -> np.ndarray:
+    def multiple(
+        self,
+        settings: TraceSettings,
+        max_buried: float,
+        albedo: np.ndarray | None = None,
+        law: tuple[Term, ...] = COSINE_LAW,
+    ) -> np.ndarray:
         """Trace the multiple scattering [detector, y, x], per albedo of the own pixel; default: albedo 1 everywhere."""
         r = self.raster
-        if albedo is None:
+        if albedo is None and law is COSINE_LAW:
             intersector, laws, own = self.intersector, {}, 1.0
         else:
-            intersector, laws, own = self._with_albedo(albedo)
+            intersector, laws, own = self._with_materials(np.ones(r.x.shape) if albedo is None else albedo, law)
         experiment = make_experiment(intersector, r.instrument, settings, laws)
         x, y = self.beam_x.ravel(), self.beam_y.ravel()
         try:
@@ -236,8 +247,10 @@ class SurfaceHypothesis:
             ) from e
         return tally.probability()[0][1].reshape(-1, *r.x.shape) / own
 
-    def _with_albedo(self, albedo: np.ndarray) -> tuple[Intersector, dict[str, tuple[Term, ...]], float]:
-        """Give the faces the albedo [y, x] of their first point of the grid; those beyond it, that of its corner.
+    def _with_materials(
+        self, albedo: np.ndarray, law: tuple[Term, ...]
+    ) -> tuple[Intersector, dict[str, tuple[Term, ...]], float]:
+        """Give all faces a law, and the albedo [y, x] of their first point of the grid; beyond it, that of its corner.
 
         Relative albedos above 1 count as 1: no material reflects more atoms than it receives.
 
@@ -253,7 +266,10 @@ class SurfaceHypothesis:
         body = replace(self.body, materials=names, face_material=material)
         intersector = Intersector(body)
         start = int(intersector.material_of(np.zeros(1, np.int32))[0])
-        laws = {name: CosineLaw(albedo=float(a)).terms() for name, a in zip(names, levels, strict=True)}
+        laws = {
+            name: tuple(replace(term, share=term.share * float(a)) for term in law)
+            for name, a in zip(names, levels, strict=True)
+        }
         return intersector, laws, float(levels[start])
 
     def masked(self, is_wanted: np.ndarray) -> np.ndarray:

@@ -251,10 +251,11 @@ class _Reconstructing:
         make_predict = self._make_predict(stack)
         rec = reconstruct_stack(stack, self.settings, make_predict, report, trace, stack.parallax_height)
         rec = replace(rec, provenance={**rec.provenance, **this_run()})
-        others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind != "cosine"]
+        assumed = self.settings.refine.law if self.settings.method == "refine" else "cosine"
+        others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind not in ("cosine", assumed)]
         if not others:
             return rec
-        law = f"NOT the cosine law, which heights assume, holds for {', '.join(others)}"
+        law = f"NOT the {assumed.replace('_', ' ')} law, which heights assume, holds for {', '.join(others)}"
         return replace(rec, warnings=(*rec.warnings, law))
 
     def _make_predict(self, stack: MicrographStack) -> Callable[[int], Predict]:

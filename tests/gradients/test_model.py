@@ -47,7 +47,7 @@ def make_problem(instrument, order=ScanOrder(1), border="flat", **settings):
     problem = FitProblem.of(signal, variance, instrument, raster, surface, chosen, region, order)
     known = np.nan_to_num(signal)
     corrections = Corrections(rng.uniform(0, 0.1, (3, 3, *SHAPE)) * phi, 0.2 * known, 0.05 * known)
-    state = update_corrections(problem, FitState.at(problem, surface), lambda *_: corrections)
+    state = update_corrections(problem, FitState.at(problem, surface), lambda *_, **__: corrections)
     if settings:
         drawn = jax.tree.map(lambda v: 0.5 * rng.normal(size=v.shape), state.parameters)
         state = replace(state, parameters=drawn)
@@ -65,7 +65,9 @@ def stated(bshem):
 def unknown(bshem):
     """All of the instrument is unknown, as with measured data."""
     sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
-    return make_problem(bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law_std=0.1)
+    return make_problem(
+        bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law="power", law_std=0.1
+    )
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +81,7 @@ def turned(bshem):
         "level_std_um": 200.0,
         "drift_std": 0.2,
         "line_std": 0.02,
+        "law": "broad_specular",
         "law_std": 0.1,
     }
     return make_problem(bshem.model_copy(update={"uncertainty": sure}), **about)

@@ -42,7 +42,10 @@ MOVES: dict[str, Any] = {
 }
 NO_MOVE = {"scale": 1.0, "size": (1.0, 1.0)}
 LEAVES = {
-    "masking": [*SURFACE, *OPTICS, *POSITIONS, "albedo", "exponent", *READOUT],
+    "masking": [*SURFACE, *OPTICS, *POSITIONS, "albedo", "law", *READOUT],
+    "lobe": [*SURFACE, "optics", "law"],
+    "rough law": ["law"],
+    "monotone": [*SURFACE, "optics", "law"],
     "heights": ["surface", *POSITIONS],
     "edges": ["surface", "edges"],
     "plan": [*SURFACE, *OPTICS, *POSITIONS],
@@ -50,7 +53,8 @@ LEAVES = {
     "moved from normal incidence": [f"moves.{name}" for name in MOVES if name != "beam_azimuth"] + OPTICS,
 }
 IS_AFFINE = {"albedo", *READOUT}
-SIZE = {"slope_x": 0.05, "slope_y": 0.05, "beam_shift": 0.003, "exponent": 0.1, "edges": 0.1}
+SIZE = {"slope_x": 0.05, "slope_y": 0.05, "beam_shift": 0.003, "edges": 0.1}
+SIZE |= {"exponent": 0.1, "share": 0.1, "width_deg": 3.0, "roughness": 0.1, "log_exponents": 0.1}
 SIZE |= dict.fromkeys(MOVES, 1e-3) | {"plate_shift": 1.0}
 SIZE |= dict.fromkeys(["distance", "working_distance", "sample_distance"], 10.0)
 """Standard deviation of a leaf's direction, 1 where it is not named: large against rounding, and so small that the
@@ -94,7 +98,7 @@ def readout(rng: np.random.Generator) -> hx.Readout:
 def render_of(tree: dict[str, Any], corrections: Any = "masking") -> jax.Array:
     """Render a tree of arguments."""
     optics = tree["optics"].moved(**tree.get("moves", {}))
-    names = {"readout", "albedo", "exponent", "edges"} & tree.keys()
+    names = {"readout", "albedo", "law", "edges"} & tree.keys()
     options = {name: tree[name] for name in names} | {"corrections": corrections, "n_slices": N_SLICES}
     return hx.render(tree["surface"], optics, tree.get("raster", RASTER), **options)
 
@@ -103,13 +107,17 @@ def make_case(name: str) -> Case:
     """Make the arguments of a case and its compiled function."""
     rng = np.random.default_rng(9)
     surface, tilted = rough_surface(rng), hx.Optics.of(instrument(25.0)).moved(tilt=(0.03, -0.02))
-    more = {"raster": RASTER, "albedo": rng.uniform(0.8, 1.2, SHAPE), "exponent": 0.4, "readout": readout(rng)}
+    more = {"raster": RASTER, "albedo": rng.uniform(0.8, 1.2, SHAPE), "law": hx.PowerLaw(0.4), "readout": readout(rng)}
     weights = tuple(rng.uniform(0.3, 1.0, (SHAPE[0] - i, SHAPE[1] - 1 + i)) for i in (0, 1))
     moved = {"surface": surface, "optics": hx.Optics.of(instrument(25.0)), "moves": MOVES}
+    scattered = {"surface": surface, "optics": tilted}
     steep = hx.Optics.of(instrument(0.0))
     still = {k: NO_MOVE.get(k, np.zeros(np.shape(v))) for k, v in MOVES.items()}
     start: dict[str, Any] = {
         "masking": {"surface": surface, "optics": tilted, **more},
+        "lobe": scattered | {"law": hx.LobeLaw(0.4, 25.0)},
+        "rough law": scattered | {"law": hx.RoughLaw(0.3)},
+        "monotone": scattered | {"law": hx.MonotoneLaw(0.5 * rng.normal(size=7))},
         "heights": {"surface": surface.height, "optics": tilted, "raster": RASTER},
         "edges": {"surface": surface.height, "optics": tilted, "edges": weights},
         "plan": {"surface": surface, "optics": tilted, "raster": RASTER},

@@ -222,7 +222,7 @@ def test_sums_covary_as_in_the_dense_inverse(bshem):
     Catches the change of a height above a tilted substrate that is left out, and mixed up fields.
     """
     sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0)
-    linear = linearise(*make_problem(bshem.model_copy(update={"uncertainty": sure}), law_std=0.1))
+    linear = linearise(*make_problem(bshem.model_copy(update={"uncertainty": sure}), law="power", law_std=0.1))
     n_pixels = math.prod(linear.shape)
     weight = np.random.default_rng(2).standard_normal((2, *linear.shape))
     sums = derivative_of_sums(Anchors(weight, np.zeros(2)), np.ones((2, *linear.shape)), linear)

@@ -101,7 +101,7 @@ CASES = {
     "unknown": Case(
         "drifting",
         refine={"drift_std": 0.05, "drift_degrees": (2, 1), "line_std": 0.02, "albedo_std": 0.02, "albedo_modes": 2}
-        | {"law_std": 0.05},
+        | {"law": "power", "law_std": 0.05},
     ),
     "traced": Case("sphere", "refine", "flat", {"rays": 10_000}, 1e-3, 2, False),
     "radiosity": Case("sphere", "nearfield", "flat", {"multiple": "radiosity"}, 2e-2, 0, False),
@@ -117,7 +117,7 @@ def predictor_of(stack: MicrographStack, n_rays: int, substrate_um: float | None
     A facet has the more of it the more it leans and the lower it lies; a tenth of that is open to the unseen side.
     """
 
-    def predict(height, normals, instrument: Instrument = stack.instrument, *, albedo=None) -> Corrections:
+    def predict(height, normals, instrument: Instrument = stack.instrument, *, albedo=None, law=None) -> Corrections:
         surface, optics = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2]), Optics.of(instrument)
         masked = masking_corrections(surface, optics, Raster.of(stack)).masked
         depth = 1.0 - (height - np.mean(height)) / instrument.sample_distance

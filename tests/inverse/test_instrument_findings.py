@@ -1,20 +1,19 @@
 """How the instrument is fitted: edges cut at first, freed from the first round on, error bars, names of findings."""
 
-import jax
 import numpy as np
 import pytest
 
-from helio_jax.forward.form_factor import form_factor
-from helio_jax.forward.optics import Optics, Raster
-from helio_jax.forward.render import MIN_COS, Corrections, detection_probability
+from helio_jax.forward.optics import Raster
+from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse import fit as refine
 from helio_jax.inverse.instrument_report import plain_name
+from helio_jax.inverse.law_prior import law_prior
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.posterior import birge_ratio
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
@@ -49,9 +48,10 @@ def test_parameters_have_plain_names():
         "drift[1, 3]": "drift left 3",
         "log_gain[0]": "log_gain forward",
         "occluded[]": "occluded",
-        "law[0]": "law",
+        "law[1]": "width of the lobe",
     }
-    assert {name: plain_name(name, names) for name in shown} == shown
+    prior = law_prior(RefineSettings(law="broad_specular"))
+    assert {name: plain_name(name, names, prior) for name in shown} == shown
 
 
 @pytest.mark.parametrize("polar_deg, is_free", [(0.0, False), (3.0, True)])
@@ -93,23 +93,3 @@ def test_birge_ratio():
     with_untold = np.concatenate([3.0 * values, np.zeros(50)]), np.concatenate([left, np.full(50, 0.99)])
     assert birge_ratio(with_untold[0], np.diag(with_untold[1])) == pytest.approx(3.0, rel=0.15)
     assert birge_ratio(np.zeros(2), np.eye(2)) == 1.0
-
-
-def test_power_of_the_law(bshem):
-    """cos^(1 + m) about the aperture's mean direction, finite below the horizon.
-
-    Catches the power taken of the whole form factor (a smaller aperture would count), and of the wrong direction.
-    """
-    optics = Optics.of(bshem)
-    phi = form_factor(optics, np.zeros((1, 2)))
-    steep = 3.0 * np.sign(phi[0, 0, 0, 0])
-    surface = Surface(np.zeros((1, 2)), np.array([[0.0, steep]]), np.zeros((1, 2)))  # the second faces away
-    corrections = Corrections.none((3, 1, 2))
-    with jax.enable_x64(True):
-        plain, powered = (
-            np.asarray(detection_probability(surface, optics, corrections, exponent=m)) for m in (None, 0.3)
-        )
-    assert plain[0, 0, 1] < 0.0
-    cos = phi[:, 2, 0, 0] / np.linalg.norm(phi[:, :, 0, 0], axis=1)
-    assert np.allclose(powered[:, 0, 0], plain[:, 0, 0] * cos**0.3, rtol=1e-5)
-    assert powered[0, 0, 1] == pytest.approx(plain[0, 0, 1] * MIN_COS**0.3, rel=1e-5)

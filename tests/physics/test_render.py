@@ -220,7 +220,7 @@ def test_readout(instrument, rough):
 
 @pytest.mark.parametrize("exponent", [0.0, 1.5])
 def test_exponent_and_albedo(instrument, rough, exponent):
-    """A law cos^(1 + m) multiplies each facet's signal by cos^m to the aperture's mean direction; the albedo by itself.
+    """A law cos^(1 + m) multiplies each facet's signal by (1 + m / 2) cos^m to the aperture; the albedo by itself.
 
     Small apertures (50 um): the mean direction is that to the centre, to 1e-3. Catches m that acts on the whole cosine.
     """
@@ -228,14 +228,15 @@ def test_exponent_and_albedo(instrument, rough, exponent):
     detectors = tuple(d.model_copy(update={"axes_um": (50.0, 50.0)}) for d in instrument.detector)
     optics = hx.Optics.of(instrument.model_copy(update={"detector": detectors}))
     plain, bent = (
-        np.asarray(hx.render(surface, optics, raster, corrections="none", exponent=m, albedo=a))
-        for m, a in ((None, 1.0), (exponent, 0.7))
+        np.asarray(hx.render(surface, optics, raster, corrections="none", law=law, albedo=a))
+        for law, a in ((None, 1.0), (hx.PowerLaw(exponent), 0.7))
     )
     toward = np.asarray(optics.center)[:, None, None] - np.stack(np.broadcast_arrays(*optics.spot(surface.height)), -1)
     toward = toward / np.linalg.norm(toward, axis=-1, keepdims=True)
     cos = np.einsum("kyxi,yxi->kyx", toward, surface.normals(np.asarray(optics.beam_shift)))
     is_high = cos > 0.1
-    assert np.allclose(bent[is_high], 0.7 * (plain * np.maximum(cos, 0.1) ** exponent)[is_high], rtol=1e-3)
+    plain = 0.7 * (1.0 + 0.5 * exponent) * plain
+    assert np.allclose(bent[is_high], (plain * np.maximum(cos, 0.1) ** exponent)[is_high], rtol=1e-3)
 
 
 LIMITS = {

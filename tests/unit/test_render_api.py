@@ -46,13 +46,13 @@ def arguments() -> dict[str, Any]:
         "moves": MOVES,
         "readout": readout,
         "albedo": rng.uniform(0.8, 1.2, SHAPE),
-        "exponent": 0.3,
+        "law": hx.LobeLaw(0.3, 30.0),
     }
 
 
 def image(tree: dict[str, Any], corrections: Any = "masking") -> jax.Array:
     """Render a tree of arguments."""
-    names = ("readout", "albedo", "exponent")
+    names = ("readout", "albedo", "law")
     optics = tree["optics"].moved(**tree["moves"])
     options = {name: tree[name] for name in names}
     return hx.render(tree["height"], optics, tree["raster"], corrections=corrections, n_slices=4, **options)
@@ -113,14 +113,14 @@ def test_transformations(precision, kind):
 
 @pytest.mark.parametrize("kind", ["none", "masking", "plan"])
 def test_jacobians(kind):
-    """jacfwd and jacrev run and agree, pixel by pixel, in the geometry and the exponent; float64.
+    """jacfwd and jacrev run and agree, pixel by pixel, in the geometry and the law; float64.
 
     Catches a rule that knows no batch of tangents or cotangents, and one that mixes pixels or detectors.
     """
     plan = corrections_of(kind)
     with jax.enable_x64(True):
         tree = in_precision(arguments(), "float64")
-        part = {name: tree[name] for name in ("exponent", "optics", "raster", "moves")}
+        part = {name: tree[name] for name in ("law", "optics", "raster", "moves")}
 
         @jax.jit
         def run(part):
@@ -193,6 +193,30 @@ def test_one_compilation_serves_all_geometries(corrections):
     with counted() as programs:
         run(0, 5)
     assert programs
+
+
+LAWS = {
+    "power": lambda i: hx.PowerLaw(0.1 * i),
+    "lobe": lambda i: hx.LobeLaw(0.05 * i, 20.0 + i),
+    "rough": lambda i: hx.RoughLaw(0.04 * i),
+    "monotone": lambda i: hx.MonotoneLaw(0.05 * i * np.linspace(-1.0, 1.0, 7)),
+}
+
+
+@pytest.mark.parametrize("kind", LAWS)
+def test_one_compilation_serves_all_numbers_of_a_law(kind):
+    """After the first, 10 other laws of a kind compile nothing, and the image follows the law.
+
+    Catches a number of the law that is a constant of the program.
+    """
+    height = arguments()["height"]
+    images = [np.asarray(hx.render(height, OPTICS, RASTER, corrections="none", law=LAWS[kind](0)))]
+    with counted() as programs:
+        images += [
+            np.asarray(hx.render(height, OPTICS, RASTER, corrections="none", law=LAWS[kind](i))) for i in range(1, 11)
+        ]
+    assert not programs
+    assert np.all(np.abs(np.diff(images, axis=0)).max((1, 2, 3)) > 1e-4 * images[0].max())
 
 
 def test_radiosity_under_a_transformation():

@@ -1,0 +1,78 @@
+"""What is unknown of the scattering law: its numbers, their prior, and their test against the cosine law."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from scipy.stats import chi2
+
+from helio_jax.errors import GuardError
+from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw
+from helio_jax.inverse.residuals import LawPrior
+from helio_jax.inverse.settings import RefineSettings
+
+LEAST_IMAGES = 5
+"""Least number of images from which a monotone law is fitted: three give the facet and its albedo."""
+_NAMES = {
+    PowerLaw: (("exponent of the law", "m of cos^(1 + m)"),),
+    LobeLaw: (("share of the lobe", "of the atoms"), ("width of the lobe", "deg")),
+    RoughLaw: (("roughness", "r of the rough diffuse law"),),
+    MonotoneLaw: tuple((f"log exponent at {angle:.0f} deg", "natural logarithm") for angle in KNOTS_DEG),
+}
+
+
+class LawNumber(NamedTuple):
+    """A number of a law: name and unit as they are shown, prior mean and standard deviation."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+
+
+def law_prior(settings: RefineSettings) -> LawPrior | None:
+    """Return the prior of a law's numbers, about those of the cosine law; None where it is the cosine law."""
+    s = settings
+    if s.law == "power":
+        return LawPrior(PowerLaw(0.0), PowerLaw(s.law_std))
+    if s.law == "broad_specular":
+        mean, std = (0.0, s.law_width_deg), (s.law_std, s.law_width_std_deg)
+        return LawPrior(LobeLaw(*mean), LobeLaw(*std))
+    if s.law == "rough_diffuse":
+        return LawPrior(RoughLaw(0.0), RoughLaw(s.law_std))
+    if s.law == "monotone":
+        n = len(KNOTS_DEG)
+        return LawPrior(MonotoneLaw(np.zeros(n)), MonotoneLaw(np.full(n, s.law_std)))
+    return None
+
+
+def check_images(settings: RefineSettings, n_images: int) -> None:
+    """Raise GuardError where the images are too few for the law."""
+    if settings.law == "monotone" and n_images < LEAST_IMAGES:
+        raise GuardError(
+            f"reconstruct.refine.law = 'monotone' needs {LEAST_IMAGES} or more images, got {n_images}: take another "
+            "law, e.g. law = 'power', or add detectors or rotated scans"
+        )
+
+
+def numbers_of(prior: LawPrior | None) -> list[LawNumber]:
+    """List the unknown numbers of a law; none of the cosine law."""
+    if prior is None:
+        return []
+    means, stds = (np.asarray(ravel_pytree(part)[0]).tolist() for part in (prior.mean, prior.std))
+    return [LawNumber(*name, *known) for name, *known in zip(_NAMES[type(prior.mean)], means, stds, strict=True)]
+
+
+def cosine_probability(prior: LawPrior, whitened: np.ndarray, covariance: np.ndarray) -> float:
+    """Compute how often numbers of the cosine law would come out as far from it as fitted ones, or farther, by chance.
+
+    The width of a lobe does not count: a lobe without atoms is the cosine law whatever its width.
+
+    Args:
+        prior: of the law.
+        whitened: fitted numbers, in prior standard deviations from their prior means [number].
+        covariance: posterior covariance, in these units [number, number].
+    """
+    n = 1 if isinstance(prior.mean, LobeLaw) else len(whitened)
+    chi_square = whitened[:n] @ np.linalg.solve(covariance[:n, :n], whitened[:n])
+    return float(chi2.sf(chi_square, n))
