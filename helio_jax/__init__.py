@@ -118,6 +118,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   band_fit            length of the band beside an edge, and the height from it
   mask_patches        surface patches between steps, and their levels
   step_records        records of steps, bands and patches
+  measured_steps      what measured steps are for a fit: walls between pixels, known differences of heights
   law_prior           what is unknown of the scattering law; its test against the cosine law
   residuals           residuals of the fit as a function of its unknowns
   problem             FitProblem: data, priors, all that is constant in a fit

@@ -251,7 +251,10 @@ def _uncertainty(rec: Reconstruction, step: int) -> Section:
 
 def _anchors(rec: Reconstruction) -> list[Section]:
     rows = anchor_rows(rec)
-    note = "What was stated of the heights, and what the data, the priors and the other anchors say without it."
+    note = (
+        "What was stated of the heights, or measured by mask bands, and what the data, the priors and the other "
+        "anchors say without it."
+    )
     return [Section("Anchors", note, words.as_table(rows, ANCHOR_TITLES, "anchors"))] if rows else []
 
 

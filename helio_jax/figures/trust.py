@@ -85,12 +85,15 @@ def error_sources(rec: Reconstruction) -> list[tuple[str, float]]:
     return sorted(found, key=lambda item: -item[1])
 
 
-ANCHOR_TITLES = "anchor", "stated (um)", "in the map (um)", "without it (um)", "difference (s.d.)", ""
+ANCHOR_TITLES = "anchor", "stated or measured (um)", "in the map (um)", "without it (um)", "difference (s.d.)", ""
 """Of the columns of `anchor_rows`."""
 
 
 def anchor_rows(rec: Reconstruction) -> list[tuple[str, ...]]:
-    """Write what each anchor stated, what the map has there, and what all else says (records of `AnchorCheck`)."""
+    """Write what each anchor states, or mask bands measure, what the map has there, and what all else says.
+
+    Of the records of `AnchorCheck`.
+    """
     found = table(rec.provenance).get("anchors")
     rows = []
     for one in found if isinstance(found, list) else []:
@@ -107,7 +110,7 @@ def anchor_rows(rec: Reconstruction) -> list[tuple[str, ...]]:
 def anchor_lines(rec: Reconstruction) -> list[str]:
     """Write the same as lines for the terminal."""
     return [
-        f"  {name}: stated {stated} um, in the map {fitted}, without it {without}, {pull} s.d. apart"
+        f"  {name}: {stated} um, in the map {fitted}, without it {without}, {pull} s.d. apart"
         + (f"; {agrees}" if agrees else "")
         for name, stated, fitted, without, pull, agrees in anchor_rows(rec)
     ]

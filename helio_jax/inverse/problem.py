@@ -332,4 +332,4 @@ def thinned_walls(along_x: np.ndarray, along_y: np.ndarray, stride: int) -> tupl
     x, y = along_x[::stride], along_y[:, ::stride]
     x, y = x[:, : (x.shape[1] // stride) * stride], y[: (y.shape[0] // stride) * stride]
     by_x, by_y = x.reshape(len(x), -1, stride), y.reshape(-1, stride, y.shape[1])
-    return by_x.any(2), by_y.any(1)
+    return np.asarray(by_x.any(2)), np.asarray(by_y.any(1))
