@@ -117,7 +117,10 @@ def find_steps(stack: MicrographStack) -> Steps:
 
 
 def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
-    """Find the edges at which bands begin, over all detectors."""
+    """Find the edges at which bands begin, over all detectors and in each alone.
+
+    A band narrower than a pixel shows steps of the raster, whose normals turn those of another detector's points.
+    """
     stack, points, normals, numbers = scan.stack, [], [], []
     for k, v in enumerate(scan.directions(scan.seen_from(0.0))):
         fraction = np.where(levels.is_shaded[k] | ~(levels.fraction[k] < SHADED), levels.fraction[k], 1.0)
@@ -125,7 +128,10 @@ def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
         points.append(at)
         normals.append(normal)
         numbers.append(np.full(len(at), k))
-    return straight_edges(np.concatenate(points), np.concatenate(normals), np.concatenate(numbers), scan.images.side)
+    side = scan.images.side
+    together = straight_edges(np.concatenate(points), np.concatenate(normals), np.concatenate(numbers), side)
+    alone = zip(points, normals, numbers, strict=True) if sum(map(len, points)) > max(map(len, points)) else ()
+    return [*together, *(edge for one in alone for edge in straight_edges(*one, side))]
 
 
 def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
