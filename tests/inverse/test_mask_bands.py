@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 import helio_jax.__main__  # noqa: F401 (registers the commands)
+from benchmarks.shapes import members
 from helio_jax.commands.app import app
 from helio_jax.errors import SceneError
 from helio_jax.formats.hdf5 import write
@@ -274,3 +275,16 @@ def test_table_of_no_steps_and_small_rasters():
     assert steps_table(record).count("\n") == 1 and lines[0].startswith("steps: 0 edges")
     with pytest.raises(SceneError, match="8 x 8"):
         find_steps(flat(0, n=6))
+
+
+def test_a_band_narrower_than_a_pixel_does_not_hide_an_edge(tmp_path):
+    """A traced step 10 pixels high, whose band is 7 pixels wide in one detector and half a pixel in another.
+
+    Catches points of the narrow band, whose normals follow the raster, that break up the edge of the wide one.
+    """
+    (member,) = members("slot", 6021, range(1), (61, 61))
+    scene = load_scene(member.write(tmp_path), {"trace.rays": 64})
+    stack = pipeline.record(scene, pipeline.simulate(scene))
+    assert isinstance(stack, MicrographStack)
+    (step,) = used(find_steps(stack))
+    assert abs(step.height_um - member.about["height_um"]) < 4.0 * step.height_std_um < 0.15 * step.height_um
