@@ -155,7 +155,7 @@ def test_incidence_that_is_not_fitted_is_in_the_error_bars(bshem, hill):
     std = 0.2
     problem, state = fit_at(hill, bshem.model_copy(update={"uncertainty": Uncertainty(incidence_deg=std)}))
     unknowns, fixed = freeze(problem, state, problem.settings.robust_limits[-1], problem.settings.jump_limits[-1])
-    error = _incidence_error(problem, state, unknowns, fixed)
+    error = _incidence_error(problem, unknowns, fixed)
     assert error is not None
     optics = jax.tree.map(jnp.asarray, problem.optics)
     tipped = [images_of(hill, optics.moved(incidence=s * math.radians(std))) for s in (1.0, -1.0)]
