@@ -34,6 +34,7 @@ from benchmarks import rows  # noqa: E402
 from helio_jax.calibration.known_objects import KnownObject  # noqa: E402
 from helio_jax.calibration.known_report import as_record, calibrated_instrument  # noqa: E402
 from helio_jax.calibration.unknowns import OBJECT  # noqa: E402
+from helio_jax.errors import GuardError  # noqa: E402
 from helio_jax.forward.readout import pedestal_modes  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
 from helio_jax.workflows.calibrate_known import calibrate_known  # noqa: E402
@@ -120,7 +121,11 @@ def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument])
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).tolist()
     as_list = SceneFile.model_validate(tables | {"scan": {"kind": "list", "points_um": points}})
     for name, instrument in instruments.items():
-        rec = hx.reconstruct(read_out(as_list, axis, instrument, rays, seed + 5000, "measured"), method="refine")
+        try:
+            rec = hx.reconstruct(read_out(as_list, axis, instrument, rays, seed + 5000, "measured"), method="refine")
+        except GuardError as e:
+            print(f"twin {seed}, instrument {name}: refused: {e}")
+            continue
         score = hx.evaluate(rec, hx.true_height(scene, rec))
         wanted = "recovered_height", "rms_region", "pull_mean", "pull_std", "coverage_1", "coverage_2", "valid_fraction"
         out[name] = {key: getattr(score, key) for key in wanted}
@@ -158,7 +163,10 @@ def collect(found: list[dict[str, Any]]) -> list[rows.Row]:
     lost = [f["seed"] for f in found if not f["is_converged"]]
     out.append(rows.row("1", "fits that have not converged", f"{len(lost)} of {len(found)} {lost}", "0", not lost))
     for name in ("calibrated", "as stated"):
-        of = [f["heights"][name] for f in found if "heights" in f]
+        of = [f["heights"][name] for f in found if name in f.get("heights", {})]
+        refused = sum("heights" in f for f in found) - len(of)
+        if refused:
+            out.append(rows.row("2", f"pyramids refused, instrument {name}", f"{refused}", "0", False))
         if not of:
             continue
         error, pull, one, two = (
