@@ -116,7 +116,8 @@ def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument])
     tables = true.idealised().model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
     tables |= {"name": "pyramid", "sample": PYRAMID | {"azimuth_deg": 20.0}}
     tables["scan"] = {"nx": size, "ny": size, "pixel_size_um": PYRAMID_PITCH, "pitch": "sample"}
-    region = {"region_radius_um": 0.75 * PYRAMID["base_um"], "height_um": PYRAMID["height_um"]}
+    reach = 0.75 * PYRAMID["base_um"]
+    region = {"region_radius_um": reach, "substrate_radius_um": reach, "height_um": PYRAMID["height_um"]}
     scene, out = SceneFile.model_validate(tables | {"truth": region}), {}
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).tolist()
     as_list = SceneFile.model_validate(tables | {"scan": {"kind": "list", "points_um": points}})

@@ -218,6 +218,10 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     of_all, inverse = inverse @ off, np.zeros((n, n))
     inverse[np.ix_(is_used, is_used)] = np.linalg.inv((known + np.eye(n))[np.ix_(is_used, is_used)])
     answer = inverse @ off
+    left = off - known @ answer
+    found = tuple(
+        replace(one, fitted=one.stated + float(rest) * one.stated_std) for one, rest in zip(found, left, strict=True)
+    )
 
     state = fit.state
     height, slope_x, slope_y = -np.tensordot(answer, surface, 1)

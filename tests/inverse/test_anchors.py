@@ -13,10 +13,10 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.anchor_settings import AnchorSettings
-from helio_jax.inverse.anchoring import LIMIT, leave_out, pulls_of, with_anchors
+from helio_jax.inverse.anchoring import LIMIT, MEASURED, _Known, _moved, leave_out, pulls_of, with_anchors
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.explanations import explain
-from helio_jax.inverse.fit import derivative_of_sums
+from helio_jax.inverse.fit import derivative_of_sums, with_posterior
 from helio_jax.inverse.known_heights import anchors_of, check_places
 from helio_jax.inverse.posterior import linearise, sample_posterior
 from helio_jax.inverse.samples import on_raster
@@ -296,3 +296,31 @@ def test_right_anchors_sharpen_and_a_wrong_one_is_named(hills):
     assert spread(better, np.mean) < 0.5 * spread(alone, np.mean)
     assert np.abs(worse.residuals - fit.residuals).max() > 0.1  # those of the heights as moved
     assert np.median(worse.posterior.height_std) > 2.0 * np.median(better.posterior.height_std)
+
+
+def test_a_measured_step_that_contradicts_all_else_is_not_used(hills):
+    """Two right measured steps and a wrong one beside them: the map is that of the right ones, and says so.
+
+    Catches a wrong step that moves the map, one that is not named, and heights "in the map" of a map that used it.
+    """
+    fit, _, true = hills
+    ends = [((5, 5), (15, 15)), ((15, 5), (5, 15)), ((10, 4), (10, 16))]
+    weight, value = np.zeros((3, *true.shape)), np.zeros(3)
+    for i, (high, low) in enumerate(ends):
+        weight[i][high], weight[i][low] = 0.5, -0.5
+        value[i] = 0.5 * (true[high] - true[low])
+    value[2] += 40.0
+
+    def moved(which):
+        anchors = Anchors(weight[which], value[which])
+        names = tuple((f"step {i + 1}", MEASURED) for i in which)
+        return _moved(with_posterior(fit, anchors), _Known(names, anchors))
+
+    right, both = moved([0, 1]), moved([0, 1, 2])
+    assert [one.name for one in both.checks if not one.agrees] == ["step 3"] and len(both.used.value) == 2
+    np.testing.assert_allclose(both.fit.surface.height, right.fit.surface.height, atol=0.02)
+    for i, one in enumerate(both.checks):
+        assert one.fitted == pytest.approx(2.0 * float(np.sum(weight[i] * both.fit.surface.height)), abs=1e-6)
+    assert "not used" in both.checks[2].sentence()
+    spread = [np.median(found.fit.posterior.height_std) for found in (right, both)]
+    assert spread[1] > spread[0]
