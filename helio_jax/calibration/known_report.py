@@ -99,7 +99,7 @@ ON_TWINS = (
     "on seven traced twins the errors were 1.0 times the standard deviations stated (root mean square; 0.6 to 1.2 for "
     "single parameters)"
 )
-"""Measured: docs/calibrate.md. A sentence of every verdict: what the standard deviations have been found to be worth."""
+"""Measured: docs/calibrate.md. A sentence of every verdict: what its standard deviations were found to be worth."""
 
 
 def verdict(fit: KnownFit) -> list[str]:
