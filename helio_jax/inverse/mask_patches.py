@@ -38,7 +38,7 @@ _BESIDE = 2
 """Pixels beside a masked one whose signals the mask explains, too."""
 _BORDER = 0.2
 """Weight of the links of the border to one common level."""
-_COMMON_STD = 0.006
+COMMON_STD = 0.006
 """Standard deviation of all levels in common, from what the model of a wall neglects, as a fraction."""
 
 
@@ -210,5 +210,5 @@ def solve_levels(n: int, above: np.ndarray, below: np.ndarray, height: np.ndarra
     robust = float(np.sum(((b - a @ solution) / sigma) ** 2))
     birge = max(1.0, robust / dof) if dof > 0 else 1.0
     cov = np.linalg.pinv((a / sigma[:, None]).T @ (a / sigma[:, None])) * birge
-    level[free], error[free] = solution, np.sqrt(np.diag(cov) + (_COMMON_STD * solution) ** 2)
+    level[free], error[free] = solution, np.sqrt(np.diag(cov) + (COMMON_STD * solution) ** 2)
     return PatchLevels(level, error, chi2, dof)

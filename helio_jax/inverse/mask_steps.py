@@ -34,7 +34,7 @@ from helio_jax.micrograph import MicrographStack
 
 MIN_WALL = 0.7
 """Least probability that the signal falls abruptly, for a wall."""
-_CERTAIN_WALL = 0.9
+CERTAIN_WALL = 0.9
 """The same where the height is not determined, but the edge may part patches."""
 _MISFIT = 4.0
 """Mean square residual above which a band is not explained by a wall."""
@@ -82,9 +82,11 @@ def find_steps(stack: MicrographStack) -> Steps:
         stack: micrographs of a raster, simulated or measured, of an instrument with apertures in a flat plate.
 
     Raises:
-        SceneError: the images are no raster, or the plate is a mesh.
+        SceneError: the images are no raster or of several beams, or the plate is a mesh.
     """
     n_detectors, ny, nx = stack.shape
+    if stack.instrument.has_several_beams:
+        raise SceneError("steps are measured in scans of one beam, got several: measure them in each scan by itself")
     if stack.positions is not None or min(ny, nx) < _SMALLEST:
         raise SceneError(f"steps need a raster of {_SMALLEST} x {_SMALLEST} pixels or more, got {ny} x {nx}")
     openings = tuple(o for o in stack.instrument.openings() if o is not None)
@@ -130,7 +132,8 @@ def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
         numbers.append(np.full(len(at), k))
     side = scan.images.side
     together = straight_edges(np.concatenate(points), np.concatenate(normals), np.concatenate(numbers), side)
-    alone = zip(points, normals, numbers, strict=True) if sum(map(len, points)) > max(map(len, points)) else ()
+    of_detector = [one for one in zip(points, normals, numbers, strict=True) if len(one[0])]
+    alone = of_detector if len(of_detector) > 1 else []
     return [*together, *(edge for one in alone for edge in straight_edges(*one, side))]
 
 
@@ -320,7 +323,7 @@ def _combined(number: int, edge: Edge, rows: list[BandRow], used: list[Band], pl
 
 def _patches(measured: list[_Measured], images: Images, levels: SignalLevels) -> np.ndarray:
     """Find the patches between the steps [y, x]."""
-    walls = [m for m in measured if m.step.is_used or (m.step.p_wall > _CERTAIN_WALL and m.jump > 0.0)]
+    walls = [m for m in measured if m.step.is_used or (m.step.p_wall > CERTAIN_WALL and m.jump > 0.0)]
     heights = np.array([m.jump for m in walls])
     alike = likeness(images.signal, images.variance, np.any(levels.is_dark, axis=0))
     return find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
@@ -346,8 +349,8 @@ def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
 
 def _border_shares(patch: np.ndarray) -> np.ndarray:
     """Compute the share of every patch in the outermost ring of pixels [patch]."""
-    count = np.bincount(patch[border_mask((patch.shape[0], patch.shape[1]), 1.0 / max(patch.shape))])
-    return np.pad(count, (0, int(patch.max()) + 1 - count.size)) / count.sum()
+    ring = patch[border_mask((patch.shape[0], patch.shape[1]), 1.0 / max(patch.shape))]
+    return np.bincount(ring, minlength=int(patch.max()) + 1) / ring.size
 
 
 def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: SignalLevels) -> Steps:

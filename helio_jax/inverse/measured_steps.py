@@ -12,6 +12,9 @@ from helio_jax.forward.optics import Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.forward.surface import along as along_axis
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.mask_edges import Edge
+from helio_jax.inverse.mask_patches import COMMON_STD
+from helio_jax.inverse.mask_steps import CERTAIN_WALL
 from helio_jax.inverse.step_records import Step, Steps
 
 ABOVE = -2.6, -0.6
@@ -20,12 +23,8 @@ BEYOND = 2.6
 """Pixels that show the lower surface: so far beyond the far end of the longest band [pixels]."""
 MIN_PIXELS = 3
 """Fewer pixels show no height."""
-WALL = 0.9
-"""Least probability that the signal falls abruptly, for a wall that parts pixels."""
 PLACES = -0.3, 0.0, 0.3
-"""Places of an edge that are allowed for: a pixel nearer to it may be on either side; it is joined to none [pixels]."""
-MODEL_STD = 0.006
-"""Standard deviation of heights from what the model of a band neglects, as a fraction."""
+"""Places of an edge that are allowed for: a pixel between them may be on either side; it is joined to none [pixels]."""
 
 
 def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +44,7 @@ def walls_of(found: Steps | None, raster: Raster) -> tuple[np.ndarray, np.ndarra
     cuts = np.zeros((ny, nx - 1), bool), np.zeros((ny - 1, nx), bool)
     side = math.sqrt(float(raster.dx) * float(raster.dy))
     for step in () if found is None else found.steps:
-        if not step.is_used or step.p_wall < WALL or step.above == step.below:
+        if not step.is_used or step.p_wall < CERTAIN_WALL or step.above == step.below:
             continue
         distance, along, length = _beside(step, raster)
         is_beside = np.abs(along) <= 0.5 * (length + side)
@@ -80,10 +79,10 @@ def anchors_of_steps(
         if sides is None:
             continue
         upper, lower, distance, end = sides
-        falls = math.radians(step.falls_deg)
-        slope = surface.slope_x * math.cos(falls) + surface.slope_y * math.sin(falls)
+        way = _edge(step).normal
+        slope = surface.slope_x * way[0] + surface.slope_y * way[1]
         rise = np.mean((slope * distance)[upper]) - np.mean((slope * (distance - end))[lower])
-        std = math.hypot(step.height_std_um, MODEL_STD * step.height_um)
+        std = math.hypot(step.height_std_um, COMMON_STD * step.height_um)
         numbers.append(step.number)
         weight.append((upper / upper.sum() - lower / lower.sum()) / std)
         value.append((step.height_um + float(rise)) / std)
@@ -120,7 +119,11 @@ def _most_frequent(numbers: np.ndarray) -> int:
 def _beside(step: Step, raster: Raster) -> tuple[np.ndarray, np.ndarray, float]:
     """Compute the distance of every pixel from an edge, towards the lower side, and its place along the edge from the
     middle [y, x]; and the length of the edge; um."""
-    falls, middle = math.radians(step.falls_deg), 0.5 * np.add(step.start, step.end)
-    x, y = np.asarray(raster.x)[None, :] - middle[0], np.asarray(raster.y)[:, None] - middle[1]
-    distance, along = x * math.cos(falls) + y * math.sin(falls), y * math.cos(falls) - x * math.sin(falls)
-    return distance, along, math.hypot(*np.subtract(step.end, step.start))
+    edge = _edge(step)
+    rel = np.stack(np.meshgrid(np.asarray(raster.x), np.asarray(raster.y)), -1) - edge.middle
+    return rel @ edge.normal, rel @ edge.along, edge.length
+
+
+def _edge(step: Step) -> Edge:
+    """Return the upper edge of a step."""
+    return Edge(np.array(step.start), np.array(step.end), ())

@@ -31,7 +31,7 @@ def measure_steps(stack: MicrographStack, figure: str | Path | None = None) -> t
         figure: file for a picture of the bands and the steps.
 
     Raises:
-        SceneError: the images are no raster, or the plate is a mesh.
+        SceneError: as `find_steps`.
     """
     found = find_steps(stack)
     if figure:

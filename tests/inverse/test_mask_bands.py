@@ -277,6 +277,15 @@ def test_table_of_no_steps_and_small_rasters():
         find_steps(flat(0, n=6))
 
 
+def test_images_of_several_beams_are_refused():
+    """A mesa, one image of which another beam took: its bands run elsewhere. Catches heights by the wrong beam."""
+    stack = mesa(60.0, 15.0)
+    other = stack.instrument.detector[0].model_copy(update={"beam_deg": (30.0, 90.0)})
+    instrument = stack.instrument.model_copy(update={"detector": (other, *stack.instrument.detector[1:])})
+    with pytest.raises(SceneError, match="one beam"):
+        find_steps(stack.replace(instrument=instrument))
+
+
 def test_a_band_narrower_than_a_pixel_does_not_hide_an_edge(tmp_path):
     """A traced step 10 pixels high, whose band is 7 pixels wide in one detector and half a pixel in another.
 

@@ -25,7 +25,7 @@ DISTANCE = RASTER.x[None, :] * WAY[0] + RASTER.y[:, None] * WAY[1] + 3.0
 def steps(**changes) -> Steps:
     """One straight step through the middle of the raster, 40 um high, with a mask band of 60 um across the edge."""
     along, middle = np.array([-WAY[1], WAY[0]]), -3.0 * WAY
-    start, end = (tuple(middle + sign * 400.0 * along) for sign in (1.0, -1.0))
+    start, end = (tuple(middle + sign * 400.0 * along) for sign in (-1.0, 1.0))
     step = Step(1, start, end, FALLS - 90.0, FALLS, HEIGHT, 2.0, 1, 0.0, False, 1.0, 0, 1, "")
     band = BandRow(1, "d0", "dark", LENGTH, 1.0, HEIGHT, 2.0, False, 1.0, FALLS, "")
     patch = np.where(DISTANCE > 0.0, 1, 0)
