@@ -176,6 +176,7 @@ def with_anchors(fit: Fit, steps: Steps | None = None) -> Anchored:
         SceneError: as `anchors_of`.
     """
     found, anchors = Anchored(fit, (), fit.problem.anchors), None
+    free = replace(fit, problem=replace(fit.problem, anchors=Anchors.none(fit.problem.raster.shape)))
     for _ in range(MAX_PLACINGS):
         known = _Known.of(fit, found.fit.surface, steps)
         if not known.names:
@@ -183,7 +184,6 @@ def with_anchors(fit: Fit, steps: Steps | None = None) -> Anchored:
         if anchors is not None and np.array_equal(known.anchors.weight, anchors.weight):
             break
         anchors = known.anchors
-        free = replace(fit, problem=replace(fit.problem, anchors=Anchors.none(fit.problem.raster.shape)))
         before = with_posterior(free, anchors)
         if before.posterior is None:
             return found._replace(fit=before)
@@ -212,16 +212,14 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     known = factor * sums.own + by_modes @ by_modes.T
     inverse = np.linalg.inv(known + np.eye(n))
     off = weight @ fit.surface.height.ravel() - anchors.value
-    found = _checks(fit, given, known - known @ inverse @ known, inverse @ off)
-    is_wrong = np.array([abs(one.pull) > LIMIT for one in found])
+    of_all = inverse @ off
+    pulls = pulls_of(known - known @ inverse @ known, of_all)
+    is_wrong = np.abs(pulls[2]) > LIMIT
     is_used = ~(is_wrong & given.is_measured)
-    of_all, inverse = inverse @ off, np.zeros((n, n))
+    inverse = np.zeros((n, n))
     inverse[np.ix_(is_used, is_used)] = np.linalg.inv((known + np.eye(n))[np.ix_(is_used, is_used)])
     answer = inverse @ off
-    left = off - known @ answer
-    found = tuple(
-        replace(one, fitted=one.stated + float(rest) * one.stated_std) for one, rest in zip(found, left, strict=True)
-    )
+    checks = _checks(fit, given, pulls, off - known @ answer)
 
     state = fit.state
     height, slope_x, slope_y = -np.tensordot(answer, surface, 1)
@@ -249,7 +247,7 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     if is_wrong.any():  # either the anchor is wrong, or all else
         change = of_all if (is_wrong & is_used).any() else of_all - answer
         conditioned = conditioned.with_common_mode((change @ heights).reshape(shape))
-    return Anchored(at_state(fit, moved, conditioned), found, anchors.taken(is_used))
+    return Anchored(at_state(fit, moved, conditioned), checks, anchors.taken(is_used))
 
 
 def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:
@@ -259,9 +257,9 @@ def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarra
     return height - np.einsum("at,tyx->ayx", instrument[:, tilts], planes[: len(tilts)])
 
 
-def _checks(fit: Fit, given: _Known, leverage: np.ndarray, residual: np.ndarray) -> tuple[AnchorCheck, ...]:
-    """Compare every anchor with all else; arguments as in `leave_out`."""
-    anchors, (off, std, pull) = given.anchors, pulls_of(leverage, residual)
+def _checks(fit: Fit, given: _Known, pulls: np.ndarray, left: np.ndarray) -> tuple[AnchorCheck, ...]:
+    """Record what every anchor did: `pulls` of `pulls_of`, and what the map is `left` off the anchors [anchor]."""
+    anchors, (off, std, pull) = given.anchors, pulls
     region, out = regions(fit.joined_x, fit.joined_y), []
     for i, (name, kind) in enumerate(given.names):
         unit = 1.0 / float(np.maximum(anchors.weight[i], 0.0).sum())
@@ -272,7 +270,7 @@ def _checks(fit: Fit, given: _Known, leverage: np.ndarray, residual: np.ndarray)
                 kind=kind,
                 stated=value,
                 stated_std=unit,
-                fitted=value + float(residual[i]) * unit,
+                fitted=value + float(left[i]) * unit,
                 without=value + float(off[i]) * unit,
                 without_std=float(std[i]) * unit,
                 pull=float(pull[i]),

@@ -269,10 +269,10 @@ class _Fits:
                 )
                 start, is_undecided = found.surface, covered(steps, found.undecided)
                 if moved := [steps[i] for i in found.moved]:
-                    all_labels = labelled(moved)
-                    anchors = level_anchors(all_labels, moved, start)
+                    labels = labelled(moved)
+                    anchors = level_anchors(labels, moved, start)
                     # masks on the raster, whose edges lie on pixels, would pull measured levels off
-                    labels = np.where(np.isin(all_labels, measured_among(moved)), 0, all_labels)
+                    labels[covered(steps, [i for i in found.moved if steps[i].height is not None])] = 0
             except PredictionError as e:  # the fit begins at a smoother start
                 self.say(f"levels of measured steps are given up: {e}")
         fit = self.fitted(start, smoothed, patches, labels, anchors)
@@ -409,11 +409,6 @@ def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -
     is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
     known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
     return Anchors.of_levels(labels, known, is_level, SKIRT)
-
-
-def measured_among(regions: list[Region]) -> list[int]:
-    """Return the numbers, from 1, of the regions whose heights are measured."""
-    return [i for i, region in enumerate(regions, 1) if region.height is not None]
 
 
 def labelled(regions: list[Region]) -> np.ndarray:

@@ -273,7 +273,7 @@ class FitProblem:
 
     @property
     def is_parted(self) -> np.ndarray:
-        """Pixels that walls part from all but a few others [y, x]."""
+        """Pixels that walls separate from all but a few others [y, x]."""
         if self.walls is None:
             return np.zeros(self.raster.shape, bool)
         region = regions(*(~wall for wall in self.walls))
@@ -286,8 +286,7 @@ class FitProblem:
             return surface
         low, high = (np.where(is_parted, outside, surface.height) for outside in (np.inf, -np.inf))
         low, high = minimum_filter(low, 3, mode="nearest"), maximum_filter(high, 3, mode="nearest")
-        is_bounded = is_parted & (low <= high)
-        height = np.where(is_bounded, np.clip(surface.height, low, np.maximum(low, high)), surface.height)
+        height = np.where(is_parted & (low <= high), np.clip(surface.height, low, high), surface.height)
         return Surface(height, surface.slope_x, surface.slope_y)
 
     def thinned(self, stride: int) -> "FitProblem":
