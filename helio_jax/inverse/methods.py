@@ -47,6 +47,13 @@ GEOMETRY_WARNING = (
 )
 """Warning of a fit whose aperture angles or distance are unknown."""
 
+LAW_WARNING = (
+    "numbers of the scattering law were fitted: on traced samples they were off by up to 7 of their stated standard "
+    "deviations (docs/limits.md), so that even a sample of the cosine law may be said not to be one: simulate the "
+    "sample to test it"
+)
+"""Warning of a fit whose scattering law is unknown."""
+
 UNUSED = "the anchors, {n} in number, were not used: {why}"
 """Warning of a height map that was not moved to what the user knows."""
 
@@ -137,6 +144,8 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
         )
     if fit.parameters.aim.size or fit.parameters.distance.size:
         found.append(GEOMETRY_WARNING)
+    if fit.parameters.law.size:
+        found.append(LAW_WARNING)
     return tuple(found)
 
 

@@ -25,6 +25,8 @@ from helio_jax.inverse.settings import RefineSettings
 
 LAW_STEP = 0.5
 """Step of a number of the law by which the derivative of the multiple scattering is taken [prior s.d.]."""
+LEAST_RATIO = 0.5
+"""Least ratio of the multiple scattering after and before such a step that is believed: a smaller one is noise."""
 Predict = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and by
 their names the albedo [y, x] where it is not 1, and the law where it is not the cosine law. The corrections are per
@@ -199,7 +201,7 @@ def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -
     for i in range(rate.size if base > 0.0 else 0):
         stepped = p.replaced(law=p.law + LAW_STEP * (np.arange(rate.size) == i))
         found = np.mean(_predicted(problem, state, predict, stepped).multiple)
-        rate[i] = np.log(max(found / base, LAW_STEP)) / LAW_STEP
+        rate[i] = np.log(max(found / base, LEAST_RATIO)) / LAW_STEP
     return replace(state, held=replace(state.held, law_rate=rate))
 
 
