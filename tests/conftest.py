@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +36,9 @@ tests/inverse/test_frozen.py pins; one test there and the notebooks of the site 
 all tests do."""
 _QUICK_JAXLIB = "0.10."
 """Where these flags are known to exist: XLA ends a process that names an unknown one."""
+MOST_MAPS = 15_000
+"""Memory maps of a process above which JAX's compiled programs are dropped. A fit adds up to 2000; Linux allows 65 530
+and ends a process that asks for more, as it did to one that had run half of the suite."""
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
 _OWN = pytest.StashKey[str]()
 
@@ -61,6 +65,15 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     """Remove it."""
     if _OWN in config.stash:
         shutil.rmtree(config.stash[_OWN], ignore_errors=True)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_memory_maps():
+    """Drop compiled programs after a module when there are many."""
+    yield
+    maps = Path("/proc/self/maps")
+    if "jax" in sys.modules and maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        sys.modules["jax"].clear_caches()
 
 
 @pytest.fixture(scope="session")
