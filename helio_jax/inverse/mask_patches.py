@@ -136,8 +136,13 @@ def find_patches(
 
 
 def _without_small(group: np.ndarray, level: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Give the pixels of small patches to the neighbour of the nearest level; renumber by falling size [pixel]."""
-    is_big = np.bincount(group)[group] >= _SMALLEST
+    """Give the pixels of small patches to the neighbour of the nearest level; renumber by falling size [pixel].
+
+    Small, too, is a strip without a pixel all of whose neighbours belong to it: the edge beside it was not closed.
+    """
+    is_inside = np.ones(group.size, bool)
+    is_inside[np.concatenate([ends[group[first] != group[second]] for ends in (first, second)])] = False
+    is_big = ((np.bincount(group) >= _SMALLEST) & (np.bincount(group, is_inside) > 0))[group]
     while not is_big.all():
         gap, best, owner = np.abs(level[first] - level[second]), np.full(level.size, np.inf), group.copy()
         for of, to in ((first, second), (second, first)):

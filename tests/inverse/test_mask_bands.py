@@ -14,6 +14,7 @@ from benchmarks.shapes import members
 from helio_jax.commands.app import app
 from helio_jax.errors import SceneError
 from helio_jax.formats.hdf5 import write
+from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.mask_patches import find_patches, solve_levels
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.step_records import Steps
@@ -242,12 +243,21 @@ def test_levels_from_steps():
 def test_patch_without_one_side():
     """Three sides of a square of jumps: the fourth side is closed straight. Catches a patch that leaks."""
     edges = [s for s in find_steps(mesa(60.0, 15.0)).steps if abs(s.falls_deg - 15.0) > 5.0]
-    from helio_jax.inverse.mask_edges import Edge
-
     place = np.stack(np.meshgrid(*(PITCH * (np.arange(61) - 30.0),) * 2), -1)
     lines = [Edge(np.array(s.start), np.array(s.end), (0,)) for s in edges]
     patch = find_patches(lines, np.full(3, 60.0), place, PITCH)
     assert np.sum(patch == 1) == pytest.approx((260.0 / PITCH) ** 2, rel=0.08)
+
+
+def test_strip_beside_an_edge_is_no_patch():
+    """A wall found twice, 1.6 pixels apart, with half of its height each. Catches a level for the strip between."""
+    x, half = PITCH * (np.arange(41) - 20.0), 100.0
+    corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    lines = [Edge(a, b, (0,)) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    lines.append(Edge(corners[0] + [0.0, 1.6 * PITCH], corners[1] + [0.0, 1.6 * PITCH], (0,)))
+    patch = find_patches(lines, np.array([30.0, 60.0, 60.0, 60.0, 30.0]), np.stack(np.meshgrid(x, x), -1), PITCH)
+    assert set(np.unique(patch)) == {0, 1}
+    assert np.sum(patch == 1) == pytest.approx((2.0 * half / PITCH) ** 2, rel=0.15)
 
 
 def test_command(tmp_path):
