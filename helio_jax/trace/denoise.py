@@ -13,22 +13,36 @@ SMOOTH_NORMALS = 0.2
 _REACH = math.ceil(2.5 * SMOOTH_PIXELS)
 _RIDGE = 0.1
 """Ridge penalty on the slopes of the local planes, relative to the weight of the centre pixel."""
+_SAME_LEVEL = 1.0, 0.25
+"""Largest distance of a neighbour from the pixel's tangent plane: pitches, and more per pixel between them. A curved
+surface whose normals turn by half a radian keeps below it."""
 
 
-def smooth_along_surface(images: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
-    """Smooth images [image, y, x] over neighbours with similar unit normals [y, x, 3].
+def smooth_along_surface(
+    images: np.ndarray, normals: np.ndarray, points: np.ndarray, pitch: float, passes: int = 1
+) -> np.ndarray:
+    """Smooth images over neighbours with similar normals on the same level.
 
     A plane is fitted around each pixel with the weights of a joint bilateral filter. Edges stay sharp, and so does the
-    rise of multiple scattering towards a sphere's rim, which a one-sided mean would flatten. Each further pass doubles
+    rise of multiple scattering towards a sphere's rim, which a one-sided mean would flatten. The top and the foot of a
+    wall have the same normal: neighbours far from the pixel's tangent plane are left out. Each further pass doubles
     the spacing of the neighbours: the Gaussian variance of `passes` passes is (4^passes - 1) / 3 squared pixels.
+
+    Args:
+        images: [image, y, x].
+        normals: unit normals [y, x, 3].
+        points: of the surface, sample frame [y, x, 3], um.
+        pitch: of the raster, um.
+        passes: at least 1.
 
     Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004) 664, eq. 3; passes: Dammertz, Sewtz, Hanika and
         Lensch, High Performance Graphics 2010, sec. 3; local planes: Fan and Gijbels, Local Polynomial Modelling
         (1996), sec. 3.1.
     """
     smooth = np.ascontiguousarray(np.moveaxis(images, 0, -1), np.float64)
+    about = np.ascontiguousarray(normals, np.float64), np.ascontiguousarray(points / pitch, np.float64)
     for number in range(passes):
-        smooth = _fit_planes(smooth, np.ascontiguousarray(normals, np.float64), 2**number)
+        smooth = _fit_planes(smooth, *about, 2**number)
     return np.moveaxis(smooth, -1, 0)
 
 
@@ -41,7 +55,7 @@ def passes_for(paths: float, wanted: float) -> int:
 
 
 @kernel
-def _fit_planes(images, normals, spacing):
+def _fit_planes(images, normals, points, spacing):
     """Evaluate at each pixel the plane fitted around it [y, x, image]."""
     ny, nx, n_images = images.shape
     out = np.empty_like(images)
@@ -55,9 +69,12 @@ def _fit_planes(images, normals, spacing):
                 y = min(max(row + i * spacing, 0), ny - 1)
                 for j in range(-_REACH, _REACH + 1):
                     x = min(max(column + j * spacing, 0), nx - 1)
-                    change = 0.0
+                    change, off = 0.0, 0.0
                     for a in range(3):
                         change += (normals[y, x, a] - normals[row, column, a]) ** 2
+                        off += normals[row, column, a] * (points[y, x, a] - points[row, column, a])
+                    if abs(off) > _SAME_LEVEL[0] + _SAME_LEVEL[1] * spacing * math.hypot(i, j):
+                        continue
                     weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + change / SMOOTH_NORMALS**2))
                     matrix[0, 0] += weight
                     matrix[0, 1] += weight * i

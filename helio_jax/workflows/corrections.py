@@ -27,6 +27,7 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.border import extend_border, mirror_border
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
+from helio_jax.scene.wall_grid import Grid, with_upright_walls
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
@@ -51,10 +52,6 @@ MIRRORED = 0.5
 """Share of the image that is mirrored at each border."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
-
-
-Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""x, y, z of points [y, x], um."""
 
 
 def make_predictor(
@@ -120,7 +117,7 @@ def make_predictor(
             plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * rasters[0][0].reach)
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
-        smooth = _denoise_within_facets(height, normals, MAX_SMOOTHING_STEP * min(dx, dy))
+        smooth = rasters[0][0].denoised(height, normals)
         terms = COSINE_LAW if law is None else law.terms()
         found = [trace_beam(raster, *smooth, surface, normals, optics, albedo, terms) for raster, _ in rasters]
         return found[0] if len(found) == 1 else _joined(found, [of_beam for _, of_beam in rasters])
@@ -144,7 +141,7 @@ def make_predictor(
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
         images = np.array(
             [
-                [smooth_along_surface(s.multiple(settings, limit, albedo, law), smooth_normals, passes) for s in way]
+                [raster.smoothed(s.multiple(settings, limit, albedo, law), smooth, smooth_normals, passes) for s in way]
                 for way in either_way
             ]
         )
@@ -195,23 +192,12 @@ def _surroundings(instrument: Instrument) -> float:
     return outermost + instrument.sample_distance
 
 
-def _denoise_within_facets(height: np.ndarray, normals: np.ndarray, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
-
-    Noise makes facets see one another: on a flat that would add half a per cent of its signal. Where the mean height
-    differs by more than `largest`, neighbours are at another level, and the height stays.
-    """
-    mean = smooth_along_surface(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), normals)
-    smooth = np.moveaxis(mean[:3], 0, -1)
-    smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
-    return np.where(np.abs(mean[3] - height) < largest, mean[3], height), smooth
-
-
 @dataclass(frozen=True)
 class SurfaceHypothesis:
     """A surface whose occluded side stands at one place: a point for every pixel, and the mesh through them.
 
-    `beam_x`, `beam_y` are the beam positions at which the points are illuminated [y, x], um.
+    `beam_x`, `beam_y` are the beam positions at which the points are illuminated [y, x], um; `pixel` numbers the pixels
+    to which the points of the mesh's grid belong.
     """
 
     raster: "_Raster"
@@ -219,7 +205,7 @@ class SurfaceHypothesis:
     beam_y: np.ndarray
     points: Hits
     body: Body
-    grid_shape: tuple[int, ...]
+    pixel: np.ndarray
     intersector: Intersector
 
     def multiple(
@@ -257,8 +243,7 @@ class SurfaceHypothesis:
         Returns:
             The surface, its laws, and the albedo of the face that all paths are taken to start from.
         """
-        pad = (int(self.grid_shape[0]) - albedo.shape[0]) // 2
-        on_grid = np.pad(np.minimum(albedo, 1.0), pad, mode="edge").ravel()
+        on_grid = np.minimum(albedo, 1.0).ravel()[self.pixel.ravel()]
         levels, index = np.unique(on_grid, return_inverse=True)
         names = tuple(f"albedo {i}" for i in range(levels.size))
         first = self.body.faces.min(axis=1)
@@ -309,28 +294,60 @@ class _Raster:
         """Ways in which the surface may go on beyond the image."""
         return CONTINUATIONS[:1] if self.has_flat_surroundings else CONTINUATIONS
 
-    def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
-        """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`."""
+    def side(
+        self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level", is_fully_seen: bool = False
+    ) -> SurfaceHypothesis:
+        """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`.
+
+        Where the beam sees all of it, walls are half-way between the pixels.
+        """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
         behind = occluded_vertices(*at, normals, shift, share)
-        if self.has_flat_surroundings:
-            body = surface_body(*at, self.reach, level=0.0, beam_shift=shift)
-            body = with_cavities(body, at, behind)
-        else:
-            level = substrate_level(height)
+        substrate = {"reach": self.reach, "level": 0.0, "beam_shift": shift}
+        if not self.has_flat_surroundings:
+            level, substrate = substrate_level(height), {}
             if way == "mirrored":
                 at, behind = self.mirrored(at, behind, level)
-            extended, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
-            body = with_cavities(surface_body(*extended), extended, behind)
+            at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
+        pixel = self.pixels(at[0].shape)
+        if is_fully_seen:
+            at, number = with_upright_walls(at, shift, self.pitch)
+            body, pixel = surface_body(*at, **substrate), pixel[number]
+        else:
+            body = with_cavities(surface_body(*at, **substrate), at, behind)
         point = np.stack(seen, -1).reshape(-1, 3) + self.lift * normal
         beam_x, beam_y = (
             at + (own - view) * height
             for at, own, view in zip((self.x, self.y), self.instrument.beam_shift, shift, strict=True)
         )
-        return SurfaceHypothesis(
-            self, beam_x, beam_y, Hits.on_mesh(point, normal), body, behind[0].shape, Intersector(body)
-        )
+        return SurfaceHypothesis(self, beam_x, beam_y, Hits.on_mesh(point, normal), body, pixel, Intersector(body))
+
+    @property
+    def pitch(self) -> float:
+        """Larger pitch, um."""
+        return max(pitch(self.x[0]), pitch(self.y[:, 0]))
+
+    def pixels(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Number the pixels of the image; in a grid with more points around it, the nearest one's of each [point]."""
+        return np.pad(np.arange(self.x.size).reshape(self.x.shape), (shape[0] - len(self.x)) // 2, mode="edge").ravel()
+
+    def smoothed(self, images: np.ndarray, height: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
+        """Smooth images [image, y, x] along a surface of heights [y, x], um, and unit normals [y, x, 3]."""
+        points = np.stack(self.surface(self.x, self.y, height), -1)
+        return smooth_along_surface(images, normals, points, self.pitch, passes)
+
+    def denoised(self, height: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
+
+        Noise makes facets see one another: on a flat that would add half a per cent of its signal. Where the mean
+        height differs by more than `MAX_SMOOTHING_STEP`, neighbours are at another level, and the height stays.
+        """
+        mean = self.smoothed(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), height, normals)
+        smooth = np.moveaxis(mean[:3], 0, -1)
+        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
+        is_near = np.abs(mean[3] - height) < MAX_SMOOTHING_STEP * self.pitch
+        return np.where(is_near, mean[3], height), smooth
 
     def surface(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Grid:
         """Compute the surface points of heights [y, x] that are seen at positions x, y of the raster [um]."""
@@ -354,4 +371,5 @@ class _Raster:
         """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
         at = self.surface(self.x, self.y, height)
         is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.view_shift, 1.0), at)
-        return [self.side(height, normals, share, way) for share in ((0.0,) if is_fully_seen else OCCLUDED_NODES)]
+        shares = (0.0,) if is_fully_seen else OCCLUDED_NODES
+        return [self.side(height, normals, share, way, is_fully_seen) for share in shares]

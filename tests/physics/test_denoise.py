@@ -9,6 +9,12 @@ SHAPE = (40, 50)
 ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]]
 
 
+def on_slope(normals: np.ndarray) -> np.ndarray:
+    """Return points [y, x, 3] of a surface of pitch 1, level or falling to the right by 45 degrees."""
+    fall = -np.cumsum(normals[..., 0] / normals[..., 2], axis=1)
+    return np.stack([*np.mgrid[: normals.shape[0], : normals.shape[1]][::-1], fall], -1).astype(float)
+
+
 def bent(column: int) -> np.ndarray:
     """Return unit normals [y, x, 3] of a flat up to a column, a slope of 45 degrees from there on."""
     return np.where((column > COLUMN)[..., None], [0.0, 0.0, 1.0], [np.sqrt(0.5), 0.0, np.sqrt(0.5)])
@@ -21,9 +27,22 @@ def test_planes_and_edges_are_kept(passes):
     Rejects a Gaussian mean, which is off by half the step there.
     """
     image = np.where(COLUMN < 20, 3.0 + 0.01 * ROW, -5.0 + 0.02 * COLUMN)
-    found = smooth_along_surface(image[None], bent(20), passes)[0]
+    found = smooth_along_surface(image[None], bent(20), on_slope(bent(20)), 1.0, passes)[0]
     inner = slice(7 * passes, -7 * passes), slice(12, 30)
     np.testing.assert_allclose(found[inner], image[inner], atol=0.02)
+
+
+def test_levels_are_kept_apart():
+    """A wall 5 pixels high between two levels with the same normal: nothing is averaged across it.
+
+    Rejects weights of normals alone, which put 13 % of a pit's multiple scattering on its rim; the noise still falls.
+    """
+    up = np.broadcast_to([0.0, 0.0, 1.0], (*SHAPE, 3))
+    points = on_slope(up) + np.where(COLUMN < 20, 5.0, 0.0)[..., None] * [0.0, 0.0, 1.0]
+    image = np.where(COLUMN < 20, 0.0, 1.0) + 0.05 * np.random.default_rng(0).normal(size=SHAPE)
+    found = smooth_along_surface(image[None], up, points, 1.0, 2)[0]
+    assert np.abs(found[:, :20]).max() < 0.1 and np.abs(found[:, 20:] - 1.0).max() < 0.1
+    assert found[8:-8, :14].std() < 0.3 * image[8:-8, :14].std()
 
 
 def test_noise_falls_with_the_passes():
@@ -34,7 +53,7 @@ def test_noise_falls_with_the_passes():
     noise = np.random.default_rng(0).normal(size=(4, 100, 120))
     up = np.broadcast_to([0.0, 0.0, 1.0], (100, 120, 3))
     for passes in (1, 2, 3):
-        found = smooth_along_surface(noise, up, passes)[:, 20:-20, 20:-20].std()
+        found = smooth_along_surface(noise, up, on_slope(up), 1.0, passes)[:, 20:-20, 20:-20].std()
         assert found == pytest.approx(0.5 / np.sqrt(np.pi * (4**passes - 1) / 3), rel=0.15)
 
 

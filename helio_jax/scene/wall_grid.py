@@ -1,0 +1,119 @@
+"""Walls half-way between pixels: a grid of heights on which depth jumps are walls along the beam, not slopes.
+
+Triangles between the points of two pixels make a ramp of a wall, one pixel wide, with its foot at the lower point. The
+wall is somewhere between the points: half-way on the average. Every pixel is given eight more points, just inside its
+own square, and only pixels that no wall parts share their heights.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from helio_jax.arrays import WALL_PITCHES
+
+GAP = 1e-3
+"""How far from the half-way line the points on both sides of it are [pixels]."""
+LEAST_JUMP = 2.0
+"""By how much more than the next ones two neighbours differ if a wall parts them [pitches]."""
+
+Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""x, y, z of points [y, x], um."""
+
+
+def wall_links(z: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the neighbours that a wall parts: their heights differ far more than those beside them in line.
+
+    A facet two pixels wide is none, however steep, up to `WALL_PITCHES`.
+
+    Args:
+        z: heights [y, x], um.
+        pitch: um.
+
+    Returns:
+        Whether a wall parts neighbours along x [y, x - 1], and along y [y - 1, x].
+    """
+    found = []
+    for heights in (z, z.T):
+        rise = np.pad(np.abs(np.diff(heights, axis=1)), ((0, 0), (1, 1)))
+        jump = rise[:, 1:-1] - np.maximum(rise[:, :-2], rise[:, 2:])
+        found.append((jump > LEAST_JUMP * pitch) | (rise[:, 1:-1] > WALL_PITCHES * pitch))
+    return found[0], found[1].T
+
+
+def with_upright_walls(grid: Grid, beam_shift: tuple[float, float], pitch: float) -> tuple[Grid, np.ndarray]:
+    """Refine a beam-frame grid to one whose walls are half-way between the pixels, if it has any.
+
+    Args:
+        grid: x, y, z of the points of the pixels [y, x], um; without occlusion edges (`occluded_vertices`).
+        beam_shift: `Instrument.beam_shift` of the grid.
+        pitch: of the raster, um.
+
+    Returns:
+        x, y, z [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the grid
+        as it is.
+    """
+    z = grid[2]
+    walls = wall_links(z, pitch)
+    number = np.arange(z.size).reshape(z.shape)
+    if not any(w.any() for w in walls):
+        return grid, number
+    height = _refined_heights(z, *walls)
+    x, y = (_refined_places(p + t * z) - t * height for p, t in zip(grid[:2], beam_shift, strict=True))
+    return (x, y, height), _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
+
+
+def _inner(field: np.ndarray) -> np.ndarray:
+    """Leave out the points beyond the pixels of the border."""
+    return field[1:-1, 1:-1]
+
+
+def _refined_places(place: np.ndarray) -> np.ndarray:
+    """Interpolate raster positions [y, x] at the points of the pixels [3 y - 2, 3 x - 2]."""
+    for axis in (0, 1):
+        n = place.shape[axis]
+        at = np.ravel(np.arange(n)[:, None] + [-0.5 + GAP, 0.0, 0.5 - GAP])[1:-1]
+        low = np.minimum(at.astype(int), n - 2)
+        share = np.expand_dims(at - low, 1 - axis)
+        place = (1.0 - share) * place.take(low, axis) + share * place.take(low + 1, axis)
+    return place
+
+
+def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:
+    """Compute the heights of the points: means of the pixels around that no wall parts from the own one.
+
+    Args:
+        z: heights [y, x], um.
+        wall_x, wall_y: from `wall_links`.
+
+    Returns:
+        Heights [3 y - 2, 3 x - 2], um.
+    """
+    ny, nx = z.shape
+    room = np.pad(z, 1, mode="edge")
+    # whether no wall parts columns x - 1 and x [y + 2, x + 1], rows y - 1 and y [y + 1, x + 2]; beyond the border: none
+    open_x, open_y = (~np.pad(wall, 1) for wall in (wall_x, wall_y))
+
+    def mean(members: Sequence[tuple[int, int, np.ndarray]]) -> np.ndarray:
+        """Average the own pixel and those at (dy, dx) that are joined to it."""
+        total, count = z.copy(), np.ones(z.shape)
+        for dy, dx, is_joined in members:
+            total += np.where(is_joined, room[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx], 0.0)
+            count += is_joined
+        return z + (1.0 - 2.0 * GAP) * (total / count - z)
+
+    height = np.empty((ny, 3, nx, 3))
+    height[:, 1, :, 1] = z
+    for side in (-1, 1):
+        ahead = (1 + side) // 2
+        height[:, 1, :, 1 + side] = mean([(0, side, open_x[1:-1, ahead : ahead + nx])])
+        height[:, 1 + side, :, 1] = mean([(side, 0, open_y[ahead : ahead + ny, 1:-1])])
+    for sy, sx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        column, row = (1 + sx) // 2, (1 + sy) // 2
+        here_x, there_x = (open_x[1 + dy : 1 + dy + ny, column : column + nx] for dy in (0, sy))
+        here_y, there_y = (open_y[row : row + ny, 1 + dx : 1 + dx + nx] for dx in (0, sx))
+        # also the other way round the four pixels
+        to_x = here_x | (here_y & there_x & there_y)
+        to_y = here_y | (here_x & there_y & there_x)
+        to_both = (here_x & there_y) | (here_y & there_x)
+        height[:, 1 + sy, :, 1 + sx] = mean([(0, sx, to_x), (sy, 0, to_y), (sy, sx, to_both)])
+    return _inner(height.reshape(3 * ny, 3 * nx))

@@ -1,0 +1,68 @@
+"""Walls half-way between pixels: levels, closure and places of the refined grid."""
+
+import numpy as np
+import pytest
+
+from helio_jax.scene.surfaces import surface_body
+from helio_jax.scene.wall_grid import GAP, wall_links, with_upright_walls
+
+PITCH = 2.0
+SHIFT = 0.3, -0.2
+Y, X = (PITCH * a for a in np.mgrid[:12, :15].astype(float))
+
+
+def grid(z: np.ndarray):
+    return X - SHIFT[0] * z, Y - SHIFT[1] * z, z
+
+
+def test_without_walls_nothing_changes():
+    """Neither of noise nor of a facet of 72 degrees, three pixels wide."""
+    z = np.random.default_rng(0).normal(0.0, 0.1, X.shape) + 3.0 * np.clip(X - 10.0, 0.0, 3.0 * PITCH)
+    points = grid(z)
+    fine, number = with_upright_walls(points, SHIFT, PITCH)
+    assert fine is points and np.array_equal(number.ravel(), np.arange(z.size))
+
+
+def test_walls_stand_half_way():
+    """A block with a wall along the raster and a corner: its levels are kept, and its edges are where pixels meet.
+
+    Rejects a ramp from point to point: its heights are between the levels.
+    """
+    is_high = (X > 9.0) & (Y > 5.0)
+    fine, number = with_upright_walls(grid(20.0 * is_high), SHIFT, PITCH)
+    x, y, z = fine
+    assert z.shape == (34, 43) and set(np.unique(z)) == {0.0, 20.0}
+    assert np.array_equal(z > 0.0, is_high.ravel()[number])
+    on_raster = x + SHIFT[0] * z, y + SHIFT[1] * z
+    assert on_raster[0][z > 0].min() == pytest.approx(9.0, abs=2.0 * GAP * PITCH)
+    assert on_raster[1][z > 0].min() == pytest.approx(5.0, abs=2.0 * GAP * PITCH)
+    assert np.array_equal(z[::3, ::3], 20.0 * is_high)
+
+
+def test_surface_stays_closed_and_tilted_levels_plane():
+    """A tilted plane with a ring-shaped wall: one sheet, and off the plane by at most half a pixel's rise, at walls."""
+    is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
+    plane = 0.2 * X - 0.1 * Y
+    z = plane + 18.0 * is_high
+    fine, number = with_upright_walls(grid(z), SHIFT, PITCH)
+    x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
+    off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
+    assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.median(np.abs(off)) < 1e-9
+    edges = np.sort(surface_body(*fine).faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, times = np.unique(edges, axis=0, return_counts=True)
+    assert times.max() == 2 and np.sum(times == 1) == 2 * (np.sum(fine[2].shape) - 2)
+
+
+def test_wall_that_ends():
+    """A slit that becomes shallower: where a cell has a wall on one side only, all its four inner corners meet.
+
+    Rejects corners that belong to the pixels beside the wall: they leave a hole.
+    """
+    depth = np.where((X < 22.0) & (np.abs(Y - 10.0) < 0.1), 1.5 * np.clip(22.0 - X, 0.0, None), 0.0)
+    along_x, along_y = wall_links(-depth, PITCH)
+    n_walls = along_y[:, :-1] + along_y[:, 1:].astype(int) + along_x[:-1] + along_x[1:]
+    assert (n_walls == 1).any() and (n_walls == 2).any()
+    z = with_upright_walls(grid(-depth), SHIFT, PITCH)[0][2]
+    corners = np.stack([z[i::3, j::3] for i in (1, 2) for j in (1, 2)])
+    spread = np.ptp(corners, axis=0)
+    assert spread[n_walls <= 1].max() < 2.0 * GAP * depth.max() < 1.0 < spread[n_walls == 2].min()
