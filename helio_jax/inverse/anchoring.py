@@ -136,13 +136,15 @@ class _Known(NamedTuple):
         detectors = () if problem.instrument is None else problem.instrument.detector_names
         anchors = anchors_of(stated, problem.raster, problem.optics, surface, detectors)
         names = [(anchor_name(i, one), one.kind) for i, one in enumerate(stated)]
-        levels = problem.anchors
+        region = regions(fit.joined_x, fit.joined_y)
+        levels = problem.anchors.within_one(region)
         if steps is not None:
-            numbers, measured = anchors_of_steps(steps, surface, problem.raster, regions(fit.joined_x, fit.joined_y))
-            anchors = anchors.and_also(measured)
-            names += [(f"step {number}", MEASURED) for number in numbers]
-            is_shown = np.any(measured.weight != 0.0, axis=0)
-            levels = levels.taken([not is_shown[inside].any() for inside in levels.weight > 0])
+            numbers, measured = anchors_of_steps(steps, surface, problem.raster, region)
+            # beside walls, multiple scattering disturbs heights the most: a mean over a whole level is the better sum
+            is_level = np.any(levels.weight > 0.0, axis=0)
+            other = np.array([not is_level[pixels].any() for pixels in measured.weight != 0.0], bool)
+            anchors = anchors.and_also(measured.taken(other))
+            names += [(f"step {n}", MEASURED) for n, is_other in zip(numbers, other, strict=True) if is_other]
         names += [(f"level {number}", MEASURED) for number in range(1, 1 + len(levels.value))]
         return cls(tuple(names), anchors.and_also(levels))
 

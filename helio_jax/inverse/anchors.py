@@ -56,6 +56,19 @@ class Anchors:
         is_taken = np.asarray(which, bool)
         return Anchors(self.weight[is_taken], self.value[is_taken])
 
+    def within_one(self, region: np.ndarray) -> "Anchors":
+        """Keep, above and below, the pixels of the most frequent region [y, x], at the same sum of weights.
+
+        A pixel that jumps part from all others may have any height: it would take up what the anchor says of the rest.
+        """
+        out = np.zeros_like(self.weight)
+        for new, old in zip(out, self.weight, strict=True):
+            for part in (old > 0.0, old < 0.0):
+                if part.any():
+                    kept = part & (region == np.bincount(region[part]).argmax())
+                    new[kept] = old[kept] * (old[part].sum() / old[kept].sum())
+        return Anchors(out, self.value)
+
     def padded(self, block: int) -> "Anchors":
         """Fill up with empty ones to a multiple of `block`: one compilation serves different numbers of them."""
         n = -len(self.value) % block if len(self.value) else block

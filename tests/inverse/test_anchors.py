@@ -128,6 +128,20 @@ def test_thinning_keeps_every_anchor():
     np.testing.assert_allclose(sums, np.sum(weight * on_raster(field, (9, 12), 4), (1, 2)))  # also where pixels tie
 
 
+def test_a_pixel_of_its_own_takes_up_no_level():
+    """Of a level of 9 pixels, one is parted from the rest: it gets no weight, the sum of weights stays."""
+    region = np.zeros((12, 12), int)
+    region[4:7, 4:7] = 1
+    level = Anchors.of_levels(region, {1: (50.0, 2.0)}, np.ones(region.shape, bool), 1)
+    parted = region.copy()
+    parted[5, 6] = 2
+    found = level.within_one(parted)
+    assert found.weight[0, 5, 6] == 0.0 and np.count_nonzero(found.weight[0] > 0.0) == 8
+    for part in (level.weight > 0.0, level.weight < 0.0):
+        assert found.weight[part].sum() == pytest.approx(level.weight[part].sum())
+    assert np.array_equal(found.value, level.value)
+
+
 def test_leaving_out_is_fitting_without():
     """Estimates without some data by the closed form, and by least squares without their rows."""
     rng = np.random.default_rng(5)
