@@ -309,6 +309,7 @@ workflows/            what joins the stages
   doctor              checks the installation
 commands/             the command line; no logic of its own
   app                 shared options and messages
+  group               the group of all commands; makes each when it is asked for
   door                checks outputs against inputs before any work
   interrupts          Ctrl-C at any moment
   log                 the log file of a command (--log)
