@@ -167,8 +167,8 @@ def _of_npz(path: Path) -> Found:
     try:
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
-    except zipfile.BadZipFile as e:
-        raise InputFileError(f"{path}: is not a readable .npz file: {e}") from None
+    except Exception as e:  # zipfile raises many kinds on corrupt files
+        raise InputFileError(f"{path}: is not a readable .npz file: {e}; write it again") from None
     if {"x", "y", "height"} <= sizes.keys():
         rows = summarise(read_height_map(path, 1.0, None))
         return "height map", [*rows, ("unit", "um is assumed here; a scene states it (sample.unit)")], {"arrays": sizes}
