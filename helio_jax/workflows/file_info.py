@@ -155,6 +155,10 @@ def _of_mesh(path: Path) -> Found:
     rows += [("size", f"{sides} in the file's unit (sample.unit in a scene)"), ("extent", place)]
     closed = "yes" if found["is_watertight"] else f"no: {found['n_inner_open_edges']} open edges within"
     rows.append(("closed", f"{closed}; {found['n_open_edges'] - found['n_inner_open_edges']} on its outer border"))
+    for hole in found["holes"][:1]:
+        middle = ", ".join(f"{v:.6g}" for v in hole["middle_um"])
+        size = f"the largest is {hole['size_um']:.6g} across, middle at {middle}"
+        rows.append(("holes", f"{found['n_holes']}; {size} (a scene closes small ones: sample.close_holes_um)"))
     faults = {"n_edges_of_three_faces": "edges of three faces", "n_duplicate_faces": "faces given twice"}
     shown = [f"{found[key]} {words}" for key, words in faults.items() if found[key]]
     if not found["is_winding_consistent"]:

@@ -1,0 +1,120 @@
+"""Holes of a triangle mesh: where they are, and small ones closed.
+
+An edge that one face uses is open. Open edges that share vertices form a hole, or the outer border of a sheet. trimesh
+closes holes of three and four edges only, and knows no largest size.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Edges of a mesh, each once.
+
+    Attributes:
+        ends: vertices of each edge, in the order of a face that uses it [n, 2].
+        face: that face [n].
+        n_uses: number of faces that use it [n].
+    """
+
+    ends: np.ndarray
+    face: np.ndarray
+    n_uses: np.ndarray
+
+    @property
+    def is_open(self) -> np.ndarray:
+        """True where one face alone uses the edge [n]."""
+        return self.n_uses == 1
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A hole of a mesh.
+
+    Attributes:
+        center: middle of its border [3].
+        size: largest extent of its border along an axis, in the unit of the vertices.
+        edges: its open edges, as indices into those given to `find_holes` [n].
+        is_loop: its border is one closed line, so that a fan of triangles closes it.
+    """
+
+    center: np.ndarray
+    size: float
+    edges: np.ndarray
+    is_loop: bool
+
+
+def find_edges(faces: np.ndarray) -> Edges:
+    """Find the edges of faces [m, 3]."""
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    key = ends.min(1) * (int(faces.max(initial=0)) + 1) + ends.max(1)
+    _, first, n_uses = np.unique(key, return_index=True, return_counts=True)
+    return Edges(ends[first], first // 3, n_uses)
+
+
+def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
+    """Group open edges to holes, the largest first.
+
+    Args:
+        vertices: positions [n, 3].
+        ends: the two vertices of each open edge, in the order of its face [k, 2].
+    """
+    if not len(ends):
+        return []
+    used, index = np.unique(ends, return_inverse=True)
+    index = index.reshape(ends.shape)
+    size = len(used)
+    joined = coo_array((np.ones(len(ends)), (index[:, 0], index[:, 1])), shape=(size, size))
+    n_holes, of_vertex = connected_components(joined, directed=False)
+    is_simple = (np.bincount(index[:, 0], minlength=size) == 1) & (np.bincount(index[:, 1], minlength=size) == 1)
+    by_vertex, by_edge = (_grouped(of, n_holes) for of in (of_vertex, of_vertex[index[:, 0]]))
+    holes = []
+    for members, edges in zip(by_vertex, by_edge, strict=True):
+        points = vertices[used[members]]
+        extent = float(np.ptp(points, axis=0).max())
+        holes.append(Hole(points.mean(0), extent, edges, bool(is_simple[members].all())))
+    return sorted(holes, key=lambda hole: -hole.size)
+
+
+def _grouped(group: np.ndarray, n: int) -> list[np.ndarray]:
+    """Return the indices of the members of each group 0 ... n - 1."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.searchsorted(group[order], np.arange(1, n)))
+
+
+def close_holes(
+    vertices: np.ndarray, faces: np.ndarray, parts: np.ndarray, largest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Hole]]:
+    """Close holes by a fan of triangles about the middle of each.
+
+    Where a flat face is missing, the fan is that face. The true surface in a hole is unknown: the fan is right to about
+    the size of the hole. A hole as wide as the mesh along two axes is the outer border of a sheet and stays open, and
+    so does one whose border is no closed line.
+
+    Args:
+        vertices, faces, parts: the mesh [n, 3], [m, 3], and the part of each face [m].
+        largest: size of the largest hole to close, in the unit of the vertices.
+
+    Returns:
+        The same with one vertex for each closed hole and one face for each of its edges, which belongs to the part of
+        the face beside it; and the closed holes.
+    """
+    edges = find_edges(faces)
+    ends, beside = edges.ends[edges.is_open], edges.face[edges.is_open]
+    across = np.ptp(vertices[faces].reshape(-1, 3), axis=0)
+    closed, new_faces, new_parts = [], [faces], [parts]
+    for hole in find_holes(vertices, ends):
+        border = ends[hole.edges]
+        is_outer = np.sum(np.ptp(vertices[border].reshape(-1, 3), axis=0) >= (1.0 - 1e-6) * across) >= 2
+        if hole.size > largest or is_outer or not hole.is_loop:
+            continue
+        middle = np.full(len(border), len(vertices) + len(closed))
+        new_faces.append(np.column_stack([border[:, ::-1], middle]))
+        new_parts.append(parts[beside[hole.edges]])
+        closed.append(hole)
+    middles = [hole.center[None] for hole in closed]
+    return np.concatenate([vertices, *middles]), np.concatenate(new_faces), np.concatenate(new_parts), closed
