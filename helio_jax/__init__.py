@@ -39,6 +39,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   scene               Scene: instrument, sample and scan, checked against each other
   sample              the [sample] table by kind; mesh samples
   meshes              reads mesh files (STL, OBJ, PLY, GLB)
+  holes               holes of a mesh; closes small ones
   shapes              samples from numbers: flat, spheres, step, trench, pyramid
   rough               random rough samples
   maps                samples from height maps and reconstructions

@@ -39,7 +39,8 @@ class Hole:
         center: middle of its border [3].
         size: largest extent of its border along an axis, in the unit of the vertices.
         edges: its open edges, as indices into those given to `find_holes` [n].
-        is_loop: its border is one closed line, so that a fan of triangles closes it.
+        is_loop: its border is one closed line, so that a fan of triangles closes it; not where neighbouring faces are
+            wound in opposite senses.
     """
 
     center: np.ndarray
@@ -57,7 +58,7 @@ def find_edges(faces: np.ndarray) -> Edges:
 
 
 def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
-    """Group open edges to holes, the largest first.
+    """Group open edges to holes, the largest first; holes that touch at a vertex are parted.
 
     Args:
         vertices: positions [n, 3].
@@ -70,20 +71,43 @@ def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
     size = len(used)
     joined = coo_array((np.ones(len(ends)), (index[:, 0], index[:, 1])), shape=(size, size))
     n_holes, of_vertex = connected_components(joined, directed=False)
-    is_simple = (np.bincount(index[:, 0], minlength=size) == 1) & (np.bincount(index[:, 1], minlength=size) == 1)
-    by_vertex, by_edge = (_grouped(of, n_holes) for of in (of_vertex, of_vertex[index[:, 0]]))
+    n_out, n_in = np.bincount(index[:, 0], minlength=size), np.bincount(index[:, 1], minlength=size)
+    is_balanced, is_simple = (
+        np.bincount(of_vertex[bad], minlength=n_holes) == 0 for bad in (n_out != n_in, n_out != 1)
+    )
+    group = of_vertex[index[:, 0]]
+    order = np.argsort(group, kind="stable")
     holes = []
-    for members, edges in zip(by_vertex, by_edge, strict=True):
-        points = vertices[used[members]]
-        extent = float(np.ptp(points, axis=0).max())
-        holes.append(Hole(points.mean(0), extent, edges, bool(is_simple[members].all())))
+    for hole, edges in enumerate(np.split(order, np.searchsorted(group[order], np.arange(1, n_holes)))):
+        parted = [edges] if is_simple[hole] or not is_balanced[hole] else [edges[k] for k in _loops(index[edges])]
+        for border in parted:
+            points = vertices[np.unique(ends[border])]
+            size_of = float(np.ptp(points, axis=0).max())
+            holes.append(Hole(points.mean(0), size_of, border, bool(is_balanced[hole])))
     return sorted(holes, key=lambda hole: -hole.size)
 
 
-def _grouped(group: np.ndarray, n: int) -> list[np.ndarray]:
-    """Return the indices of the members of each group 0 ... n - 1."""
-    order = np.argsort(group, kind="stable")
-    return np.split(order, np.searchsorted(group[order], np.arange(1, n)))
+def _loops(ends: np.ndarray) -> list[np.ndarray]:
+    """Part directed edges [k, 2], of which as many leave each vertex as enter it, into closed lines."""
+    leaving: dict[int, list[int]] = {}
+    for k, start in enumerate(ends[:, 0].tolist()):
+        leaving.setdefault(start, []).append(k)
+    loops = []
+    for first in list(leaving):
+        path: list[int] = []
+        at, visited = first, {first: 0}
+        while leaving[at]:
+            path.append(leaving[at].pop())
+            at = int(ends[path[-1], 1])
+            if at in visited:  # a closed line ends here: take it from the path
+                loop = path[visited[at] :]
+                del path[visited[at] :]
+                for k in loop[:-1]:
+                    del visited[int(ends[k, 1])]
+                loops.append(np.array(loop))
+            else:
+                visited[at] = len(path)
+    return loops
 
 
 def close_holes(

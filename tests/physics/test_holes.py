@@ -13,7 +13,7 @@ from helio_jax.commands.app import app
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.body import Body
-from helio_jax.scene.holes import find_edges, find_holes
+from helio_jax.scene.holes import close_holes, find_edges, find_holes
 from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.scene.surfaces import flat_body
 from helio_jax.trace.run import make_experiment, trace_pixels
@@ -70,10 +70,10 @@ def facing_up(ball: trimesh.Trimesh, n: int) -> np.ndarray:
 def trace(
     body: Body, seed: int, reach: float = 80.0, estimator: Literal["analog", "expected"] = "expected"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trace 21 x 21 pixels with 256 rays each; return the mean signal of each detector and its standard error [2]."""
+    """Trace 21 x 21 pixels with 64 rays each; return the mean signal of each detector and its standard error [2]."""
     axis = np.linspace(-reach, reach, 21)
     x, y = (g.ravel() for g in np.meshgrid(axis, axis))
-    settings = TraceSettings(rays=256, seed=seed, estimator=estimator)
+    settings = TraceSettings(rays=64, seed=seed, estimator=estimator)
     estimate = trace_pixels(make_experiment(body, INSTRUMENT, settings), x, y)
     return estimate.total_mean.mean(-1), np.sqrt(estimate.total_variance.sum(-1)) / len(x)
 
@@ -104,6 +104,27 @@ def test_places_of_holes(ball, tmp_path):
     assert large["size_um"] == pytest.approx(np.ptp(corners, axis=0).max(), abs=1e-3)
 
 
+def test_holes_that_touch_are_parted(ball):
+    """Two missing faces that share one vertex: two holes of three edges. 300 faces at random: all closed.
+
+    Catches one fan over both, which would leave neither surface; and edges that are lost where borders cross.
+    """
+    first = 77
+    around = ball.vertex_faces[ball.faces[first][0]]
+    touching = next(f for f in around if f >= 0 and len(set(ball.faces[f]) & set(ball.faces[first])) == 1)
+    holes = find_holes(*_open(without(ball, first, int(touching))))
+    assert [(len(hole.edges), hole.is_loop) for hole in holes] == [(3, True)] * 2
+    some = np.random.default_rng(1).choice(len(ball.faces), 300, replace=False)
+    open_ball = without(ball, *some)
+    holes = find_holes(*_open(open_ball))
+    assert sorted(np.concatenate([hole.edges for hole in holes])) == list(range(len(_open(open_ball)[1])))
+    mesh = np.asarray(open_ball.vertices), np.asarray(open_ball.faces)
+    vertices, faces, _, closed = close_holes(*mesh, np.zeros(len(mesh[1]), int), RADIUS)
+    mended = trimesh.Trimesh(vertices, faces, process=False)
+    assert mended.is_watertight and mended.is_winding_consistent and len(closed) == len(holes)
+    assert mended.volume == pytest.approx(ball.volume, rel=1e-2)
+
+
 def test_no_ray_leaks_where_a_mesh_stands_on_the_substrate(tmp_path):
     """A box loses its bottom to the substrate: no hole. Catches "rays leak" said of every box on a substrate."""
     trimesh.creation.box((100.0, 100.0, 100.0)).export(tmp_path / "box.stl")
@@ -115,7 +136,7 @@ def test_no_ray_leaks_where_a_mesh_stands_on_the_substrate(tmp_path):
 def test_closed_holes_count_as_the_closed_ball(ball, tmp_path):
     """20 missing faces of a ball, closed: the same surface, and the counts of the closed ball.
 
-    The ratio has a standard error of 0.01 %: a bias of 0.1 % would be rejected. Holes left open, and fans with their
+    The ratio has a standard error of 0.02 %: a bias of 0.2 % would be rejected. Holes left open, and fans with their
     faces inward, lose every atom that meets them.
     """
     ball.export(tmp_path / "closed.stl")
@@ -127,7 +148,7 @@ def test_closed_holes_count_as_the_closed_ball(ball, tmp_path):
     found = check_body(mended)
     assert found["is_watertight"] and found["is_winding_consistent"] and found["n_holes"] == 0
     assert trimesh.Trimesh(mended.vertices, mended.faces, process=False).volume == pytest.approx(ball.volume, rel=1e-6)
-    assert_same(trace(mended, seed=1), trace(closed, seed=2), 0.0002)
+    assert_same(trace(mended, seed=1), trace(closed, seed=2), 0.0004)
 
 
 def test_which_holes_are_closed(ball, tmp_path):
@@ -139,9 +160,10 @@ def test_which_holes_are_closed(ball, tmp_path):
     without(ball, 77, *two).export(tmp_path / "ball.stl")
     sizes = [hole.size for hole in find_holes(*_open(without(ball, 77, *two)))]
     between = 0.5 * (sizes[0] + sizes[1])
-    for scale, unit, factor in ((1.0, "um", 1.0), (1e-3, "mm", 1.0), (2.0, "um", 2.0)):
-        body = MeshSample(file="ball.stl", unit=unit, scale=scale, close_holes_um=factor * between).build(tmp_path)
-        assert check_body(body)["n_holes"] == 1, (scale, unit)
+    options = {"file": "ball.stl", "unit": "um", "close_holes_um": between}
+    for changes in ({}, {"unit": "mm", "scale": 1e-3}, {"scale": 2.0, "close_holes_um": 2.0 * between}):
+        body = MeshSample.model_validate(options | changes).build(tmp_path)
+        assert check_body(body)["n_holes"] == 1, changes
     sheet = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0], [4, 4, 1]], [[0, 1, 4], [1, 2, 4], [2, 3, 4]])
     sheet.export(tmp_path / "sheet.stl")
     body = MeshSample(file="sheet.stl", unit="um", close_holes_um=1000.0).build(tmp_path)
@@ -171,7 +193,7 @@ def test_two_sided_sheets(tmp_path):
 
     Half of the beam passes beside it, and atoms between sheet and substrate meet its lower side. Catches a face
     that loses what comes from behind, and one that sends it through to the other side: the ratio has a standard error
-    of 0.1 %, a bias of 1 % would be rejected.
+    of 0.2 %, a bias of 2 % would be rejected.
     """
     corners = np.array([[-50, -50, 60], [50, -50, 60], [50, 50, 60], [-50, 50, 60.0]])
     up = np.array([[0, 1, 2], [0, 2, 3]])
@@ -192,7 +214,7 @@ def test_two_sided_sheets(tmp_path):
     for estimator in ("analog", "expected"):
         turned = trace(build("down.stl", two_sided=True), 1, estimator=estimator)
         np.testing.assert_allclose(trace(sheet, 1, estimator=estimator), turned, rtol=1e-6)
-    assert_same(trace(sheet, seed=1), trace(build("thick.stl"), seed=2), 0.002)
+    assert_same(trace(sheet, seed=1), trace(build("thick.stl"), seed=2), 0.004)
 
 
 def test_validate_says_where_and_what_was_closed(ball, tmp_path):
