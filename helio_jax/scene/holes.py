@@ -7,8 +7,6 @@ closes holes of three and four edges only, and knows no largest size.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 
 @dataclass(frozen=True)
@@ -64,6 +62,9 @@ def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
         vertices: positions [n, 3].
         ends: the two vertices of each open edge, in the order of its face [k, 2].
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     if not len(ends):
         return []
     used, index = np.unique(ends, return_inverse=True)
