@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+BORDER_SHARE = 0.9
+"""Smallest extent of a sheet's outer border, as a share of that of the mesh."""
+
 
 @dataclass(frozen=True)
 class Edges:
@@ -111,18 +114,39 @@ def _loops(ends: np.ndarray) -> list[np.ndarray]:
     return loops
 
 
+def faces_up(vertices: np.ndarray, border: np.ndarray, up: np.ndarray) -> bool:
+    """Whether the sheet within a border faces up; False of a hole in such a sheet and of the rim of an open cup.
+
+    The vector area of the border, half the sum of a x b over its edges, then points up.
+
+    Args:
+        vertices: positions [n, 3].
+        border: the two vertices of each edge, in the order of its face [k, 2].
+        up: unit vector away from the substrate [3].
+    """
+    a, b = np.moveaxis(vertices[border], 1, 0)
+    middle = a.mean(0)
+    area = 0.5 * np.cross(a - middle, b - middle).sum(0)
+    return float(area @ up) > 1e-6 * float(np.ptp(a, axis=0).max()) ** 2
+
+
+def is_wide(vertices: np.ndarray, border: np.ndarray, across: np.ndarray) -> bool:
+    """Whether a border [k, 2] is nearly as wide as the mesh, `across` [3], along two axes."""
+    return int(np.sum(np.ptp(vertices[border[:, 0]], axis=0) >= BORDER_SHARE * across)) >= 2
+
+
 def close_holes(
-    vertices: np.ndarray, faces: np.ndarray, parts: np.ndarray, largest: float
+    vertices: np.ndarray, faces: np.ndarray, parts: np.ndarray, largest: float, up: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Hole]]:
     """Close holes by a fan of triangles about the middle of each.
 
     Where a flat face is missing, the fan is that face. The true surface in a hole is unknown: the fan is right to about
-    the size of the hole. A hole as wide as the mesh along two axes is the outer border of a sheet and stays open, and
-    so does one whose border is no closed line.
+    the size of the hole. The outer border of a sheet stays open, and so does a hole whose border is no closed line.
 
     Args:
         vertices, faces, parts: the mesh [n, 3], [m, 3], and the part of each face [m].
         largest: size of the largest hole to close, in the unit of the vertices.
+        up: unit vector away from the substrate, in the frame of the vertices [3].
 
     Returns:
         The same with one vertex for each closed hole and one face for each of its edges, which belongs to the part of
@@ -134,8 +158,8 @@ def close_holes(
     closed, new_faces, new_parts = [], [faces], [parts]
     for hole in find_holes(vertices, ends):
         border = ends[hole.edges]
-        is_outer = np.sum(np.ptp(vertices[border].reshape(-1, 3), axis=0) >= (1.0 - 1e-6) * across) >= 2
-        if hole.size > largest or is_outer or not hole.is_loop:
+        is_outer = is_wide(vertices, border, across) and faces_up(vertices, border, up)
+        if hole.size > largest or not hole.is_loop or is_outer:
             continue
         middle = np.full(len(border), len(vertices) + len(closed))
         new_faces.append(np.column_stack([border[:, ::-1], middle]))

@@ -15,11 +15,11 @@ from helio_jax.errors import InputFileError
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes
-from helio_jax.scene.holes import close_holes, find_edges, find_holes
+from helio_jax.scene.holes import Hole, close_holes, faces_up, find_edges, find_holes, is_wide
 from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
 from helio_jax.scene.meshes import check_outside, load_mesh
 from helio_jax.scene.mtl import FileLaw, mtl_files, used_laws
-from helio_jax.scene.placement import PlaceableSample
+from helio_jax.scene.placement import PlaceableSample, rotation_matrix
 from helio_jax.scene.rough import RoughSample
 from helio_jax.scene.shapes import (
     FlatSample,
@@ -71,18 +71,25 @@ class MeshSample(MaterialSample):
         """Read and check the mesh, in the file's unit (errors as `load_mesh`)."""
         laws = self.file_laws(base_dir)
         own = tuple(law.name for law in laws.values())
-        names, flip = tuple(self.materials), self.flip_normals
-        vertices, faces, parts = load_mesh(base_dir / self.file, self.max_file_mb, names, own, flip=flip)
-        if self.close_holes_um is not None:
-            vertices, faces, parts, _ = close_holes(vertices, faces, parts, self.close_holes_um / self._unit_um)
-            check_outside(base_dir / self.file, vertices, faces, flip=flip)
-        if self.mirror != "none":  # which turns the outside of every face in
-            vertices, faces = vertices * np.where(np.array(["x", "y", "z"]) == self.mirror, -1.0, 1.0), faces[:, ::-1]
+        vertices, faces, parts, _ = self._read(base_dir, own)
         by_part = (*self.material_names, *laws)
         names = tuple(dict.fromkeys(by_part))
         index = np.array([names.index(name) for name in by_part])[parts]
         two_sided = np.full(len(faces), self.two_sided)
         return Body(vertices, faces, materials=names, face_material=index, is_two_sided=two_sided)
+
+    def _read(self, base_dir: Path, own: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Hole]]:
+        """Read the mesh, mirror it and close its holes; return vertices, faces, parts as `load_mesh`, closed holes."""
+        path, flip = base_dir / self.file, self.flip_normals
+        vertices, faces, parts = load_mesh(path, self.max_file_mb, tuple(self.materials), own, flip=flip)
+        if self.mirror != "none":  # which turns the outside of every face in
+            vertices, faces = vertices * np.where(np.array(["x", "y", "z"]) == self.mirror, -1.0, 1.0), faces[:, ::-1]
+        if self.close_holes_um is None:
+            return vertices, faces, parts, []
+        up = rotation_matrix(self.rotate_deg)[2]
+        vertices, faces, parts, closed = close_holes(vertices, faces, parts, self.close_holes_um / self._unit_um, up)
+        check_outside(path, vertices, faces, flip=flip)
+        return vertices, faces, parts, closed
 
     @property
     def _unit_um(self) -> float:
@@ -111,8 +118,7 @@ class MeshSample(MaterialSample):
             for name in missing
         ]
         if self.close_holes_um is not None:
-            mesh = load_mesh(path, self.max_file_mb, tuple(self.materials), flip=self.flip_normals)
-            closed = close_holes(*mesh, self.close_holes_um / self._unit_um)[-1]
+            closed = self._read(base_dir)[-1]
             sizes = f"; the largest is {closed[0].size * self._unit_um:.4g} um across" if closed else ""
             what = "1 hole is closed" if len(closed) == 1 else f"{len(closed)} holes are closed"
             out.append(f"{path.name}: {what} (sample.close_holes_um){sizes}")
@@ -200,8 +206,9 @@ Sample = Annotated[Single | SeveralSamples, Field(discriminator="kind")]
 def check_body(body: Body, untilted: Body | None = None, *, has_substrate: bool = False) -> dict[str, Any]:
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
-    An open sheet is allowed: a substrate with structure is open along its outer border. `n_inner_open_edges` counts
-    open edges of one-sided faces away from the sides of the bounding box, where rays would leak; `n_holes` the holes
+    An open sheet that faces up is allowed: a substrate with structure is open along its outer border, which lies on the
+    sides of the bounding box or is a line around all of it. `n_inner_open_edges` counts the other open edges of one-sided faces,
+    where rays would leak; `n_holes` the holes
     that they form, `holes` the largest of these: middle [um], size [um], number of edges.
 
     Args:
@@ -222,8 +229,12 @@ def check_body(body: Body, untilted: Body | None = None, *, has_substrate: bool 
     for axis in (0, 1):
         for side in (low, high):
             on_side |= np.all(np.abs(places[..., axis] - side[axis]) <= near, axis=1)
+    is_border, across = np.zeros(len(places), bool), np.ptp(body.triangles.reshape(-1, 3), axis=0)
+    for hole in find_holes(body.vertices, ends):
+        if faces_up(body.vertices, border := ends[hole.edges], np.array([0.0, 0.0, 1.0])):
+            is_border[hole.edges] = on_side[hole.edges] | is_wide(body.vertices, border, across)
     stands = np.all(np.abs(places[..., 2]) <= near, axis=1) & has_substrate
-    leaks = ends[~(on_side | stands | body.is_two_sided[beside])]
+    leaks = ends[~(is_border | stands | body.is_two_sided[beside])]
     holes = find_holes(body.vertices, leaks)
     sorted_faces = np.unique(np.sort(body.faces, axis=1), axis=0)
     return {

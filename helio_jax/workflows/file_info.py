@@ -30,7 +30,7 @@ from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import load_study
 
 TABLES = (".csv", ".tsv", ".txt")
-_MANY = 12
+_MANY = 40
 """A table with more columns is a grid."""
 
 
@@ -227,7 +227,7 @@ def _of_table(path: Path) -> Found:
         rows.append(("values", f"{low:.6g} to {high:.6g}, {int(np.isnan(table).sum())} missing"))
         return (
             "grid of numbers",
-            [*rows, ("use", "a height map (sample.kind = 'height-map')")],
+            [*rows, ("use", "a height map (sample.kind = 'height_map')")],
             {"shape": [n_rows, n_columns]},
         )
     labels = names if has_names and len(names) == n_columns else [f"column {i + 1}" for i in range(n_columns)]

@@ -14,6 +14,7 @@ from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.body import Body
 from helio_jax.scene.holes import close_holes, find_edges, find_holes
+from helio_jax.scene.placement import rotation_matrix
 from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.scene.surfaces import flat_body
 from helio_jax.trace.run import make_experiment, trace_pixels
@@ -119,7 +120,7 @@ def test_holes_that_touch_are_parted(ball):
     holes = find_holes(*_open(open_ball))
     assert sorted(np.concatenate([hole.edges for hole in holes])) == list(range(len(_open(open_ball)[1])))
     mesh = np.asarray(open_ball.vertices), np.asarray(open_ball.faces)
-    vertices, faces, _, closed = close_holes(*mesh, np.zeros(len(mesh[1]), int), RADIUS)
+    vertices, faces, _, closed = close_holes(*mesh, np.zeros(len(mesh[1]), int), RADIUS, np.array([0.0, 0.0, 1.0]))
     mended = trimesh.Trimesh(vertices, faces, process=False)
     assert mended.is_watertight and mended.is_winding_consistent and len(closed) == len(holes)
     assert mended.volume == pytest.approx(ball.volume, rel=1e-2)
@@ -152,9 +153,9 @@ def test_closed_holes_count_as_the_closed_ball(ball, tmp_path):
 
 
 def test_which_holes_are_closed(ball, tmp_path):
-    """Sizes count after unit and scale; a larger hole and the outer border of a sheet stay open.
+    """Sizes count after unit and scale; a larger hole stays open; new faces have the material beside them.
 
-    Catches a size in the file's unit, a lid over an open sheet, and a fan that takes the first material.
+    Catches a size in the file's unit, and a fan that takes the first material.
     """
     two = [int(f) for f in ball.face_adjacency[200]]
     without(ball, 77, *two).export(tmp_path / "ball.stl")
@@ -164,10 +165,6 @@ def test_which_holes_are_closed(ball, tmp_path):
     for changes in ({}, {"unit": "mm", "scale": 1e-3}, {"scale": 2.0, "close_holes_um": 2.0 * between}):
         body = MeshSample.model_validate(options | changes).build(tmp_path)
         assert check_body(body)["n_holes"] == 1, changes
-    sheet = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0], [4, 4, 1]], [[0, 1, 4], [1, 2, 4], [2, 3, 4]])
-    sheet.export(tmp_path / "sheet.stl")
-    body = MeshSample(file="sheet.stl", unit="um", close_holes_um=1000.0).build(tmp_path)
-    assert len(body.faces) == 3
     lines = [*(f"v {a} {b} {c}" for a, b, c in ball.vertices), "g low"]
     low = ball.triangles_center[:, 2] < RADIUS
     faces = np.concatenate([ball.faces[low], ball.faces[~low & (np.arange(len(ball.faces)) != facing_up(ball, 1)[0])]])
@@ -181,6 +178,35 @@ def test_which_holes_are_closed(ball, tmp_path):
     ball.invert()
     with pytest.raises(InputFileError, match=r"set sample\.flip_normals = true"):
         MeshSample(file="inside.stl", unit="um", close_holes_um=30.0).build(tmp_path)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, 90.0, 0.0)])
+def test_outer_border_and_rim(turn, tmp_path):
+    """The border of a sheet with an uneven edge is no hole, whatever its size; the rim of an open cup is one.
+
+    The sheet lacks its corners, as an export of heights may: its border leaves the sides of the bounding box. A box that
+    lacks a side has a hole on that side. Catches a lid below a sheet, a cup that is left open, and an axis of the file
+    taken for the vertical.
+    """
+    back = np.linalg.inv(rotation_matrix(turn))
+    n = 7
+    x, y = np.meshgrid(10.0 * np.arange(n), 10.0 * np.arange(n))
+    points = np.column_stack([x.ravel(), y.ravel(), 2.0 * np.cos(x.ravel())])
+    at = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (v.ravel() for v in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    cells = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    corners = np.isin(cells, [at[0, 0], at[0, -1], at[-1, 0], at[-1, -1], at[3, 3]]).any(1)
+    cup = trimesh.creation.box((60.0, 60.0, 40.0))
+    side = cup.copy()
+    cup.update_faces(cup.face_normals[:, 2] < 0.5)
+    side.update_faces(side.face_normals[:, 0] < 0.5)
+    solids = [(f"{name}.stl", solid.vertices, solid.faces) for name, solid in (("cup", cup), ("side", side))]
+    for name, vertices, faces in [("sheet.stl", points, cells[~corners]), *solids]:
+        trimesh.Trimesh(vertices @ back.T, faces, process=False).export(tmp_path / name)
+        sample = MeshSample(file=name, unit="um", rotate_deg=turn)
+        assert check_body(sample.build(tmp_path))["n_holes"] == 1
+        closed = check_body(sample.model_copy(update={"close_holes_um": 1000.0}).build(tmp_path))
+        assert closed["n_holes"] == 0 and closed["is_watertight"] == (name != "sheet.stl")
 
 
 def _open(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
