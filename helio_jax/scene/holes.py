@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MAX_TANGLED = 200_000
+"""Largest number of edges of holes that touch, which are parted one by one."""
 BORDER_SHARE = 0.9
 """Smallest extent of a sheet's outer border, as a share of that of the mesh."""
 
@@ -33,21 +35,41 @@ class Edges:
 
 
 @dataclass(frozen=True)
-class Hole:
-    """A hole of a mesh.
+class Holes:
+    """Holes of a mesh, the largest first, in the unit of its vertices.
 
     Attributes:
-        center: middle of its border [3].
-        size: largest extent of its border along an axis, in the unit of the vertices.
-        edges: its open edges, as indices into those given to `find_holes` [n].
-        is_loop: its border is one closed line, so that a fan of triangles closes it; not where neighbouring faces are
-            wound in opposite senses.
+        of_edge: hole of each open edge given to `find_holes` [k].
+        n_edges: number of edges of each hole [h].
+        center: middle of its border [h, 3].
+        extent: of its border along each axis [h, 3].
+        area: vector area of its border, half the sum of a x b over its edges [h, 3].
+        is_loop: its border is one closed line, so that a fan of triangles closes it [h].
     """
 
+    of_edge: np.ndarray
+    n_edges: np.ndarray
     center: np.ndarray
-    size: float
-    edges: np.ndarray
-    is_loop: bool
+    extent: np.ndarray
+    area: np.ndarray
+    is_loop: np.ndarray
+
+    @property
+    def size(self) -> np.ndarray:
+        """Largest extent of each hole along an axis [h]."""
+        return self.extent.max(1)
+
+    def face_up(self, up: np.ndarray) -> np.ndarray:
+        """Whether the sheet within the border faces up; False of holes in such a sheet, of the rim of an open cup [h].
+
+        Args:
+            up: unit vector away from the substrate [3].
+        """
+        return self.area @ up > 1e-6 * self.size**2
+
+    def are_wide(self, across: np.ndarray) -> np.ndarray:
+        """Whether a border is nearly as wide as the mesh, `across` [3], along two axes [h]."""
+        return np.sum(self.extent >= BORDER_SHARE * across, axis=1) >= 2
 
 
 def find_edges(faces: np.ndarray) -> Edges:
@@ -58,8 +80,8 @@ def find_edges(faces: np.ndarray) -> Edges:
     return Edges(ends[first], first // 3, n_uses)
 
 
-def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
-    """Group open edges to holes, the largest first; holes that touch at a vertex are parted.
+def find_holes(vertices: np.ndarray, ends: np.ndarray) -> Holes:
+    """Group open edges to holes; holes that touch at a vertex are parted.
 
     Args:
         vertices: positions [n, 3].
@@ -69,26 +91,40 @@ def find_holes(vertices: np.ndarray, ends: np.ndarray) -> list[Hole]:
     from scipy.sparse.csgraph import connected_components
 
     if not len(ends):
-        return []
+        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
+        return Holes(none, none, nowhere, nowhere, nowhere, np.zeros(0, bool))
     used, index = np.unique(ends, return_inverse=True)
     index = index.reshape(ends.shape)
     size = len(used)
     joined = coo_array((np.ones(len(ends)), (index[:, 0], index[:, 1])), shape=(size, size))
     n_holes, of_vertex = connected_components(joined, directed=False)
     n_out, n_in = np.bincount(index[:, 0], minlength=size), np.bincount(index[:, 1], minlength=size)
-    is_balanced, is_simple = (
-        np.bincount(of_vertex[bad], minlength=n_holes) == 0 for bad in (n_out != n_in, n_out != 1)
-    )
-    group = of_vertex[index[:, 0]]
-    order = np.argsort(group, kind="stable")
-    holes = []
-    for hole, edges in enumerate(np.split(order, np.searchsorted(group[order], np.arange(1, n_holes)))):
-        parted = [edges] if is_simple[hole] or not is_balanced[hole] else [edges[k] for k in _loops(index[edges])]
-        for border in parted:
-            points = vertices[np.unique(ends[border])]
-            size_of = float(np.ptp(points, axis=0).max())
-            holes.append(Hole(points.mean(0), size_of, border, bool(is_balanced[hole])))
-    return sorted(holes, key=lambda hole: -hole.size)
+    balanced, simple = (np.bincount(of_vertex[bad], minlength=n_holes) == 0 for bad in (n_out != n_in, n_out != 1))
+    of_edge = of_vertex[index[:, 0]]
+    tangled = np.flatnonzero((balanced & ~simple)[of_edge])
+    if len(tangled) <= MAX_TANGLED:
+        for k, loop in enumerate(_loops(index[tangled])):
+            of_edge[tangled[loop]] = n_holes + k
+        balanced = np.append(balanced, np.ones(len(tangled), bool))
+    else:
+        balanced &= simple
+    kept, of_edge = np.unique(of_edge, return_inverse=True)
+    return _measure(vertices[ends], of_edge.reshape(-1), balanced[kept])
+
+
+def _measure(places: np.ndarray, of_edge: np.ndarray, is_loop: np.ndarray) -> Holes:
+    """Compute extent, middle and area of holes from the ends of their edges [k, 2, 3]; sort the holes by size."""
+    order = np.argsort(of_edge, kind="stable")
+    first = np.searchsorted(of_edge[order], np.arange(len(is_loop)))
+    a, b = places[order, 0], places[order, 1]
+    n_edges = np.diff(first, append=len(order))
+    extent = np.maximum.reduceat(np.maximum(a, b), first) - np.minimum.reduceat(np.minimum(a, b), first)
+    center = np.add.reduceat(0.5 * (a + b), first) / n_edges[:, None]
+    middle = np.repeat(center, n_edges, axis=0)
+    area = 0.5 * np.add.reduceat(np.cross(a - middle, b - middle), first)
+    by_size = np.argsort(-extent.max(1), kind="stable")
+    rank = np.argsort(by_size)
+    return Holes(rank[of_edge], *(v[by_size] for v in (n_edges, center, extent, area, is_loop)))
 
 
 def _loops(ends: np.ndarray) -> list[np.ndarray]:
@@ -114,30 +150,9 @@ def _loops(ends: np.ndarray) -> list[np.ndarray]:
     return loops
 
 
-def faces_up(vertices: np.ndarray, border: np.ndarray, up: np.ndarray) -> bool:
-    """Whether the sheet within a border faces up; False of a hole in such a sheet and of the rim of an open cup.
-
-    The vector area of the border, half the sum of a x b over its edges, then points up.
-
-    Args:
-        vertices: positions [n, 3].
-        border: the two vertices of each edge, in the order of its face [k, 2].
-        up: unit vector away from the substrate [3].
-    """
-    a, b = np.moveaxis(vertices[border], 1, 0)
-    middle = a.mean(0)
-    area = 0.5 * np.cross(a - middle, b - middle).sum(0)
-    return float(area @ up) > 1e-6 * float(np.ptp(a, axis=0).max()) ** 2
-
-
-def is_wide(vertices: np.ndarray, border: np.ndarray, across: np.ndarray) -> bool:
-    """Whether a border [k, 2] is nearly as wide as the mesh, `across` [3], along two axes."""
-    return int(np.sum(np.ptp(vertices[border[:, 0]], axis=0) >= BORDER_SHARE * across)) >= 2
-
-
 def close_holes(
     vertices: np.ndarray, faces: np.ndarray, parts: np.ndarray, largest: float, up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Hole]]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Close holes by a fan of triangles about the middle of each.
 
     Where a flat face is missing, the fan is that face. The true surface in a hole is unknown: the fan is right to about
@@ -150,20 +165,19 @@ def close_holes(
 
     Returns:
         The same with one vertex for each closed hole and one face for each of its edges, which belongs to the part of
-        the face beside it; and the closed holes.
+        the face beside it; and the sizes of the closed holes, the largest first [c].
     """
     edges = find_edges(faces)
     ends, beside = edges.ends[edges.is_open], edges.face[edges.is_open]
-    across = np.ptp(vertices[faces].reshape(-1, 3), axis=0)
-    closed, new_faces, new_parts = [], [faces], [parts]
-    for hole in find_holes(vertices, ends):
-        border = ends[hole.edges]
-        is_outer = is_wide(vertices, border, across) and faces_up(vertices, border, up)
-        if hole.size > largest or not hole.is_loop or is_outer:
-            continue
-        middle = np.full(len(border), len(vertices) + len(closed))
-        new_faces.append(np.column_stack([border[:, ::-1], middle]))
-        new_parts.append(parts[beside[hole.edges]])
-        closed.append(hole)
-    middles = [hole.center[None] for hole in closed]
-    return np.concatenate([vertices, *middles]), np.concatenate(new_faces), np.concatenate(new_parts), closed
+    holes = find_holes(vertices, ends)
+    is_outer = holes.are_wide(np.ptp(vertices[faces].reshape(-1, 3), axis=0)) & holes.face_up(up)
+    closed = holes.is_loop & (holes.size <= largest) & ~is_outer
+    use = closed[holes.of_edge]
+    middle = len(vertices) + np.cumsum(closed) - 1
+    fans = np.column_stack([ends[use][:, ::-1], middle[holes.of_edge[use]]])
+    return (
+        np.concatenate([vertices, holes.center[closed]]),
+        np.concatenate([faces, fans]),
+        np.concatenate([parts, parts[beside[use]]]),
+        holes.size[closed],
+    )

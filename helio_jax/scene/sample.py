@@ -15,7 +15,7 @@ from helio_jax.errors import InputFileError
 from helio_jax.scene import surfaces
 from helio_jax.scene.body import Body
 from helio_jax.scene.files import read_bytes
-from helio_jax.scene.holes import Hole, close_holes, faces_up, find_edges, find_holes, is_wide
+from helio_jax.scene.holes import close_holes, find_edges, find_holes
 from helio_jax.scene.maps import HeightMapSample, ReconstructionSample
 from helio_jax.scene.meshes import check_outside, load_mesh
 from helio_jax.scene.mtl import FileLaw, mtl_files, used_laws
@@ -78,14 +78,14 @@ class MeshSample(MaterialSample):
         two_sided = np.full(len(faces), self.two_sided)
         return Body(vertices, faces, materials=names, face_material=index, is_two_sided=two_sided)
 
-    def _read(self, base_dir: Path, own: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Hole]]:
-        """Read the mesh, mirror it and close its holes; return vertices, faces, parts as `load_mesh`, closed holes."""
+    def _read(self, base_dir: Path, own: tuple[str, ...] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Read the mesh, mirror it, close holes; return the mesh as `load_mesh`, and the sizes of closed holes."""
         path, flip = base_dir / self.file, self.flip_normals
         vertices, faces, parts = load_mesh(path, self.max_file_mb, tuple(self.materials), own, flip=flip)
         if self.mirror != "none":  # which turns the outside of every face in
             vertices, faces = vertices * np.where(np.array(["x", "y", "z"]) == self.mirror, -1.0, 1.0), faces[:, ::-1]
         if self.close_holes_um is None:
-            return vertices, faces, parts, []
+            return vertices, faces, parts, np.zeros(0)
         up = rotation_matrix(self.rotate_deg)[2]
         vertices, faces, parts, closed = close_holes(vertices, faces, parts, self.close_holes_um / self._unit_um, up)
         check_outside(path, vertices, faces, flip=flip)
@@ -119,7 +119,7 @@ class MeshSample(MaterialSample):
         ]
         if self.close_holes_um is not None:
             closed = self._read(base_dir)[-1]
-            sizes = f"; the largest is {closed[0].size * self._unit_um:.4g} um across" if closed else ""
+            sizes = f"; the largest is {closed[0] * self._unit_um:.4g} um across" if len(closed) else ""
             what = "1 hole is closed" if len(closed) == 1 else f"{len(closed)} holes are closed"
             out.append(f"{path.name}: {what} (sample.close_holes_um){sizes}")
         return out
@@ -207,9 +207,9 @@ def check_body(body: Body, untilted: Body | None = None, *, has_substrate: bool 
     """Report on a body's triangles, for `helio validate` (JSON-compatible).
 
     An open sheet that faces up is allowed: a substrate with structure is open along its outer border, which lies on the
-    sides of the bounding box or is a line around all of it. `n_inner_open_edges` counts the other open edges of one-sided faces,
-    where rays would leak; `n_holes` the holes
-    that they form, `holes` the largest of these: middle [um], size [um], number of edges.
+    sides of the bounding box or is a line around all of it. `n_inner_open_edges` counts the other open edges of
+    one-sided faces, where rays would leak; `n_holes` the holes that they form, `holes` the largest of these: middle
+    [um], size [um], number of edges.
 
     Args:
         body: after placement.
@@ -229,10 +229,9 @@ def check_body(body: Body, untilted: Body | None = None, *, has_substrate: bool 
     for axis in (0, 1):
         for side in (low, high):
             on_side |= np.all(np.abs(places[..., axis] - side[axis]) <= near, axis=1)
-    is_border, across = np.zeros(len(places), bool), np.ptp(body.triangles.reshape(-1, 3), axis=0)
-    for hole in find_holes(body.vertices, ends):
-        if faces_up(body.vertices, border := ends[hole.edges], np.array([0.0, 0.0, 1.0])):
-            is_border[hole.edges] = on_side[hole.edges] | is_wide(body.vertices, border, across)
+    borders, across = find_holes(body.vertices, ends), np.ptp(body.triangles.reshape(-1, 3), axis=0)
+    is_up, is_wide = borders.face_up(np.array([0.0, 0.0, 1.0])), borders.are_wide(across)
+    is_border = is_up[borders.of_edge] & (on_side | is_wide[borders.of_edge])
     stands = np.all(np.abs(places[..., 2]) <= near, axis=1) & has_substrate
     leaks = ends[~(is_border | stands | body.is_two_sided[beside])]
     holes = find_holes(body.vertices, leaks)
@@ -248,10 +247,15 @@ def check_body(body: Body, untilted: Body | None = None, *, has_substrate: bool 
         "n_two_sided_faces": int(np.sum(body.is_two_sided)),
         "n_open_edges": len(ends),
         "n_inner_open_edges": len(leaks),
-        "n_holes": len(holes),
+        "n_holes": len(holes.size),
         "holes": [
-            {"middle_um": hole.center.round(4).tolist(), "size_um": round(hole.size, 4), "n_edges": len(hole.edges)}
-            for hole in holes[:MAX_PLACES]
+            {"middle_um": middle, "size_um": size, "n_edges": n_edges}
+            for middle, size, n_edges in zip(
+                holes.center[:MAX_PLACES].round(4).tolist(),
+                holes.size[:MAX_PLACES].round(4).tolist(),
+                holes.n_edges[:MAX_PLACES].tolist(),
+                strict=True,
+            )
         ],
         "n_edges_of_three_faces": int(np.sum(edges.n_uses > 2)),
         "n_faces_without_area": int(np.sum(~np.any(body.normals, axis=1))),

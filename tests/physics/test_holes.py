@@ -114,15 +114,15 @@ def test_holes_that_touch_are_parted(ball):
     around = ball.vertex_faces[ball.faces[first][0]]
     touching = next(f for f in around if f >= 0 and len(set(ball.faces[f]) & set(ball.faces[first])) == 1)
     holes = find_holes(*_open(without(ball, first, int(touching))))
-    assert [(len(hole.edges), hole.is_loop) for hole in holes] == [(3, True)] * 2
+    assert holes.n_edges.tolist() == [3, 3] and holes.is_loop.all()
     some = np.random.default_rng(1).choice(len(ball.faces), 300, replace=False)
     open_ball = without(ball, *some)
     holes = find_holes(*_open(open_ball))
-    assert sorted(np.concatenate([hole.edges for hole in holes])) == list(range(len(_open(open_ball)[1])))
+    assert holes.is_loop.all() and holes.n_edges.sum() == len(_open(open_ball)[1])
     mesh = np.asarray(open_ball.vertices), np.asarray(open_ball.faces)
     vertices, faces, _, closed = close_holes(*mesh, np.zeros(len(mesh[1]), int), RADIUS, np.array([0.0, 0.0, 1.0]))
     mended = trimesh.Trimesh(vertices, faces, process=False)
-    assert mended.is_watertight and mended.is_winding_consistent and len(closed) == len(holes)
+    assert mended.is_watertight and mended.is_winding_consistent and len(closed) == len(holes.size)
     assert mended.volume == pytest.approx(ball.volume, rel=1e-2)
 
 
@@ -159,8 +159,7 @@ def test_which_holes_are_closed(ball, tmp_path):
     """
     two = [int(f) for f in ball.face_adjacency[200]]
     without(ball, 77, *two).export(tmp_path / "ball.stl")
-    sizes = [hole.size for hole in find_holes(*_open(without(ball, 77, *two)))]
-    between = 0.5 * (sizes[0] + sizes[1])
+    between = float(find_holes(*_open(without(ball, 77, *two))).size.mean())
     options = {"file": "ball.stl", "unit": "um", "close_holes_um": between}
     for changes in ({}, {"unit": "mm", "scale": 1e-3}, {"scale": 2.0, "close_holes_um": 2.0 * between}):
         body = MeshSample.model_validate(options | changes).build(tmp_path)
@@ -180,13 +179,13 @@ def test_which_holes_are_closed(ball, tmp_path):
         MeshSample(file="inside.stl", unit="um", close_holes_um=30.0).build(tmp_path)
 
 
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, 90.0, 0.0)])
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, 90.0, 0.0)])
 def test_outer_border_and_rim(turn, tmp_path):
     """The border of a sheet with an uneven edge is no hole, whatever its size; the rim of an open cup is one.
 
-    The sheet lacks its corners, as an export of heights may: its border leaves the sides of the bounding box. A box that
-    lacks a side has a hole on that side. Catches a lid below a sheet, a cup that is left open, and an axis of the file
-    taken for the vertical.
+    The sheet lacks its corners, as an export of heights may: its border leaves the sides of the bounding box. A box
+    without a side has a hole there. Catches a lid below a sheet, a cup that is left open, and an axis of the file taken
+    for the vertical.
     """
     back = np.linalg.inv(rotation_matrix(turn))
     n = 7
