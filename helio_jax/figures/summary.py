@@ -54,7 +54,10 @@ def text_lines(rows: Rows) -> list[str]:
 def hole_lines(body: dict[str, Any]) -> list[str]:
     """Write where the holes of a sample's mesh are, and what to do (`scene.sample.check_body`)."""
     if not body["n_holes"]:
-        open_edges = "open edges: all on the outer border, on the substrate or of two-sided faces: no ray leaks there"
+        open_edges = (
+            "open edges: no ray leaks there: outer border of a sheet (a substrate is open by design), foot of a "
+        )
+        open_edges += "mesh on the substrate, or two-sided faces"
         return [open_edges] if body["n_open_edges"] else []
     largest = body["holes"][0]["size_um"]
     out = [

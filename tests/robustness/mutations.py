@@ -178,7 +178,7 @@ def readers() -> dict[str, Callable[[Path], object]]:
         instrument = instrument or load_instrument(path.with_name("instrument.toml"), CHANNELS)
         return import_micrographs(path, instrument)
 
-    special = {
+    special: dict[str, Callable[[Path], object]] = {
         "scene.toml": check_file, "instrument.toml": check_file, "manifest.json": manifest, "part.npz": part,
         "rays.npz": read_rays, "rays.npy": read_rays, "rays.csv": read_rays, "positions.csv": read_positions,
         "grid.csv": lambda path: read_height_map(path, 1.0, 5.0), "scattering.csv": read_scattering_table,
