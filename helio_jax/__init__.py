@@ -39,6 +39,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   scene               Scene: instrument, sample and scan, checked against each other
   sample              the [sample] table by kind; mesh samples
   meshes              reads mesh files (STL, OBJ, PLY, GLB)
+  holes               holes of a mesh; closes small ones
   shapes              samples from numbers: flat, spheres, step, trench, pyramid
   rough               random rough samples
   maps                samples from height maps and reconstructions
@@ -309,6 +310,7 @@ workflows/            what joins the stages
   doctor              checks the installation
 commands/             the command line; no logic of its own
   app                 shared options and messages
+  group               the group of all commands; makes each when it is asked for
   door                checks outputs against inputs before any work
   interrupts          Ctrl-C at any moment
   log                 the log file of a command (--log)

@@ -18,7 +18,6 @@ try:
     from helio_jax.commands.app import app, say
     from helio_jax.commands.interrupts import INTERRUPTED, not_lost
     from helio_jax.errors import HelioError
-    from helio_jax.workflows.compilation_cache import keep_compiled
 except KeyboardInterrupt:  # before anything was begun
     sys.exit(130)
 
@@ -29,7 +28,6 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 def main(args: list[str] | None = None) -> None:
     """Run the command line and end the process with an exit code of errors.py."""
     try:
-        keep_compiled()
         with not_lost():
             app(args=args, standalone_mode=True)
     except HelioError as e:

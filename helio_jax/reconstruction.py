@@ -31,7 +31,8 @@ class Reconstruction(OnRaster):
         albedo: relative reflectivity, substrate = 1 [y, x].
         height_std: standard deviation of each height [y, x], um, or None if the method gives none.
         height_samples: joint posterior deviations of all heights [sample, y, x], um, or None; see `spread`.
-        is_valid: True where the height may be trusted, by `validity.VALID_RULE` [y, x].
+        is_valid: True where the height may be trusted, by `validity.VALID_RULE` [y, x]; a height that is not finite
+            never is.
         reason: index into `validity.REASONS` [y, x].
         residuals: (data - model) / standard deviation [detector, y, x].
         chi_square: mean square deviation, in standard deviations, of the data of each pixel and its neighbours from the
@@ -87,6 +88,7 @@ class Reconstruction(OnRaster):
             if value.shape != shape:
                 raise error(f"{name} must have the shape {shape} of the raster, got {value.shape}")
             object.__setattr__(self, name, value.astype(kind))
+        object.__setattr__(self, "is_valid", self.is_valid & np.isfinite(self.height))
         if self.reason.max(initial=0) >= len(REASONS):
             raise error(f"reason must be < {len(REASONS)}, got {self.reason.max()}")
         own = {CONTRADICTED: self.is_contradicted, NONE_VALID: not self.is_valid.any()}
@@ -134,7 +136,7 @@ class Reconstruction(OnRaster):
     @property
     def valid_share(self) -> float:
         """Share of the pixels with a valid height."""
-        return float(np.mean(self.is_valid & np.isfinite(self.height)))
+        return float(np.mean(self.is_valid))
 
     @property
     def trust(self) -> dict[str, Any]:

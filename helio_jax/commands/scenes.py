@@ -76,7 +76,7 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
-    from helio_jax.figures.summary import text_lines
+    from helio_jax.figures.summary import hole_lines, text_lines
     from helio_jax.workflows.validate import check_file
 
     found = check_file(file, scene_overrides(changes))
@@ -84,15 +84,11 @@ def validate(
         print(json.dumps(asdict(found)))
         return
     print("\n".join(text_lines(found.about)))
-    for key, value in (found.body or {}).items():
-        print(f"  {key}: {value}") if key != "holes_um" else None
-    if found.body and found.body["n_open_edges"] and not found.body["n_inner_open_edges"]:
-        print("  open edges: all on the outer border; a substrate with structure is an open surface by design")
-    if found.body and (holes := found.body["holes_um"]):
-        print("  rays leak at open edges within the sample: close the mesh there (the first ones, x, y, z in um):")
-        print("\n".join(f"    {x:g}, {y:g}, {z:g}" for x, y, z in holes))
-    for key, value in (found.plate or {}).items():
-        print(f"  plate {key}: {value}")
+    for label, body in (("", found.body or {}), ("plate ", found.plate or {})):
+        for key, value in body.items():
+            print(f"  {label}{key}: {value}") if key != "holes" else None
+    for text in hole_lines(found.body) if found.body else []:
+        print(f"  {text}")
     for text in found.replaced:
         print(f"  {text}")
     for warning in found.warnings:

@@ -132,7 +132,7 @@ def _warn_of_scene(scene: Path, overrides: dict[str, Any]) -> None:
     from helio_jax.workflows.scene_warnings import scene_warnings
 
     loaded = load_scene(scene, overrides)
-    for text in scene_warnings(loaded, loaded.build_body()):
+    for text in (*loaded.warnings(), *scene_warnings(loaded, loaded.build_body())):
         say(f"warning: {text}")
 
 

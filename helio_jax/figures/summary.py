@@ -51,6 +51,26 @@ def text_lines(rows: Rows) -> list[str]:
     return [f"  {label:<{width}}  {text}" for label, text in rows]
 
 
+def hole_lines(body: dict[str, Any]) -> list[str]:
+    """Write where the holes of a sample's mesh are, and what to do (`scene.sample.check_body`)."""
+    if not body["n_holes"]:
+        open_edges = (
+            "open edges: no ray leaks there: outer border of a sheet (a substrate is open by design), foot of a "
+        )
+        open_edges += "mesh on the substrate, or two-sided faces"
+        return [open_edges] if body["n_open_edges"] else []
+    largest = body["holes"][0]["size_um"]
+    out = [
+        f"rays leak through {plural(body['n_holes'], 'hole')}: close them in the mesh, or set sample.close_holes_um "
+        f"(the largest is {largest:g} um across); a sheet without thickness needs sample.two_sided = true"
+    ]
+    for hole in body["holes"]:
+        place = ", ".join(f"{v:g}" for v in hole["middle_um"])
+        out.append(f"  hole {hole['size_um']:g} um across, middle at {place} um, {hole['n_edges']} edges")
+    n_more = body["n_holes"] - len(body["holes"])
+    return [*out, f"  and {n_more} smaller"] if n_more else out
+
+
 def aims(instrument: Instrument) -> list[str]:
     """Write where each detector's opening lies, e.g. polar 30 deg, azimuth 120 deg."""
     found = [detector.aim(instrument.working_distance) for detector in instrument.detector]

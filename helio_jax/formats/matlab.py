@@ -201,7 +201,8 @@ def _find_kind(path: str, tree: dict[str, Any]) -> str:
     found = ", ".join(list(tree)[:10]) or "none"
     raise InputFileError(
         f"{path} holds no known micrographs: neither im.single and im.multiple (reference simulator) nor "
-        f"meas_list.image (B-SHeM, A-SHeM); its variables: {found}"
+        f"meas_list.image (B-SHeM, A-SHeM); its variables: {found}: read them yourself into a MicrographStack "
+        "(docs/howto_mat.md)"
     )
 
 

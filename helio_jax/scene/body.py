@@ -26,6 +26,7 @@ class Body:
         spheres: x, y, z of the centre and radius [s, 4], um; intersected analytically.
         materials: names of the materials.
         face_material, sphere_material: index into `materials` of each face [m] and sphere [s]; default: the first.
+        is_two_sided: True where atoms scatter from both sides of a face [m]; default: nowhere.
     """
 
     vertices: np.ndarray
@@ -34,6 +35,7 @@ class Body:
     materials: tuple[str, ...] = (COSINE,)
     face_material: np.ndarray = field(default=None)  # type: ignore[assignment]
     sphere_material: np.ndarray = field(default=None)  # type: ignore[assignment]
+    is_two_sided: np.ndarray = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         set_float_arrays(self, {"vertices": (None, 3), "spheres": (None, 4)}, SceneError)
@@ -54,6 +56,15 @@ class Body:
             if index.shape != (n,) or (n and not 0 <= index.min() <= index.max() < len(self.materials)):
                 raise SceneError(f"{name} must be {n} indices of the {len(self.materials)} materials, got {index!r}")
             object.__setattr__(self, name, index)
+        both = np.zeros(len(self.faces), bool) if self.is_two_sided is None else np.asarray(self.is_two_sided, bool)
+        if both.shape != (len(self.faces),):
+            raise SceneError(f"is_two_sided must be one of each of the {len(self.faces)} faces, got {both.shape}")
+        object.__setattr__(self, "is_two_sided", both)
+
+    def with_faces(self, keep: np.ndarray) -> "Body":
+        """Return the body with those faces only (mask or indices), with all its vertices and spheres."""
+        kept = {name: getattr(self, name)[keep] for name in ("faces", "face_material", "is_two_sided")}
+        return replace(self, **kept)
 
     def with_material(self, face: str, sphere: Sequence[str] = ()) -> "Body":
         """Return the body with one material on all faces, and one per sphere (default: that of the faces)."""
@@ -85,6 +96,7 @@ class Body:
             names,
             np.concatenate([m[body.face_material] for m, body in zip(maps, bodies, strict=True)]),
             np.concatenate([m[body.sphere_material] for m, body in zip(maps, bodies, strict=True)]),
+            np.concatenate([body.is_two_sided for body in bodies]),
         )
 
     @property

@@ -98,12 +98,24 @@ def parse_mesh(path: Path, names: list[str], own: list[str], flip: bool) -> Mesh
     clean.update_faces(has_area)
     if not len(clean.faces):
         raise InputFileError(f"{path}: no triangle of the mesh has an area: the file is corrupt or its unit is wrong")
-    if clean.is_watertight and clean.volume < 0:
+    check_outside(path, clean.vertices, clean.faces, flip=flip)
+    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
+
+
+def check_outside(path: Path, vertices: np.ndarray, faces: np.ndarray, *, flip: bool) -> None:
+    """Refuse a closed mesh (vertices [n, 3], faces [m, 3]) that is inside out.
+
+    Raises:
+        InputFileError: its volume is negative.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if mesh.is_watertight and mesh.volume < 0:
         raise InputFileError(
             f"{path}: the mesh is inside out (volume < 0): set sample.flip_normals = {'false' if flip else 'true'}, or "
             "flip its normals in the program that made it"
         )
-    return np.asarray(clean.vertices, np.float64), np.asarray(clean.faces, np.int64), parts[has_area]
 
 
 def _check_number(path: Path, n_faces: int) -> None:

@@ -4,7 +4,6 @@ Plate frame: x, y of the lab, z = 0 in the plane of the pinhole, z up, um; the w
 moves it with the beam (trace/meshplate.py).
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,4 +66,4 @@ def read_plate(plate: Plate, detectors: tuple[Detector, ...], base_dir: Path = P
 
 def check_solid(body: Body) -> dict:
     """Report on the faces of a plate that do not detect atoms, as `check_body`."""
-    return check_body(replace(body, faces=body.faces[body.face_material == 0], face_material=None))
+    return check_body(body.with_faces(body.face_material == 0))

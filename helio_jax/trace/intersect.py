@@ -30,7 +30,7 @@ class Hits:
         point: hit points [n, 3] [um] (undefined for misses).
         normal: unit normals, outward [n, 3].
         surface: surface hit [n] (see `MISS`).
-        is_back: True where the surface was hit from inside: a hole in the mesh, or inverted normals [n].
+        is_back: True where a one-sided surface was hit from inside: a hole in the mesh, or inverted normals [n].
     """
 
     point: np.ndarray
@@ -88,7 +88,8 @@ def _scale_rays(origins, directions, center, inverse_size, o32, d32):
 def resolve_hit(origins, directions, i, skip, face, u, v, facets, spheres, points, normals, j):
     """Find the nearest of triangle `face` (or -1) and the spheres on ray `i`; return `surface` and `is_back`.
 
-    Writes point and normal to row `j`. `facets` [triangle, 12] holds corners and normals. Arguments are whole arrays
+    Writes point and normal to row `j`. `facets` [triangle, 13] holds corners, normals, and 1 where atoms scatter from
+    both sides: then the normal of a face that is hit from behind is reversed. Arguments are whole arrays
     and indices because numba counts the references of each row that is passed, which took a third of the time.
     """
     t_face, surface = np.inf, -1
@@ -107,7 +108,12 @@ def resolve_hit(origins, directions, i, skip, face, u, v, facets, spheres, point
             points[j, k] = origins[i, k] + t * directions[i, k]
             normals[j, k] = (points[j, k] - spheres[s, k]) / spheres[s, 3]
     cosine = normals[j, 0] * directions[i, 0] + normals[j, 1] * directions[i, 1] + normals[j, 2] * directions[i, 2]
-    return surface, surface != -1 and cosine > 0.0
+    is_back = surface != -1 and cosine > 0.0
+    if is_back and surface >= 0 and facets[surface, 12] > 0.0:
+        is_back = False
+        for k in range(3):
+            normals[j, k] = -normals[j, k]
+    return surface, is_back
 
 
 @kernel
@@ -180,7 +186,8 @@ class Intersector:
         has_area = length > 0
         self.triangles = np.ascontiguousarray(self.triangles[has_area])
         self.normals = cross[has_area] / length[has_area, None]
-        self.facets = np.concatenate([corners[has_area].reshape(-1, 9), self.normals], 1)
+        both = body.is_two_sided[has_area]
+        self.facets = np.concatenate([corners[has_area].reshape(-1, 9), self.normals, both[:, None]], 1)
         self.materials, self._sphere_material = body.materials, body.sphere_material
         self._face_material = body.face_material[has_area]
         self._set_scale()

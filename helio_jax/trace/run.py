@@ -203,7 +203,9 @@ def check_rays(fates: np.ndarray, n_unaccounted: int, n_launched: int, max_lost:
     if lost > max_lost * n_launched:
         raise GuardError(
             f"{lost} of {n_launched} rays ({lost / n_launched:.2%}, limit {max_lost:.2%}) met a surface from behind: "
-            "the mesh has holes or inverted normals; repair it (helio validate SCENE shows where)"
+            "the mesh has holes or inverted normals (helio validate SCENE shows where): repair it, close small holes "
+            "by sample.close_holes_um, or reverse it by sample.flip_normals; a sheet without thickness needs "
+            "sample.two_sided"
         )
 
 

@@ -5,6 +5,7 @@ import os
 import re
 import textwrap
 import zipfile
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from helio_jax.figures.summary import Rows, summarise
 from helio_jax.figures.wording import plural
 from helio_jax.formats import hdf5
 from helio_jax.formats.matlab import describe_matlab
-from helio_jax.formats.points import HEADER, read_points
+from helio_jax.formats.points import HEADER, read_points, read_rows
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.body import Body
@@ -30,8 +31,10 @@ from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import load_study
 
 TABLES = (".csv", ".tsv", ".txt")
-_MANY = 12
-"""A table with more columns is a grid."""
+_MANY = 10
+"""Most columns whose contents are shown."""
+_MANY_WORDS = 5
+"""Most frequent words of a column that are shown."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,10 @@ def _of_mesh(path: Path) -> Found:
     rows += [("size", f"{sides} in the file's unit (sample.unit in a scene)"), ("extent", place)]
     closed = "yes" if found["is_watertight"] else f"no: {found['n_inner_open_edges']} open edges within"
     rows.append(("closed", f"{closed}; {found['n_open_edges'] - found['n_inner_open_edges']} on its outer border"))
+    for hole in found["holes"][:1]:
+        middle = ", ".join(f"{v:.6g}" for v in hole["middle_um"])
+        size = f"the largest is {hole['size_um']:.6g} across, middle at {middle}"
+        rows.append(("holes", f"{found['n_holes']}; {size} (a scene closes small ones: sample.close_holes_um)"))
     faults = {"n_edges_of_three_faces": "edges of three faces", "n_duplicate_faces": "faces given twice"}
     shown = [f"{found[key]} {words}" for key, words in faults.items() if found[key]]
     if not found["is_winding_consistent"]:
@@ -167,8 +174,8 @@ def _of_npz(path: Path) -> Found:
     try:
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
-    except zipfile.BadZipFile as e:
-        raise InputFileError(f"{path}: is not a readable .npz file: {e}") from None
+    except Exception as e:  # zipfile raises many kinds on corrupt files
+        raise InputFileError(f"{path}: is not a readable .npz file: {e}; write it again") from None
     if {"x", "y", "height"} <= sizes.keys():
         rows = summarise(read_height_map(path, 1.0, None))
         return "height map", [*rows, ("unit", "um is assumed here; a scene states it (sample.unit)")], {"arrays": sizes}
@@ -210,26 +217,59 @@ def _of_table(path: Path) -> Found:
         views = read_points(path)
         rows = [(view, ", ".join(points)) for view, points in views.items()]
         return "control points", rows, {"points": views}
-    has_names = re.search(r"[A-Za-z_]{2}", first) is not None and not first.lstrip().startswith("#")
+    words = re.sub(r"(?i)[-+]?\b(nan|inf|infinity)\b", "", first)  # which are numbers
+    has_names = re.search(r"[A-Za-z_]{2}", words) is not None and not first.lstrip().startswith("#")
     separator = "," if path.suffix.lower() == ".csv" else None
     titles = first.replace(" ", "") if has_names else ""
-    table = read_table(path, MAX_HEIGHT_MAP_MB, "a table of numbers", separator=separator, titles=titles)
+    try:
+        table = read_table(path, MAX_HEIGHT_MAP_MB, "a table of numbers", separator=separator, titles=titles)
+    except InputFileError:
+        if not (has_names and separator):
+            raise
+        return _of_words(path, names)
     if not table.size:
         raise InputFileError(f"{path}: holds no numbers below its titles: write it again")
     n_rows, n_columns = table.shape
     rows = [("table", f"{n_rows} lines of {plural(n_columns, 'number')}")]
-    if n_columns > _MANY or (not has_names and n_columns > 7):
+    if not has_names and n_columns > 7:
         low, high = float(np.nanmin(table)), float(np.nanmax(table))
         rows.append(("values", f"{low:.6g} to {high:.6g}, {int(np.isnan(table).sum())} missing"))
         return (
             "grid of numbers",
-            [*rows, ("use", "a height map (sample.kind = 'height-map')")],
+            [*rows, ("use", "a height map (sample.kind = 'height_map')")],
             {"shape": [n_rows, n_columns]},
         )
     labels = names if has_names and len(names) == n_columns else [f"column {i + 1}" for i in range(n_columns)]
-    for label, column in zip(labels, table.T, strict=True):
-        rows.append((label, f"{np.nanmin(column):.6g} to {np.nanmax(column):.6g}"))
+    rows += _columns(labels, [f"{np.nanmin(column):.6g} to {np.nanmax(column):.6g}" for column in table.T[:_MANY]])
     uses = {2: "beam positions x, y in um", 3: "a scattering table (theta, phi, intensity)"}
     uses |= {4: "a scattering table (incidence, theta, phi, intensity)", 6: "rays of a beam", 7: "rays with weights"}
     use = [] if has_names and names != ["x_um", "y_um"] else [("use", uses.get(n_columns, "none known"))]
     return "table of numbers", rows + use, {"shape": [n_rows, n_columns], "columns": labels}
+
+
+def _of_words(path: Path, names: list[str]) -> Found:
+    """Find out what a table with columns of words holds, such as those of `helio measure --table`."""
+    lines = [row for _, row in read_rows(path, names)][1:]
+    if not lines:
+        raise InputFileError(f"{path}: holds nothing below its titles: write it again")
+    rows = [("table", f"{plural(len(lines), 'line')} of {plural(len(names), 'column')}")]
+    rows += _columns(names, [_range_or_words(cells) for cells in list(zip(*lines, strict=True))[:_MANY]])
+    return "table", rows, {"shape": [len(lines), len(names)], "columns": names}
+
+
+def _columns(labels: list[str], texts: list[str]) -> Rows:
+    """Label the texts of the first columns, and name the others."""
+    further = [("further columns", ", ".join(labels[_MANY:]))] if len(labels) > _MANY else []
+    return [*zip(labels, texts, strict=False), *further]
+
+
+def _range_or_words(cells: tuple[str, ...]) -> str:
+    """Write the range of numbers, or the most frequent words."""
+    try:
+        numbers = np.array([float(cell) for cell in cells if cell])
+    except ValueError:
+        found = Counter(textwrap.shorten(cell, 40, placeholder=" ...") for cell in cells).most_common(_MANY_WORDS + 1)
+        shown = ", ".join(f"{word or 'nothing'} ({n})" for word, n in found[:_MANY_WORDS])
+        return f"{shown}, ..." if len(found) > _MANY_WORDS else shown
+    known = numbers[np.isfinite(numbers)]
+    return f"{known.min():.6g} to {known.max():.6g}" if known.size else "no number"

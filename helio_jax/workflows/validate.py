@@ -117,4 +117,4 @@ def _check_sample(scene: SceneFile, body: Body) -> dict[str, Any]:
     sample = scene.sample
     stands_on_flat = isinstance(sample, MeshSample) and sample.flat_size_um is not None  # which does not tilt with it
     untilted = sample.build_shape(scene.base_dir) if sample.is_tilted and not stands_on_flat else None
-    return check_body(body, untilted)
+    return check_body(body, untilted, has_substrate=stands_on_flat)

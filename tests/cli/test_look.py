@@ -51,6 +51,10 @@ def folder(tmp_path_factory):
     )
     (out / "positions.csv").write_text("x_um,y_um\n1.5,-2\n4,7\n", encoding="utf-8")
     (out / "grid.txt").write_text("\n".join(" ".join(map(str, range(k, k + 20))) for k in range(5)), encoding="utf-8")
+    (out / "nan.csv").write_text("nan,nan,1,2,3,4,5,6\n" + "0,1,2,3,4,5,6,7\n" * 3, encoding="utf-8")
+    (out / "profile.csv").write_text("height_um,flag\n1,valid\n2.5,valid\n,depth jump\n", encoding="utf-8")
+    wide = ",".join(f"c_{k}" for k in range(12)) + "\n" + 2 * (",".join(map(str, range(12))) + "\n")
+    (out / "wide.csv").write_text(wide, encoding="utf-8")
     write_points(out / "points.csv", {"scan 1": {"P1": (1.0, 2.0)}, "scan 2": {"P1": (0.0, 2.5), "P2": (5.0, 6.0)}})
     (out / "box.mtl").write_text("newmtl steel\nhelio_law cosine\nnewmtl glass\nKd 1 1 1\n", encoding="utf-8")
     np.save(out / "rays.npy", np.zeros((11, 6)))
@@ -188,6 +192,9 @@ def test_wrong_files(folder, monkeypatch, words, code, told):
         ("map.npz", ["height map", "0 to 770 um", "grid 30 x 20 pixels of 20 x 10 um"]),
         ("box.obj", ["4 triangles, 4 vertices", "2 x 3 x 5 in the file's unit", "closed yes"]),
         ("positions.csv", ["2 lines of 2 numbers", "x_um 1.5 to 4", "y_um -2 to 7", "beam positions x, y in um"]),
+        ("profile.csv", ["3 lines of 2 columns", "height_um 1 to 2.5", "flag valid (2), depth jump (1)"]),
+        ("wide.csv", ["2 lines of 12 numbers", "c_1 1 to 1", "further columns c_10, c_11"]),
+        ("nan.csv", ["grid of numbers", "4 lines of 8 numbers", "0 to 7, 2 missing"]),
         ("grid.txt", ["5 lines of 20 numbers", "0 to 23", "a height map"]),
         ("points.csv", ["control points", "scan 2 P1, P2"]),
         ("box.mtl", ["steel cosine", "glass no helio_law"]),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import helio_jax.__main__  # noqa: F401 (registers the commands)
 from helio_jax import MicrographSet, MicrographStack, Reconstruction, write
 from helio_jax.commands.app import app
 from helio_jax.errors import InputFileError, ResumeError
@@ -16,8 +17,6 @@ from helio_jax.workflows.scene_file import load_scene
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """A folder with a stack, a set of two, a height map and a scene."""
-    import helio_jax.__main__  # noqa: F401 (registers the commands)
-
     folder = tmp_path_factory.mktemp("files")
     detector = Detector(name="a", polar_deg=40.0, half_angle_deg=10.0)
     instrument = Instrument(plate=Plate(working_distance_um=3000.0), detector=(detector,))

@@ -117,6 +117,10 @@ def write_originals(folder: Path) -> None:
     angles = np.stack(np.meshgrid([0.0, 45.0, 90.0], [0.0, 90.0, 180.0]), -1).reshape(-1, 2)
     np.savetxt(folder / "scattering.csv", np.column_stack([angles, np.ones(9)]), delimiter=",")
     (folder / "points.csv").write_text("view,point,x_um,y_um\na,p1,0.0,1.0\na,p2,5.0,6.0\nb,p1,1.0,2.0\n")
+    np.savetxt(folder / "grid.tsv", rng.random((6, 14)), delimiter="\t")
+    np.savetxt(folder / "table.txt", rng.random((6, 3)), header="theta phi intensity")
+    anchors = "name,kind,x_um,y_um,height_um,std_um\na,height,10.0,20.0,3.0,0.5\nb,height,5.0,6.0,7.0,\n"
+    (folder / "anchors.csv").write_text(anchors)
     cube = trimesh.creation.box((200.0, 200.0, 100.0))
     for name, options in (("cube.stl", {}), ("cube.glb", {}), ("cube.ply", {}), ("ascii.ply", {"encoding": "ascii"})):
         cube.export(folder / name, **options)
@@ -139,6 +143,7 @@ def write_originals(folder: Path) -> None:
 
 def readers() -> dict[str, Callable[[Path], object]]:
     """Return what reads each file, as the program does it."""
+    from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.parts import Parts
     from helio_jax.instrument import Instrument
     from helio_jax.scene.files import read_height_map, read_positions, read_scattering_table
@@ -173,11 +178,12 @@ def readers() -> dict[str, Callable[[Path], object]]:
         instrument = instrument or load_instrument(path.with_name("instrument.toml"), CHANNELS)
         return import_micrographs(path, instrument)
 
-    special = {
+    special: dict[str, Callable[[Path], object]] = {
         "scene.toml": check_file, "instrument.toml": check_file, "manifest.json": manifest, "part.npz": part,
         "rays.npz": read_rays, "rays.npy": read_rays, "rays.csv": read_rays, "positions.csv": read_positions,
         "grid.csv": lambda path: read_height_map(path, 1.0, 5.0), "scattering.csv": read_scattering_table,
         "cube.mtl": laws, "map.npz": read_any, "plain.mat": matlab, "packed.mat": matlab, "seven.mat": matlab,
+        "anchors.csv": read_anchors,
     }  # fmt: skip
     return special | {"": file_info}
 

@@ -1,4 +1,4 @@
-"""Probable mistakes that show when the sample is built; mirrored and inside-out meshes; places of holes."""
+"""Probable mistakes that show when the sample is built; mirrored and inside-out meshes."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import trimesh
 
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Beam
-from helio_jax.scene.sample import MeshSample, check_body
+from helio_jax.scene.sample import MeshSample
 from helio_jax.scene.scan import Raster
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.scene_warnings import scene_warnings
@@ -86,18 +86,6 @@ def test_mirror_and_flip(scene):
     np.testing.assert_allclose(found.bounds, plain.bounds)
     with pytest.raises(InputFileError, match=r"set sample\.flip_normals = false"):
         solid(flip_normals=True)
-
-
-def test_places_of_holes(tmp_path):
-    """One face of a ball on a substrate is missing: the middles of its edges. Catches places of the outer border."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=100.0)
-    hole = ball.triangles[77]
-    ball.update_faces(np.arange(len(ball.faces)) != 77)
-    ball.export(tmp_path / "ball.stl")
-    found = check_body(MeshSample(file="ball.stl", unit="um", flat_size_um=900.0).build(tmp_path))
-    middles = 0.5 * (hole + np.roll(hole, 1, axis=0))
-    assert found["n_inner_open_edges"] == 3 and found["n_open_edges"] == 7
-    np.testing.assert_allclose(np.sort(found["holes_um"], 0), np.sort(middles, 0), atol=1e-3)
 
 
 def test_pitch_of_rows():
