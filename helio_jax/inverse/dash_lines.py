@@ -37,10 +37,10 @@ _SHIFT = 0.25
 
 
 class Line(NamedTuple):
-    """A straight line in units of pixels, (column, row).
+    """A straight line; lengths in pixels.
 
     Attributes:
-        angle: of the normal, which points to the side whose detectors the line darkens [rad].
+        angle: of the normal, which points to the lower side: along it the masks of the step run [rad].
         offset: distance from the origin along the normal.
         start, end: of the line, along its direction (the normal turned by +90 deg).
     """
@@ -99,47 +99,44 @@ def find_dips(signal: np.ndarray, variance: np.ndarray, lit: np.ndarray, is_expl
     return Dips(dips & counted, counted)
 
 
-def find_line(dips: Dips, v: np.ndarray) -> tuple[Line, float] | None:
-    """Find the line on which chance explains the dips least.
+def find_line(dips: Dips, place: np.ndarray, v: np.ndarray) -> Line | None:
+    """Find the line on which chance explains the dips least, if it is below `FALSE_ALARMS`.
+
+    The dips of other places are how frequent chance makes them. On a line count dips of the detectors that a step along
+    it masks, in pixels where no other detector's signal dips: a groove darkens both.
 
     Args:
         dips: isolated dark pixels.
-        v: direction of each detector plus beam shift, in pixels [detector, 2].
-
-    Returns:
-        The line, and the expected number of lines that chance makes of as many dips; None if none is below
-        `FALSE_ALARMS`.
+        place: of the pixels, about the middle of the image [y, x, 2], pixels.
+        v: direction of each detector plus beam shift [detector, 2].
     """
-    row, column = np.nonzero(dips.is_dip.any(0))
-    if len(row) < MIN_DIPS:
+    is_any = dips.is_dip.any(0)
+    if is_any.sum() < MIN_DIPS:
         return None
-    place, shows = np.stack([column, row], -1).astype(float), dips.is_dip[:, row, column]
-    counted = np.argwhere(dips.is_counted)[:, ::-1].astype(float)
+    at, shows, counted = place[is_any], dips.is_dip[:, is_any], place[dips.is_counted]
     angles = np.arange(0.0, 2.0 * np.pi, _TURN)
-    reach = float(np.hypot(*dips.is_counted.shape))
-    tests = np.log(len(angles) * 2.0 * reach / _SHIFT * 0.5 * reach**2)
-    best, found = np.log(FALSE_ALARMS), None
+    reach = float(np.hypot(place[..., 0], place[..., 1]).max()) + 2.0
+    bins, width = int(2.0 * reach / _SHIFT), round(2.0 * _STRIP / _SHIFT)
+    # every strip, and every start and end in it
+    best, found = np.log(FALSE_ALARMS / (len(angles) * bins * 2.0 * reach**2)), None
+
+    def in_strips(u: np.ndarray) -> np.ndarray:
+        number = np.bincount(((u + reach) / _SHIFT).astype(int), minlength=bins)
+        return np.convolve(number, np.ones(width), "valid")
+
     for angle in angles:
         line = Line(float(angle), 0.0, 0.0, 0.0)
         faces = v @ line.normal <= -_FACES * np.hypot(v[:, 0], v[:, 1])
         use = shows[faces].any(0) & ~shows[~faces].any(0)
         if use.sum() < MIN_DIPS:
             continue
-        u = place[use] @ line.normal
-        share = 1.0 / counted.shape[0]
-        bins = int(2.0 * reach / _SHIFT) + 2
-        width = round(2.0 * _STRIP / _SHIFT)
-        of = lambda x: np.floor((x + reach) / _SHIFT).astype(int)  # noqa: E731
-        n = np.convolve(np.bincount(of(u), minlength=bins), np.ones(width))[: bins + width - 1]
-        m = np.convolve(np.bincount(of(counted @ line.normal), minlength=bins), np.ones(width))[: bins + width - 1]
+        u, w = at[use] @ line.normal, at[use] @ line.along
+        n, of = in_strips(u), in_strips(counted @ line.normal)
         i = int(np.argmax(n))
-        if n[i] < MIN_DIPS:
-            continue
-        rate = (use.sum() - n[i] + 1.0) * share
-        centre = (i + 1 - 0.5 * width) * _SHIFT - reach
-        cost = tests + float(binom.logsf(n[i] - 1, m[i], min(rate, 0.5)))
-        inside = np.abs(u - centre) <= _STRIP
-        w = place[use][inside] @ line.along
-        if cost < best and inside.any() and np.ptp(w) >= MIN_SPAN:
-            best, found = cost, Line(float(angle), float(centre), float(w.min()), float(w.max()))
-    return None if found is None else (found, float(np.exp(best)))
+        share = (use.sum() - n[i] + 1.0) / len(counted)
+        cost = float(binom.logsf(n[i] - 1, of[i], min(share, 0.5)))
+        offset = (i + 0.5 * width) * _SHIFT - reach
+        inside = np.abs(u - offset) <= _STRIP
+        if cost < best and n[i] >= MIN_DIPS and np.ptp(w[inside]) >= MIN_SPAN:
+            best, found = cost, Line(float(angle), offset, float(w[inside].min()), float(w[inside].max()))
+    return found

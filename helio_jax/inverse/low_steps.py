@@ -1,49 +1,58 @@
-"""Heights of steps whose mask bands are shorter than a pixel, from the pixels along the whole edge.
+"""Heights of steps whose mask bands are shorter than a pixel, from all pixels along the edge.
 
-A pixel shows one point of the surface. Along an edge these points lie at all distances from it, up to half a pixel, so
-that together they show the signal across the step at a fraction of a pixel: where the upper level, the wall, its mask
-and the lower level begin and end. Place and direction of the edge, height and width of the wall (which may slope, and
-is seen as far as the beam reaches it), and how much is scattered at its foot are sampled from their posterior.
-
-The model is that of `wall_signal`, with a wall that falls by its height h over a horizontal width w: the point at the
-distance u from the upper edge in the raster lies at the horizontal distance x = u + (t . n) drop, and is masked from
-the part of the aperture with q > x / drop.
+A pixel shows the surface at one point. Along an edge these points lie at all distances from it, up to half a pixel:
+together they show the signal across the step finer than the raster, where wall, mask and lower level begin and end.
+Place, direction and bend of the edge, height and width of the wall and the scattering at its foot are sampled from
+their posterior. A line that no step explains, such as a scratch, has none.
 
 Source: sampler: Goodman and Weare, Comm. Appl. Math. Comp. Sci. 5 (2010) 65.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from helio_jax.inverse.dash_lines import Line
+from helio_jax.inverse.low_wall import LowWall
 from helio_jax.inverse.wall_signal import Opening, WallSignal, wall_signal
 
 _NEAR = 1.2
 """Pixels that are compared with the model: up to this distance from the line [pixels]."""
 _SIDES = 1.2, 5.0, 3.0
-"""Pixels that show the level of a side: their least and largest distance from the line, and the standard deviation of
-the weight along it [pixels]."""
+"""Pixels that show the signal of a side: their least and largest distance from the line, and the standard deviation of
+their weight along it [pixels]."""
 _MODEL_ERROR = 0.03
-"""Error of the modelled signal, as a fraction of the level's."""
+"""Error of the modelled signal, in that of the level."""
 _WALL_ERROR = 0.25
-"""The same on the wall: how it is inclined and what it is seen from is modelled roughly."""
+"""Relative error on the wall: how it is inclined and what it sees is modelled roughly."""
 _FUZZ = 0.1
 """How straight an edge is [pixels]."""
+_BEND = 0.2
+"""How far the middle of an edge is from the line between its ends: on a curved surface an oblique beam bends it
+[pixels]."""
 _OUTLIER = 3.0
 """Residual from which on a pixel loses weight [standard deviations]."""
-_HEIGHTS = 0.02, 4.0
-"""Heights that are tried: the band of the detector with the longest one [pixels]."""
+_LONGEST = 0.02, 4.0
+"""Longest band of a step that is tried [pixels]."""
 _WIDEST = 0.8
 """Greatest width of a wall [pixels]."""
-_NODES = 256
-"""Nodes of tables."""
-_WALKERS, _TRIES, _MOVES = 48, 2000, (120, 300)
-"""Number of walkers; of random starts, of which the best become walkers; of moves of each, of which half count."""
+_SCATTER = 1.0, 0.6, 2.0
+"""Multiple scattering over the prediction: prior mean, standard deviation, and most."""
+_WALKERS, _TRIES, _MOVES = 48, 3000, (150, 300)
+"""Walkers; random starts, of which the best become walkers; moves of each, of which the second half counts."""
+_SPREADS = (0.8, 0.03), (0.25, 0.01)
+"""Range of the first shifts [pixels] and turns [rad] of a line."""
 _TEMPERATURE = 2.0
 """Factor on minus the logarithm of the likelihood: the model errs from pixel to pixel in common."""
+_AGAINST = 3.0
+"""Evidence against a step beyond the ends of its line, from which on it ends there [minus log likelihood]."""
+_GAIN = 30.0
+"""Least gain of a step that is believed [minus log likelihood]."""
+SHAPE_STD = 0.1
+"""Standard deviation of heights by the shape of the wall, as a fraction: staircases of facets a quarter of a pixel wide
+come out 10 % too low."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +62,9 @@ class LowStep:
     Attributes:
         line: the upper edge.
         height, std: of the step.
-        width: of the wall.
-        gain: by how much the model is better than a surface without a step: difference of minus the logarithm of the
-            likelihood.
-        misfit: mean robust square of the residuals [standard deviations squared].
-        darkened: share of the pixels that the model darkens most in which the signal is dark.
-        bands: mean length of the band along the normal of every detector over the height; 0: none [detector].
+        width: horizontal width of the wall.
+        gain: by how much a step explains the pixels better than none [minus log likelihood].
+        signals: of a vertical wall along the line [detector].
     """
 
     line: Line
@@ -66,8 +72,27 @@ class LowStep:
     std: float
     width: float
     gain: float
-    misfit: float
-    bands: tuple[float, ...]
+    signals: tuple[WallSignal, ...]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Data; lengths in pixels.
+
+    Attributes:
+        place: of the pixels, about the middle of the image [y, x, 2].
+        signal, variance: NaN where not observed [detector, y, x].
+        openings: of the detectors.
+        beam_shift: `Instrument.beam_shift` [2].
+        spot: standard deviation of the beam's spot.
+    """
+
+    place: np.ndarray
+    signal: np.ndarray
+    variance: np.ndarray
+    openings: Sequence[Opening]
+    beam_shift: np.ndarray
+    spot: float
 
 
 @dataclass(frozen=True)
@@ -75,149 +100,113 @@ class _Strip:
     """Pixels along a line.
 
     Attributes:
-        place: (column, row) [pixel, 2].
+        u, w: distance from the line, and place along it from the middle [pixel].
         data, std: signal and its noise [detector, pixel].
-        upper, lower: signal of each side there [detector, pixel].
-        signals: of a vertical wall along the line [detector].
-        openings: of the detectors.
-        beam_shift: along x and y [2].
-        spot: standard deviation of the beam's spot [pixels].
+        upper, lower: signal of the two sides there [detector, pixel].
+        half: half the length of the line.
+        walls: signal across a wall along the line [detector].
+        fuzz: how sharp an edge is seen.
     """
 
-    place: np.ndarray
+    u: np.ndarray
+    w: np.ndarray
     data: np.ndarray
     std: np.ndarray
     upper: np.ndarray
     lower: np.ndarray
-    signals: tuple[WallSignal, ...]
-    openings: tuple[Opening, ...]
-    beam_shift: np.ndarray
-    spot: float
-
-
-def _strip_of(
-    line: Line, signal: np.ndarray, variance: np.ndarray, openings: tuple[Opening, ...], shift: np.ndarray, spot: float
-) -> _Strip | None:
-    """Take the pixels along a line, and the levels of its sides from those farther away."""
-    row, column = np.indices(signal.shape[1:])
-    place = np.stack([column, row], -1).reshape(-1, 2).astype(float)
-    u, w = place @ line.normal - line.offset, place @ line.along
-    known = np.isfinite(signal).all(0).ravel()
-    inside = known & (np.abs(u) < _NEAR) & (w >= line.start - 0.5) & (w <= line.end + 0.5)
-    values, errors = signal.reshape(len(signal), -1), variance.reshape(len(signal), -1)
-    sides = []
-    for way in (-1.0, 1.0):
-        beside = known & (way * u > _SIDES[0]) & (way * u < _SIDES[1])
-        if beside.sum() < 2 * int(line.end - line.start) or not inside.any():
-            return None
-        weight = np.exp(-0.5 * ((w[inside, None] - w[None, beside]) / _SIDES[2]) ** 2)
-        # lines across the strip: the sides may slope
-        sides.append(values[:, beside] @ weight.T / weight.sum(1))
-    normal = line.normal
-    return _Strip(
-        place[inside],
-        values[:, inside],
-        np.sqrt(np.maximum(errors[:, inside], 0.0)),
-        sides[0],
-        sides[1],
-        tuple(wall_signal(o, (float(shift[0]), float(shift[1])), normal) for o in openings),
-        openings,
-        shift,
-        spot,
-    )
-
-
-class _Tables(NamedTuple):
-    """Signal across a wall of one detector at evenly spaced arguments from 0 to 1.
-
-    Attributes:
-        masked: fraction of the aperture masked from the lower level, by distance from the upper edge over `reach`.
-        reach: least distance that no point of the aperture is masked from [heights].
-        level: multiple scattering at the distance d from the foot of a vertical wall, by d / (1 + d) [heights].
-        wall: the same on the wall, by height above the foot over that of the wall.
-        facet: direct signal of a wall, in that of the level, by its inclination over 90 deg.
-        shift: t . n.
-    """
-
-    masked: np.ndarray
-    reach: float
-    level: np.ndarray
-    wall: np.ndarray
-    facet: np.ndarray
-    shift: float
+    half: float
+    walls: tuple[LowWall, ...]
+    fuzz: float
 
     @classmethod
-    def of(cls, s: WallSignal, opening: Opening, normal: np.ndarray) -> "_Tables":
-        """Tabulate the signal of a wall that falls along a normal."""
-        t = np.linspace(0.0, 1.0, _NODES + 1)
-        reach = max(float(s.q[-1]), 1e-6)
-        tilt = 0.5 * np.pi * t[:, None]
-        facet = np.maximum(np.cos(tilt) + np.sin(tilt) * (opening.tau @ normal), 0.0) @ opening.weight
-        distance = t / np.maximum(1.0 - t, 1e-3)
-        return cls(s.masked(reach * t), reach, s.on_level(distance), s.on_wall(t), facet, s.shift)
+    def of(cls, line: Line, scan: Scan, signals: Sequence[WallSignal], beyond: float = 0.5) -> "_Strip | None":
+        """Take the pixels along a line and `beyond` its ends; None where too few pixels show its sides."""
+        place = scan.place.reshape(-1, 2)
+        u, w = place @ line.normal - line.offset, place @ line.along - 0.5 * (line.start + line.end)
+        half = 0.5 * (line.end - line.start)
+        values, noise = (a.reshape(len(a), -1) for a in (scan.signal, scan.variance))
+        known = np.isfinite(values).all(0)
+        inside, sides = known & (np.abs(u) < _NEAR) & (np.abs(w) <= half + beyond), []
+        for way in (-1.0, 1.0):
+            beside = known & (way * u > _SIDES[0]) & (way * u < _SIDES[1])
+            weight = np.exp(-0.5 * ((w[inside, None] - w[None, beside]) / _SIDES[2]) ** 2)
+            if not weight.size or weight.sum(1).min() < 1.0:
+                return None
+            sides.append(values[:, beside] @ weight.T / weight.sum(1))
+        walls = tuple(LowWall.of(s, o, line.normal) for s, o in zip(signals, scan.openings, strict=True))
+        std = np.sqrt(np.maximum(noise[:, inside], 0.0))
+        fuzz = math.hypot(_FUZZ, scan.spot)
+        return cls(u[inside], w[inside], values[:, inside], std, *sides, half, walls, fuzz)
+
+    def costs(self, walkers: np.ndarray) -> np.ndarray:
+        """Compute minus the logarithm of the likelihood of every pixel [walker, pixel]; walkers as in `_prior`."""
+        shift, turn, log_height, width, scatter, bend = (walkers[:, i, None] for i in range(6))
+        height, width = np.exp(log_height), np.maximum(width, 1e-3)
+        u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
+        total = np.zeros(u.shape)
+        for k, wall in enumerate(self.walls):
+            (before, was), (after, is_next) = (
+                wall.profile(u + d, height, width, scatter) for d in (-self.fuzz, self.fuzz)
+            )
+            level, model = np.where(u < 0.0, self.upper[k], self.lower[k]), 0.5 * (before + after)
+            error = np.where(was | is_next, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
+            std = np.sqrt(self.std[k] ** 2 + level**2 * (error**2 + (0.5 * (after - before)) ** 2))
+            rest = (self.data[k] - level * model) / std
+            total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / level)
+        return total / _TEMPERATURE
+
+    def without(self) -> np.ndarray:
+        """Compute the same of a surface without a step [pixel]."""
+        far = np.array([[self.fuzz + 2.0 * _NEAR, 0.0, 0.0, 0.1, 1.0, 0.0]])
+        return np.minimum(self.costs(far)[0], replace(self, upper=self.lower).costs(far)[0])
 
 
-def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Interpolate a table of evenly spaced arguments from 0 to 1."""
-    place = np.clip(t, 0.0, 1.0) * _NODES
-    i = np.minimum(place.astype(np.intp), _NODES - 1)
-    return table[i] + (place - i) * np.diff(table)[i]
-
-
-def _profile(
-    s: _Tables, u: np.ndarray, h: np.ndarray, w: np.ndarray, c: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the signal across a wall of one detector, in that of the level, and where the wall is [walker, pixel].
+def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
+    """Compute minus the logarithm of the prior [walker].
 
     Args:
-        s: of the detector.
-        u: distance from the upper edge [walker, pixel].
-        h, w: height and width of the wall [walker, 1].
-        c: multiple scattering, over that of the cosine law [walker, 1].
+        walkers: shift of the line [pixels], turn [rad], logarithm of the height, width of the wall [pixels], scattering
+            over the prediction, and bend [pixels] [walker, 6].
+        longest: band of the detector that shows the longest one, over the height.
     """
-    image = np.maximum(w - h * s.shift, 0.0)
-    x = np.maximum(u + h * s.shift, 0.0)
-    tilt = np.arctan2(h, w)
-    c = c * (1.0 - np.cos(tilt))  # solid angle of an inclined wall over that of a vertical one, at the foot
-    away = np.maximum(x - w, 0.0)
-    low = 1.0 - _at(s.masked, x / (h * s.reach)) + c * _at(s.level, away / (away + h))
-    wall = _at(s.facet, tilt / (0.5 * np.pi)) + c * _at(s.wall, 1.0 - u / np.maximum(image, 1e-9))
-    is_wall = (u > 0.0) & (u < image)
-    return np.where(u <= 0.0, 1.0, np.where(is_wall, wall, low)), is_wall
+    _, _, log_height, width, scatter, bend = walkers.T
+    band = np.exp(log_height) * longest
+    mean, std, most = _SCATTER
+    is_out = (band < _LONGEST[0]) | (band > _LONGEST[1]) | (width < 0.0) | (width > _WIDEST)
+    is_out |= (scatter < 0.0) | (scatter > most)
+    # all inclinations of the wall are equally likely
+    inclined = np.log1p((width * np.exp(-log_height)) ** 2) + log_height
+    return np.where(is_out, np.inf, inclined + 0.5 * (((scatter - mean) / std) ** 2 + (bend / _BEND) ** 2))
 
 
-def _cost(strip: _Strip, line: Line) -> Callable[[np.ndarray], np.ndarray]:
-    """Make the function that computes minus the logarithm of the posterior of walkers [walker, 5] -> [walker].
+def _starts(rng: np.random.Generator, longest: float, spread: tuple[float, float]) -> np.ndarray:
+    """Draw random walkers as in `_prior`."""
+    n = _TRIES
+    columns = (
+        rng.uniform(-spread[0], spread[0], n),
+        rng.uniform(-spread[1], spread[1], n),
+        rng.uniform(math.log(0.05), math.log(2.0), n) - math.log(longest),
+        rng.uniform(0.0, _WIDEST, n),
+        rng.uniform(0.3, 1.5, n),
+        rng.normal(0.0, _BEND, n),
+    )
+    return np.stack(columns, -1)
 
-    Their coordinates: shift of the line [pixels], turn [rad], logarithm of the height, width [pixels], scattering.
+
+def _sampled(
+    cost: Callable[[np.ndarray], np.ndarray], first: np.ndarray, moves: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sample a posterior by the stretch move, from the best of some starts.
+
+    Args:
+        cost: minus the logarithm of the posterior of points [point, n] -> [point].
+        first: starts [start, n].
+        moves: of every walker; the second half counts.
+        rng: random numbers.
+
+    Returns:
+        Samples [sample, n] and their costs [sample].
     """
-    u0, w0 = strip.place @ line.normal - line.offset, strip.place @ line.along - 0.5 * (line.start + line.end)
-    tables = [_Tables.of(s, o, line.normal) for s, o in zip(strip.signals, strip.openings, strict=True)]
-    longest, fuzz = max(s.length for s in strip.signals), float(np.hypot(_FUZZ, strip.spot))
-
-    def cost(walkers: np.ndarray) -> np.ndarray:
-        shift, turn, log_h, w, c = (walkers[:, i, None] for i in range(5))
-        h = np.exp(log_h)
-        u = u0 - shift - turn * w0
-        total = np.zeros(len(walkers))
-        bad = (h * longest < _HEIGHTS[0]) | (h * longest > _HEIGHTS[1]) | (w < 0.0) | (w > _WIDEST)
-        bad = (bad | (c < 0.0) | (c > 2.0))[:, 0]
-        w = np.clip(w, 1e-3, None)
-        for k, s in enumerate(tables):
-            (before, on_wall), (after, is_next) = (_profile(s, u + d, h, w, c) for d in (-fuzz, fuzz))
-            level = np.where(u < 0.0, strip.upper[k], strip.lower[k])
-            model = 0.5 * (before + after)
-            rough = np.where(on_wall | is_next, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
-            std = np.sqrt(strip.std[k] ** 2 + level**2 * (rough**2 + (0.5 * (after - before)) ** 2))
-            r = (strip.data[k] - level * model) / std
-            total += np.sum(0.5 * _OUTLIER**2 * np.log1p((r / _OUTLIER) ** 2) + np.log(std / level), 1)
-        return np.where(bad, np.inf, total / _TEMPERATURE + 0.5 * ((c[:, 0] - 1.0) / 0.6) ** 2)
-
-    return cost
-
-
-def _sampled(cost: Callable[[np.ndarray], np.ndarray], first: np.ndarray, moves: int, rng: np.random.Generator) -> np.ndarray:
-    """Sample a posterior by the stretch move from the best of some starts [start, n] -> [sample, n]."""
     value = cost(first)
     best = np.argsort(value)[:_WALKERS]
     at, value, kept = first[best].copy(), value[best].copy(), []
@@ -225,71 +214,81 @@ def _sampled(cost: Callable[[np.ndarray], np.ndarray], first: np.ndarray, moves:
     groups = np.arange(half), np.arange(half, _WALKERS)
     for move in range(moves):
         for mine, others in (groups, groups[::-1]):
-            z = (1.0 + rng.random(half)) ** 2 / 2.0  # 1/sqrt(z) on [1/2, 2]
+            z = (1.0 + rng.random(half)) ** 2 / 2.0
             other = at[rng.choice(others, half)]
             new = other + z[:, None] * (at[mine] - other)
             moved = cost(new)
             is_taken = np.log(rng.random(half)) < (n - 1) * np.log(z) + value[mine] - moved
             at[mine[is_taken]], value[mine[is_taken]] = new[is_taken], moved[is_taken]
         if move >= moves // 2:
-            kept.append(np.concatenate([at, value[:, None]], 1))
-    return np.concatenate(kept)
+            kept.append((at.copy(), value.copy()))
+    points, values = zip(*kept, strict=True)
+    return np.concatenate(points), np.concatenate(values)
 
 
-def fit_step(
-    line: Line, signal: np.ndarray, variance: np.ndarray, openings: tuple[Opening, ...], shift: np.ndarray, spot: float
-) -> LowStep | None:
-    """Measure a step along a line of dashes.
+def _moved(line: Line, shift: float, turn: float) -> Line:
+    """Return a line shifted along its normal [pixels] and turned about its middle [rad]."""
+    middle = line.normal * (line.offset + shift) + line.along * 0.5 * (line.start + line.end)
+    half, turned = 0.5 * (line.end - line.start), line._replace(angle=line.angle - math.atan(turn))
+    at = float(middle @ turned.along)
+    return Line(turned.angle, float(middle @ turned.normal), at - half, at + half)
+
+
+def _extended(line: Line, scan: Scan, signals: Sequence[WallSignal], walker: np.ndarray) -> Line:
+    """Extend a line at both ends up to where the pixels speak against a step.
+
+    Where no pixel lies in its band nothing tells whether a step goes on: it does, for a step rarely ends.
+    """
+    reach = float(np.hypot(scan.place[..., 0], scan.place[..., 1]).max())
+    strip = _Strip.of(line, scan, signals, beyond=2.0 * reach)
+    if strip is None:
+        return line
+    flat = walker.copy()
+    flat[5] = 0.0  # a bend is not to be extrapolated
+    gain = strip.costs(flat[None])[0] - strip.without()
+    ends = []
+    for way in (-1.0, 1.0):
+        beyond = way * strip.w > strip.half
+        order = np.argsort(way * strip.w[beyond])
+        place, against = (way * strip.w[beyond])[order], np.cumsum(gain[beyond][order])
+        stop = np.flatnonzero(against - np.minimum.accumulate(np.minimum(against, 0.0)) > _AGAINST)
+        if stop.size:
+            best = int(np.argmin(against[: stop[0] + 1]))
+            ends.append(float(place[best]) if against[best] < 0.0 else strip.half)
+        else:
+            ends.append(float(place.max(initial=strip.half)))
+    middle = 0.5 * (line.start + line.end)
+    return line._replace(start=middle - ends[0], end=middle + ends[1])
+
+
+def fit_step(line: Line, scan: Scan) -> LowStep | None:
+    """Measure the step along a line of dashes.
 
     Args:
-        line: near the upper edge [pixels].
-        signal, variance: [detector, y, x].
-        openings: of the detectors.
-        shift: `Instrument.beam_shift` [2].
-        spot: standard deviation of the beam's spot [pixels].
+        line: near the upper edge.
+        scan: data.
 
     Returns:
-        The step; None where too few pixels show its sides.
+        The step; None where too few pixels show its sides, or no step explains them.
     """
-    rng = np.random.default_rng(0)
-    spread = 0.8, 0.03
-    for moves in _MOVES:  # once more with the line as found
-        strip = _strip_of(line, signal, variance, openings, shift, spot)
-        if strip is None:
+    rng, found = np.random.default_rng(0), None
+    for moves, spread in zip(_MOVES, _SPREADS, strict=True):
+        shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
+        signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
+        strip, longest = _Strip.of(line, scan, signals), max(s.length for s in signals)
+        if strip is None or longest <= 0.0:
             return None
-        longest = max(s.length for s in strip.signals)
-        if longest <= 0.0:
-            return None
-        cost = _cost(strip, line)
-        n = _TRIES
-        first = np.stack(
-            [
-                rng.uniform(-1.0, 1.0, n) * spread[0],
-                rng.uniform(-1.0, 1.0, n) * spread[1],
-                rng.uniform(np.log(0.05), np.log(2.0), n) - np.log(longest),
-                rng.uniform(0.0, _WIDEST, n),
-                rng.uniform(0.3, 1.5, n),
-            ],
-            -1,
+        points, costs = _sampled(
+            lambda p, strip=strip, longest=longest: _prior(p, longest) + strip.costs(p).sum(1),
+            _starts(rng, longest, spread),
+            moves,
+            rng,
         )
-        drawn = _sampled(cost, first, moves, rng)
-        mean = drawn[np.argmin(drawn[:, -1])]
-        middle = 0.5 * (line.start + line.end)
-        angle = line.angle + float(np.arctan(mean[1]))
-        turned = Line(angle, 0.0, line.start, line.end)
-        through = line.normal * (line.offset + mean[0]) + line.along * middle
-        half = 0.5 * (line.end - line.start)
-        w = float(through @ turned.along)
-        line = Line(angle, float(through @ turned.normal), w - half, w + half)
-        spread = 0.25, 0.01
-    height = np.exp(drawn[:, 2])
-    none = np.array([[10.0, 0.0, np.log(0.3 / longest), 0.1, 1.0]])  # the line lies beyond the strip
-    return LowStep(
-        line,
-        float(height.mean()),
-        float(height.std()),
-        float(drawn[:, 3].mean()),
-        float(cost(none)[0] - drawn[:, -1].min()),
-        float(drawn[:, -1].min()) / strip.data.size,
-        tuple(s.length if s.dark_share > 0.995 else 0.0 for s in strip.signals),
-    )
+        best = points[np.argmin(costs)]
+        gain = float(strip.without().sum() - strip.costs(best[None]).sum())
+        if gain < _GAIN:
+            return None
+        height, line = np.exp(points[:, 2]), _moved(line, float(best[0]), float(best[1]))
+        found = LowStep(line, float(height.mean()), float(height.std()), float(points[:, 3].mean()), gain, signals)
+        line = _extended(line, scan, signals, np.array([0.0, 0.0, *best[2:]]))
+    return found
