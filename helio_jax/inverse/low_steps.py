@@ -40,7 +40,7 @@ _WIDEST = 0.8
 """Greatest width of a wall [pixels]."""
 _SCATTER = 1.0, 0.6, 2.0
 """Multiple scattering over the prediction: prior mean, standard deviation, and most."""
-_WALKERS, _TRIES, _MOVES = 48, 3000, (150, 300)
+_WALKERS, _TRIES, _MOVES = 32, (3000, 1000), (60, 160)
 """Walkers; random starts, of which the best become walkers; moves of each, of which the second half counts."""
 _SPREADS = (0.8, 0.03), (0.25, 0.01)
 """Range of the first shifts [pixels] and turns [rad] of a line."""
@@ -50,7 +50,7 @@ _AGAINST = 3.0
 """Evidence against a step beyond the ends of its line, from which on it ends there [minus log likelihood]."""
 _GAIN = 30.0
 """Least gain of a step that is believed [minus log likelihood]."""
-SHAPE_STD = 0.1
+SHAPE_STD = 0.05
 """Standard deviation of heights by the shape of the wall, as a fraction: staircases of facets a quarter of a pixel wide
 come out 10 % too low."""
 
@@ -105,7 +105,7 @@ class _Strip:
         upper, lower: signal of the two sides there [detector, pixel].
         half: half the length of the line.
         walls: signal across a wall along the line [detector].
-        fuzz: how sharp an edge is seen.
+        fuzz: how far the edge may be from its line in a pixel: there, at its line, or as far before it.
     """
 
     u: np.ndarray
@@ -143,16 +143,19 @@ class _Strip:
         shift, turn, log_height, width, scatter, bend = (walkers[:, i, None] for i in range(6))
         height, width = np.exp(log_height), np.maximum(width, 1e-3)
         u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
-        total = np.zeros(u.shape)
-        for k, wall in enumerate(self.walls):
-            (before, was), (after, is_next) = (
-                wall.profile(u + d, height, width, scatter) for d in (-self.fuzz, self.fuzz)
-            )
-            level, model = np.where(u < 0.0, self.upper[k], self.lower[k]), 0.5 * (before + after)
-            error = np.where(was | is_next, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
-            std = np.sqrt(self.std[k] ** 2 + level**2 * (error**2 + (0.5 * (after - before)) ** 2))
-            rest = (self.data[k] - level * model) / std
-            total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / level)
+        places = []
+        for place, share in ((-self.fuzz, 0.25), (0.0, 0.5), (self.fuzz, 0.25)):
+            total = np.full(u.shape, -math.log(share))
+            is_upper = u + place < 0.0
+            for k, wall in enumerate(self.walls):
+                model, is_wall = wall.profile(u + place, height, width, scatter)
+                side = np.where(is_upper, self.upper[k], self.lower[k])
+                error = np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
+                std = np.sqrt(self.std[k] ** 2 + (side * error) ** 2)
+                rest = (self.data[k] - side * model) / std
+                total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / side)
+            places.append(-total)
+        total = -np.logaddexp(np.logaddexp(places[0], places[1]), places[2])
         return total / _TEMPERATURE
 
     def without(self) -> np.ndarray:
@@ -179,9 +182,8 @@ def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
     return np.where(is_out, np.inf, inclined + 0.5 * (((scatter - mean) / std) ** 2 + (bend / _BEND) ** 2))
 
 
-def _starts(rng: np.random.Generator, longest: float, spread: tuple[float, float]) -> np.ndarray:
-    """Draw random walkers as in `_prior`."""
-    n = _TRIES
+def _starts(rng: np.random.Generator, n: int, longest: float, spread: tuple[float, float]) -> np.ndarray:
+    """Draw n random walkers as in `_prior`."""
     columns = (
         rng.uniform(-spread[0], spread[0], n),
         rng.uniform(-spread[1], spread[1], n),
@@ -272,7 +274,7 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
         The step; None where too few pixels show its sides, or no step explains them.
     """
     rng, found = np.random.default_rng(0), None
-    for moves, spread in zip(_MOVES, _SPREADS, strict=True):
+    for tries, moves, spread in zip(_TRIES, _MOVES, _SPREADS, strict=True):
         shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
         signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
         strip, longest = _Strip.of(line, scan, signals), max(s.length for s in signals)
@@ -280,7 +282,7 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
             return None
         points, costs = _sampled(
             lambda p, strip=strip, longest=longest: _prior(p, longest) + strip.costs(p).sum(1),
-            _starts(rng, longest, spread),
+            _starts(rng, tries, longest, spread),
             moves,
             rng,
         )

@@ -45,9 +45,7 @@ class LowWall(NamedTuple):
         tilt = 0.5 * np.pi * t[:, None]
         facet = np.maximum(np.cos(tilt) + np.sin(tilt) * (opening.tau @ normal), 0.0) @ opening.weight
         distance = t / np.maximum(1.0 - t, 1e-3)
-        return cls(
-            signal.masked(reach * t), reach, signal.on_level(distance), signal.on_wall(t), facet, signal.shift
-        )
+        return cls(signal.masked(reach * t), reach, signal.on_level(distance), signal.on_wall(t), facet, signal.shift)
 
     def profile(
         self, u: np.ndarray, height: np.ndarray, width: np.ndarray, scatter: np.ndarray
@@ -72,5 +70,5 @@ class LowWall(NamedTuple):
 def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Interpolate a table of evenly spaced arguments from 0 to 1."""
     place = np.clip(t, 0.0, 1.0) * _NODES
-    i = np.minimum(place.astype(np.intp), _NODES - 1)
-    return table[i] + (place - i) * np.diff(table)[i]
+    i = place.astype(np.intp)
+    return table[i] + (place - i) * np.append(np.diff(table), 0.0)[i]
