@@ -47,6 +47,22 @@ class Anchors:
                 value.append(height / std)
         return cls(np.stack(weight), np.array(value)) if weight else cls.none(region.shape)
 
+    def known_steps(self, region: np.ndarray) -> dict[int, float]:
+        """Return the largest known difference of heights between each region and region 0, by number [um].
+
+        Args:
+            region: number of every pixel's region [y, x].
+        """
+        found: dict[int, float] = {}
+        for weight, value in zip(self.weight, self.value, strict=True):
+            sides = [region[side] for side in (weight > 0.0, weight < 0.0)]
+            if not all(side.size for side in sides):
+                continue
+            low, high = sorted(int(np.bincount(side).argmax()) for side in sides)
+            if low == 0 < high:
+                found[high] = max(found.get(high, 0.0), abs(float(value)) / float(weight.sum(where=weight > 0.0)))
+        return found
+
     def and_also(self, other: "Anchors") -> "Anchors":
         """Join with others."""
         return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))

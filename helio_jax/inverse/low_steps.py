@@ -136,7 +136,7 @@ class _Strip:
         walls = tuple(LowWall.of(s, o, line.normal) for s, o in zip(signals, scan.openings, strict=True))
         std = np.sqrt(np.maximum(noise[:, inside], 0.0))
         fuzz = math.hypot(_FUZZ, scan.spot)
-        return cls(u[inside], w[inside], values[:, inside], std, *sides, half, walls, fuzz)
+        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, fuzz)
 
     def costs(self, walkers: np.ndarray) -> np.ndarray:
         """Compute minus the logarithm of the likelihood of every pixel [walker, pixel]; walkers as in `_prior`."""

@@ -3,6 +3,8 @@
 The limits that make up the rule of `is_valid` are those of `validity`.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import coo_matrix
@@ -66,7 +68,11 @@ def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
 
 
 def floating(
-    height: np.ndarray, samples: np.ndarray, region: np.ndarray, common_modes: np.ndarray | None = None
+    height: np.ndarray,
+    samples: np.ndarray,
+    region: np.ndarray,
+    common_modes: np.ndarray | None = None,
+    steps: Mapping[int, float] | None = None,
 ) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
@@ -78,6 +84,9 @@ def floating(
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
         common_modes: as in `Posterior` [error, y, x], um.
+        steps: known heights of steps between a region and the largest one, by number [um]. Its uncertainty must be a
+            small share of its step: the difference of medians or, if larger, the known one: medians of slopes may be
+            equal.
     """
     flags = np.zeros(height.shape, bool)
     if common_modes is not None:
@@ -87,6 +96,7 @@ def floating(
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number
         step = abs(float(np.median(height[inside]) - np.median(height[substrate])))
+        step = max(step, (steps or {}).get(int(number), 0.0))
         spread = float(np.std(samples[:, inside].mean(1) - samples[:, substrate].mean(1)))
         flags |= inside & (spread > FLOATING * step)
     return flags
