@@ -65,6 +65,7 @@ def _records(
     line, height = low.line, side * low.height
     std = math.hypot(side * low.std, SHAPE_STD * height)
     dark = tuple(k for k, s in enumerate(low.signals) if kind_of(s) == "dark")
+    dark = dark or (int(np.argmax([s.length for s in low.signals])),)
     start, end = (middle + side * (line.offset * line.normal + at * line.along) for at in (line.start, line.end))
     edge = Edge(start, end, dark)
     bands = []

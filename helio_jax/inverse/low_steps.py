@@ -40,10 +40,12 @@ _WIDEST = 0.8
 """Greatest width of a wall [pixels]."""
 _SCATTER = 1.0, 0.6, 2.0
 """Multiple scattering over the prediction: prior mean, standard deviation, and most."""
-_WALKERS, _TRIES, _MOVES = 32, (3000, 1000), (60, 160)
-"""Walkers; random starts, of which the best become walkers; moves of each, of which the second half counts."""
-_SPREADS = (0.8, 0.03), (0.25, 0.01)
-"""Range of the first shifts [pixels] and turns [rad] of a line."""
+_WALKERS = 32
+_ROUNDS = (4000, 40, 0.8, 0.03), (2000, 40, 0.2, 0.008), (1000, 160, 0.06, 0.003)
+"""Random starts, of which the best become walkers; moves of each, of which the second half counts; range of the first
+shifts [pixels] and turns [rad] of the line: in each round, about the best of the last one."""
+_LOST = 12.0
+"""Walkers whose cost is greater than the least one by more have not arrived [minus log likelihood]."""
 _TEMPERATURE = 2.0
 """Factor on minus the logarithm of the likelihood: the model errs from pixel to pixel in common."""
 _AGAINST = 3.0
@@ -182,15 +184,20 @@ def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
     return np.where(is_out, np.inf, inclined + 0.5 * (((scatter - mean) / std) ** 2 + (bend / _BEND) ** 2))
 
 
-def _starts(rng: np.random.Generator, n: int, longest: float, spread: tuple[float, float]) -> np.ndarray:
-    """Draw n random walkers as in `_prior`."""
+def _starts(rng: np.random.Generator, n: int, longest: float, shift: float, turn: float) -> np.ndarray:
+    """Draw n random walkers as in `_prior`, half of them without a bend, half of vertical walls.
+
+    `longest` as there; `shift` [pixels] and `turn` [rad]: the largest.
+    """
+    height = np.exp(rng.uniform(math.log(0.05), math.log(2.0), n)) / longest
+    width = height * np.tan(0.45 * np.pi * rng.random(n)) * rng.integers(0, 2, n)
     columns = (
-        rng.uniform(-spread[0], spread[0], n),
-        rng.uniform(-spread[1], spread[1], n),
-        rng.uniform(math.log(0.05), math.log(2.0), n) - math.log(longest),
-        rng.uniform(0.0, _WIDEST, n),
-        rng.uniform(0.3, 1.5, n),
-        rng.normal(0.0, _BEND, n),
+        rng.uniform(-shift, shift, n),
+        rng.uniform(-turn, turn, n),
+        np.log(height),
+        np.minimum(width, _WIDEST * rng.random(n)),
+        rng.uniform(0.0, 1.5, n),
+        rng.normal(0.0, _BEND, n) * rng.integers(0, 2, n),
     )
     return np.stack(columns, -1)
 
@@ -274,7 +281,7 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
         The step; None where too few pixels show its sides, or no step explains them.
     """
     rng, found = np.random.default_rng(0), None
-    for tries, moves, spread in zip(_TRIES, _MOVES, _SPREADS, strict=True):
+    for tries, moves, *spread in _ROUNDS:
         shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
         signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
         strip, longest = _Strip.of(line, scan, signals), max(s.length for s in signals)
@@ -282,7 +289,7 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
             return None
         points, costs = _sampled(
             lambda p, strip=strip, longest=longest: _prior(p, longest) + strip.costs(p).sum(1),
-            _starts(rng, tries, longest, spread),
+            _starts(rng, int(tries), longest, *spread),
             moves,
             rng,
         )
@@ -290,7 +297,9 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
         gain = float(strip.without().sum() - strip.costs(best[None]).sum())
         if gain < _GAIN:
             return None
-        height, line = np.exp(points[:, 2]), _moved(line, float(best[0]), float(best[1]))
-        found = LowStep(line, float(height.mean()), float(height.std()), float(points[:, 3].mean()), gain, signals)
+        drawn = points[costs < costs.min() + _LOST]
+        height, width = np.exp(drawn[:, 2]), float(drawn[:, 3].mean())
+        line = _moved(line, float(best[0]), float(best[1]))
+        found = LowStep(line, float(height.mean()), float(height.std()), width, gain, signals)
         line = _extended(line, scan, signals, np.array([0.0, 0.0, *best[2:]]))
     return found

@@ -25,6 +25,7 @@ from helio_jax.inverse.mask_edges import (
     SignalLevels,
     edge_points,
     find_levels,
+    is_on,
     straight_edges,
     variance_of,
 )
@@ -107,7 +108,7 @@ def find_steps(stack: MicrographStack) -> Steps:
     tried = ((edge, _measure(0, edge, scan, 0.0)) for edge in edges)
     shown = [(edge, m) for edge, m in tried if m.bands]
     low = _low(scan, [m for _, m in shown])
-    shown = [(edge, m) for edge, m in shown if m.step.is_used or not any(_same(m.edge, o.edge, side) for o in low)]
+    shown = [(edge, m) for edge, m in shown if m.step.is_used or not any(is_on(m.edge, o.edge, side) for o in low)]
     edges, n = [edge for edge, _ in shown], len(shown)
     measured = [m.numbered(i) for i, m in enumerate([*(m for _, m in shown), *low], 1)]
     patch = _patches(measured, images, levels)
@@ -155,18 +156,9 @@ def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
             edge = replace(laid[0], detectors=tuple(dark))
         if laid is None:
             continue
-        if not any(_same(edge, other, scan.images.side) for other, _ in out):
+        if not any(is_on(edge, other, scan.images.side) for other, _ in out):
             out.append((edge, laid[1]))
     return out
-
-
-def _same(a: Edge, b: Edge, side: float) -> bool:
-    """Return whether edge a lies on edge b."""
-    if a.normal @ b.normal < math.cos(math.radians(20.0)):
-        return False
-    rel = np.stack([a.start, a.middle, a.end]) - b.middle
-    away, along = np.abs(rel @ b.normal), np.abs(rel @ b.along)
-    return bool(away[1] < 1.5 * side and along[1] < 0.5 * b.length)
 
 
 @dataclass(frozen=True)
@@ -187,10 +179,10 @@ class _Measured:
 def _low(scan: _Scan, measured: list[_Measured]) -> list[_Measured]:
     """Find the steps that dashes show, apart from those whose bands are measured."""
     used = [m for m in measured if m.step.is_used]
-    names, side = scan.stack.instrument.detector_names, scan.images.side
-    found = find_low_steps(scan.images, scan.seen_from(0.0), scan.beam_shift, names, _explained(used, scan))
-    low = [_Measured(edge, step, bands, step.height_um) for edge, step, bands in found]
-    return [m for m in low if not any(_same(u.edge, m.edge, side) for u in used)]
+    names, explained = scan.stack.instrument.detector_names, _explained(used, scan)
+    found = find_low_steps(scan.images, scan.seen_from(0.0), scan.beam_shift, names, explained)
+    low = (_Measured(edge, step, bands, step.height_um) for edge, step, bands in found)
+    return [m for m in low if not any(is_on(u.edge, m.edge, scan.images.side) for u in used)]
 
 
 def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -> _Measured:

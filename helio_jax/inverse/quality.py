@@ -72,7 +72,7 @@ def floating(
     samples: np.ndarray,
     region: np.ndarray,
     common_modes: np.ndarray | None = None,
-    steps: Mapping[int, float] | None = None,
+    steps: Mapping[int, tuple[float, np.ndarray]] | None = None,
 ) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
@@ -84,9 +84,9 @@ def floating(
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
         common_modes: as in `Posterior` [error, y, x], um.
-        steps: known heights of steps between a region and the largest one, by number [um]. Its uncertainty must be a
-            small share of its step: the difference of medians or, if larger, the known one: medians of slopes may be
-            equal.
+        steps: known steps between a region and the largest one, by number: height, and the weights that measure it
+            (`Anchors.known_steps`). A region whose step is known is fixed there: what its slopes add, which are
+            uncertain with a free border, they add within a region, too.
     """
     flags = np.zeros(height.shape, bool)
     if common_modes is not None:
@@ -96,9 +96,12 @@ def floating(
     for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
         inside = region == number
         step = abs(float(np.median(height[inside]) - np.median(height[substrate])))
-        step = max(step, (steps or {}).get(int(number), 0.0))
         spread = float(np.std(samples[:, inside].mean(1) - samples[:, substrate].mean(1)))
-        flags |= inside & (spread > FLOATING * step)
+        is_floating = spread > FLOATING * step
+        if steps and number in steps:
+            known, weight = steps[number]
+            is_floating &= float(np.std(np.tensordot(samples, weight, 2))) > FLOATING * known
+        flags |= inside & is_floating
     return flags
 
 
