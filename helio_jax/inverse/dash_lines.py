@@ -27,7 +27,8 @@ _AROUND = 7
 _NOISE = 5.0
 """Least depth of a dip [standard deviations]."""
 _FACES = 0.2
-"""Least cosine of the angle between the normal of a line and a detector's -v for its mask to lie along it."""
+"""Least cosine of the angle between the normal of a line and a detector's -v for its mask to lie beside it, and between
+normal and v for none to lie there."""
 _TURN = np.radians(0.75)
 """Angle between the lines that are tried."""
 _STRIP = 0.75
@@ -126,8 +127,8 @@ def find_line(dips: Dips, place: np.ndarray, v: np.ndarray) -> Line | None:
 
     for angle in angles:
         line = Line(float(angle), 0.0, 0.0, 0.0)
-        faces = v @ line.normal <= -_FACES * np.hypot(v[:, 0], v[:, 1])
-        use = shows[faces].any(0) & ~shows[~faces].any(0)
+        toward = v @ line.normal / np.maximum(np.hypot(v[:, 0], v[:, 1]), 1e-12)
+        use = shows[toward < -_FACES].any(0) & ~shows[toward > _FACES].any(0)
         if use.sum() < MIN_DIPS:
             continue
         u, w = at[use] @ line.normal, at[use] @ line.along

@@ -48,8 +48,9 @@ _LOST = 12.0
 """Walkers whose cost is greater than the least one by more have not arrived [minus log likelihood]."""
 _TEMPERATURE = 2.0
 """Factor on minus the logarithm of the likelihood: the model errs from pixel to pixel in common."""
-_AGAINST = 3.0
-"""Evidence against a step beyond the ends of its line, from which on it ends there [minus log likelihood]."""
+_AGAINST = 25.0
+"""Evidence against a step beyond the ends of its line, from which on it ends there: of three pixels or more that should
+be dark [minus log likelihood]."""
 _GAIN = 30.0
 """Least gain of a step that is believed [minus log likelihood]."""
 SHAPE_STD = 0.05
