@@ -13,8 +13,14 @@ from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.step_records import BandRow, Step
 from helio_jax.inverse.wall_signal import Opening
 
-MAX_LINES = 6
+MAX_LINES = 4
 """Lines that are looked for."""
+MIN_SHARE = 0.5
+"""Least share of its way through the image along which a line shows dashes."""
+MAX_BAND = 1.5
+"""Longest band of a low step: longer ones are those of `band_fit` [pixels]."""
+_BORDER = 3.0
+"""Distance from the border within which a line ends there [pixels]."""
 _BESIDE = 2.0
 """Dips so near to a line are its own [pixels]."""
 
@@ -22,7 +28,9 @@ _BESIDE = 2.0
 def find_low_steps(
     images: Images, openings: Sequence[Opening], beam_shift: np.ndarray, names: Sequence[str], is_explained: np.ndarray
 ) -> list[tuple[Edge, Step, tuple[BandRow, ...]]]:
-    """Find the steps whose mask bands are shorter than a pixel, and measure them.
+    """Find the steps through the image whose mask bands are shorter than a pixel, and measure them.
+
+    Around the ends of a shorter one the surface joins both sides, and tells their heights; where it ends dashes do not.
 
     Args:
         images: data.
@@ -44,11 +52,30 @@ def find_low_steps(
         line = find_line(dips, place, v)
         if line is None:
             break
-        low = fit_step(line, scan)
-        if low is not None:
+        low = fit_step(line, scan) if _share(line, place) >= MIN_SHARE else None
+        if low is not None and _is_through(low, place):
             found.append(_records(low, middle, images.side, names, v))
         dips = _without(dips, place, line if low is None else low.line)
     return found
+
+
+def _way(line: Line, place: np.ndarray) -> tuple[float, float]:
+    """Return where a line enters and leaves the image, along it [pixels]."""
+    w = (place @ line.along)[np.abs(place @ line.normal - line.offset) < 1.0]
+    return (float(w.min()), float(w.max())) if w.size else (line.start, line.end)
+
+
+def _share(line: Line, place: np.ndarray) -> float:
+    """Return along which share of its way through the image a line shows dashes."""
+    first, last = _way(line, place)
+    return (line.end - line.start) / max(last - first, 1e-9)
+
+
+def _is_through(low: LowStep, place: np.ndarray) -> bool:
+    """Return whether a low step goes through the image, and is one."""
+    first, last = _way(low.line, place)
+    ends_there = low.line.start < first + _BORDER and low.line.end > last - _BORDER
+    return ends_there and low.height * max(s.length for s in low.signals) <= MAX_BAND
 
 
 def _without(dips: Dips, place: np.ndarray, line: Line) -> Dips:
