@@ -24,7 +24,7 @@ def ramp_share(aperture, instrument, normal, u, height, width):
 
     Args:
         u: distance from the image of the upper edge along the normal [um].
-        height, width: of the ramp, on which points see what lies before their facet and is not behind the edge [um].
+        height, width: of the ramp [um].
     """
     shift = np.array(instrument.beam_shift) @ normal
     s, r = np.pi * (3.0 - math.sqrt(5.0)) * np.arange(400), np.sqrt((np.arange(400) + 0.5) / 400)
