@@ -118,6 +118,10 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edge_place          where an upper edge lies between the pixels
   band_fit            length of the band beside an edge, and the height from it
   mask_patches        surface patches between steps, and their levels
+  dash_lines          lines of isolated dark pixels, which no chance explains
+  low_wall            signal across a low wall that may slope
+  low_steps           heights of steps whose bands are shorter than a pixel
+  dash_steps          such steps as records
   step_records        records of steps, bands and patches
   measured_steps      what measured steps are for a fit: walls between pixels, known differences of heights
   law_prior           what is unknown of the scattering law; its test against the cosine law

@@ -47,6 +47,28 @@ class Anchors:
                 value.append(height / std)
         return cls(np.stack(weight), np.array(value)) if weight else cls.none(region.shape)
 
+    def known_steps(self, region: np.ndarray) -> dict[int, tuple[float, np.ndarray]]:
+        """Find the largest known difference of heights between each region and region 0.
+
+        Args:
+            region: number of every pixel's region [y, x].
+
+        Returns:
+            By number of the region: the difference [um], and the weights that measure it, of sum 1 on its upper side
+            and -1 on its lower side [y, x].
+        """
+        found: dict[int, tuple[float, np.ndarray]] = {}
+        for weight, value in zip(self.weight, self.value, strict=True):
+            sides = [region[side] for side in (weight > 0.0, weight < 0.0)]
+            if not all(side.size for side in sides):
+                continue
+            low, high = sorted(int(np.bincount(side).argmax()) for side in sides)
+            total = float(weight.sum(where=weight > 0.0))
+            height = abs(float(value)) / total
+            if low == 0 < high and height > found.get(high, (0.0, weight))[0]:
+                found[high] = height, weight / total
+        return found
+
     def and_also(self, other: "Anchors") -> "Anchors":
         """Join with others."""
         return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))

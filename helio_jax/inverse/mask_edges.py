@@ -23,6 +23,8 @@ _SMOOTH = 2.0
 """Distance over which normals are averaged [pixels]."""
 _COS_TURN = np.cos(np.radians(22.5))
 """Cosine of the largest angle between a point's normal and the mean of its edge."""
+_COS_SAME = np.cos(np.radians(20.0))
+"""Cosine of the largest angle between two edges of which one lies on the other."""
 _STRAIGHT = 0.6
 """Largest distance of the points of an edge from its line [pixels]."""
 _ACROSS = 0.25
@@ -133,6 +135,15 @@ class Edge:
     def normal(self) -> np.ndarray:
         """Unit normal towards the lower side [2]."""
         return np.array([self.along[1], -self.along[0]])
+
+
+def is_on(a: Edge, b: Edge, side: float) -> bool:
+    """Return whether edge a lies on edge b; `side`: of a pixel [um]."""
+    if a.normal @ b.normal < _COS_SAME:
+        return False
+    rel = np.stack([a.start, a.middle, a.end]) - b.middle
+    away, along = np.abs(rel @ b.normal), np.abs(rel @ b.along)
+    return bool(away[1] < 1.5 * side and along[1] < 0.5 * b.length)
 
 
 def edge_points(fraction: np.ndarray, x: np.ndarray, y: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

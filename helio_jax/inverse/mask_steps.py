@@ -17,6 +17,7 @@ from helio_jax.arrays import border_mask, pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
 from helio_jax.inverse.band_fit import Band, disturbance, fit_band, kind_of, place_edge
+from helio_jax.inverse.dash_steps import find_low_steps
 from helio_jax.inverse.edge_place import Images, abruptness, band_coordinates, lay_edge
 from helio_jax.inverse.mask_edges import (
     SHADED,
@@ -24,6 +25,7 @@ from helio_jax.inverse.mask_edges import (
     SignalLevels,
     edge_points,
     find_levels,
+    is_on,
     straight_edges,
     variance_of,
 )
@@ -105,16 +107,19 @@ def find_steps(stack: MicrographStack) -> Steps:
     edges = _laid(_found(scan, levels), scan)
     tried = ((edge, _measure(0, edge, scan, 0.0)) for edge in edges)
     shown = [(edge, m) for edge, m in tried if m.bands]
-    edges, measured = [edge for edge, _ in shown], [m.numbered(i) for i, (_, m) in enumerate(shown, 1)]
+    low = _low(scan, [m for _, m in shown])
+    shown = [(edge, m) for edge, m in shown if m.step.is_used or not any(is_on(m.edge, o.edge, side) for o in low)]
+    edges, n = [edge for edge, _ in shown], len(shown)
+    measured = [m.numbered(i) for i, m in enumerate([*(m for _, m in shown), *low], 1)]
     patch = _patches(measured, images, levels)
     result = _joined(measured, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step, above most of the border
     ground = result.patches[int(np.argmax(_border_shares(patch)))].level_um
-    low = [result.patches[s.below].level_um - ground for s in result.steps]
-    moved = [z if math.isfinite(z) else 0.0 for z in low]
+    heights = [result.patches[s.below].level_um - ground for s in result.steps[:n]]
+    moved = [z if math.isfinite(z) else 0.0 for z in heights]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
-        measured = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
-        result = _joined(measured, patch, scan, levels)
+        again = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
+        result = _joined([*again, *measured[n:]], patch, scan, levels)
     return result
 
 
@@ -151,18 +156,9 @@ def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
             edge = replace(laid[0], detectors=tuple(dark))
         if laid is None:
             continue
-        if not any(_same(edge, other, scan.images.side) for other, _ in out):
+        if not any(is_on(edge, other, scan.images.side) for other, _ in out):
             out.append((edge, laid[1]))
     return out
-
-
-def _same(a: Edge, b: Edge, side: float) -> bool:
-    """Return whether edge a lies on edge b."""
-    if a.normal @ b.normal < math.cos(math.radians(20.0)):
-        return False
-    rel = np.stack([a.start, a.middle, a.end]) - b.middle
-    away, along = np.abs(rel @ b.normal), np.abs(rel @ b.along)
-    return bool(away[1] < 1.5 * side and along[1] < 0.5 * b.length)
 
 
 @dataclass(frozen=True)
@@ -178,6 +174,15 @@ class _Measured:
         """Return the edge with another number."""
         bands = tuple(replace(band, step=number) for band in self.bands)
         return replace(self, step=replace(self.step, number=number), bands=bands)
+
+
+def _low(scan: _Scan, measured: list[_Measured]) -> list[_Measured]:
+    """Find the steps that dashes show, apart from those whose bands are measured."""
+    used = [m for m in measured if m.step.is_used]
+    names, explained = scan.stack.instrument.detector_names, _explained(used, scan)
+    found = find_low_steps(scan.images, scan.seen_from(0.0), scan.beam_shift, names, explained)
+    low = (_Measured(edge, step, bands, step.height_um) for edge, step, bands in found)
+    return [m for m in low if not any(is_on(u.edge, m.edge, scan.images.side) for u in used)]
 
 
 def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -> _Measured:

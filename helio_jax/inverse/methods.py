@@ -187,7 +187,8 @@ def _refined(
     posterior, raster = fit.posterior, Raster.of(stack)
     if posterior is not None:
         region = regions(fit.joined_x, fit.joined_y)
-        is_floating |= floating(fit.surface.height, posterior.samples, region, posterior.common_modes)
+        known = used.known_steps(region)
+        is_floating |= floating(fit.surface.height, posterior.samples, region, posterior.common_modes, known)
     worst = fit.weight.min(0, where=stack.is_observed, initial=1.0)
     jumps = (
         depth_jumps(fit.surface.height, fit.surface.slope_x, fit.joined_x, raster.dx, 1),

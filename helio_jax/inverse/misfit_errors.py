@@ -139,10 +139,10 @@ def with_path_error(
     error = path_error(rec, misfit, Raster.of(stack), expected, settings, anchors)
     samples = add_common_modes(rec.height_samples, [error], SEED)
     std = np.sqrt(np.mean(samples**2, axis=0))
-    return flag_floating(rec.replace(height_samples=samples, height_std=std))
+    return flag_floating(rec.replace(height_samples=samples, height_std=std), anchors)
 
 
-def flag_floating(rec: Reconstruction) -> Reconstruction:
+def flag_floating(rec: Reconstruction, known: Anchors | None = None) -> Reconstruction:
     """Mark regions whose level the data do not fix, and specks of valid pixels, as floating.
 
     A region that only invalid pixels join to the largest one is floating when its level is uncertain by more than a
@@ -152,6 +152,7 @@ def flag_floating(rec: Reconstruction) -> Reconstruction:
         return rec
     region = valid_regions(rec.is_valid)
     is_speck = (np.bincount(region.ravel()) < MIN_REGION)[region] & (region > 0)
-    is_floating = rec.is_valid & (is_speck | floating(rec.height, rec.height_samples, region))
+    steps = None if known is None else known.known_steps(region)
+    is_floating = rec.is_valid & (is_speck | floating(rec.height, rec.height_samples, region, steps=steps))
     reason = np.where(is_floating, _FLOATING, rec.reason)
     return rec.replace(reason=reason, is_valid=reason == 0)

@@ -3,6 +3,8 @@
 The limits that make up the rule of `is_valid` are those of `validity`.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import coo_matrix
@@ -66,7 +68,11 @@ def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
 
 
 def floating(
-    height: np.ndarray, samples: np.ndarray, region: np.ndarray, common_modes: np.ndarray | None = None
+    height: np.ndarray,
+    samples: np.ndarray,
+    region: np.ndarray,
+    common_modes: np.ndarray | None = None,
+    steps: Mapping[int, tuple[float, np.ndarray]] | None = None,
 ) -> np.ndarray:
     """Return True where a region's level relative to the largest region is not fixed by the data [y, x].
 
@@ -78,6 +84,9 @@ def floating(
         samples: posterior deviations [sample, y, x], um.
         region: from `regions` [y, x].
         common_modes: as in `Posterior` [error, y, x], um.
+        steps: known steps between a region and the largest one, by number: height, and the weights that measure it
+            (`Anchors.known_steps`). A region whose step is known is fixed there: what its slopes add, which are
+            uncertain with a free border, they add within a region, too.
     """
     flags = np.zeros(height.shape, bool)
     if common_modes is not None:
@@ -88,7 +97,11 @@ def floating(
         inside = region == number
         step = abs(float(np.median(height[inside]) - np.median(height[substrate])))
         spread = float(np.std(samples[:, inside].mean(1) - samples[:, substrate].mean(1)))
-        flags |= inside & (spread > FLOATING * step)
+        is_floating = spread > FLOATING * step
+        if steps and number in steps:
+            known, weight = steps[number]
+            is_floating &= float(np.std(np.tensordot(samples, weight, 2))) > FLOATING * known
+        flags |= inside & is_floating
     return flags
 
 

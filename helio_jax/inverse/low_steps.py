@@ -1,0 +1,306 @@
+"""Heights of steps whose mask bands are shorter than a pixel, from all pixels along the edge.
+
+A pixel shows the surface at one point. Along an edge these points lie at all distances from it, up to half a pixel:
+together they show the signal across the step finer than the raster, where wall, mask and lower level begin and end.
+Place, direction and bend of the edge, height and width of the wall and the scattering at its foot are sampled from
+their posterior. A line that no step explains, such as a scratch, has none.
+
+Source: sampler: Goodman and Weare, Comm. Appl. Math. Comp. Sci. 5 (2010) 65.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from helio_jax.inverse.dash_lines import Line
+from helio_jax.inverse.low_wall import LowWall
+from helio_jax.inverse.wall_signal import Opening, WallSignal, wall_signal
+
+_NEAR = 1.2
+"""Pixels that are compared with the model: up to this distance from the line [pixels]."""
+_SIDES = 1.2, 5.0, 3.0
+"""Pixels that show the signal of a side: their least and largest distance from the line, and the standard deviation of
+their weight along it [pixels]."""
+_MODEL_ERROR = 0.03
+"""Error of the modelled signal, in that of the level."""
+_WALL_ERROR = 0.25
+"""Relative error on the wall: how it is inclined and what it sees is modelled roughly."""
+_FUZZ = 0.1
+"""How straight an edge is [pixels]."""
+_BEND = 0.2
+"""How far the middle of an edge is from the line between its ends: on a curved surface an oblique beam bends it
+[pixels]."""
+_OUTLIER = 3.0
+"""Residual from which on a pixel loses weight [standard deviations]."""
+_LONGEST = 0.02, 4.0
+"""Longest band of a step that is tried [pixels]."""
+_WIDEST = 0.8
+"""Greatest width of a wall [pixels]."""
+_SCATTER = 1.0, 0.6, 2.0
+"""Multiple scattering over the prediction: prior mean, standard deviation, and most."""
+_WALKERS = 32
+_ROUNDS = (4000, 40, 0.8, 0.03), (2000, 40, 0.2, 0.008), (1000, 160, 0.06, 0.003)
+"""Random starts, of which the best become walkers; moves of each, of which the second half counts; range of the first
+shifts [pixels] and turns [rad] of the line: in each round, about the best of the last one."""
+_LOST = 12.0
+"""Walkers whose cost is greater than the least one by more have not arrived [minus log likelihood]."""
+_TEMPERATURE = 2.0
+"""Factor on minus the logarithm of the likelihood: the model errs from pixel to pixel in common."""
+_AGAINST = 25.0
+"""Evidence against a step beyond the ends of its line, from which on it ends there: of three pixels or more that should
+be dark [minus log likelihood]."""
+_GAIN = 30.0
+"""Least gain of a step that is believed [minus log likelihood]."""
+SHAPE_STD = 0.05
+"""Standard deviation of heights by the shape of the wall, as a fraction: staircases of facets a quarter of a pixel wide
+come out 10 % too low."""
+
+
+@dataclass(frozen=True)
+class LowStep:
+    """A step lower than a pixel's worth of mask; lengths in pixels.
+
+    Attributes:
+        line: the upper edge.
+        height, std: of the step.
+        width: horizontal width of the wall.
+        gain: by how much a step explains the pixels better than none [minus log likelihood].
+        signals: of a vertical wall along the line [detector].
+    """
+
+    line: Line
+    height: float
+    std: float
+    width: float
+    gain: float
+    signals: tuple[WallSignal, ...]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Data; lengths in pixels.
+
+    Attributes:
+        place: of the pixels, about the middle of the image [y, x, 2].
+        signal, variance: NaN where not observed [detector, y, x].
+        openings: of the detectors.
+        beam_shift: `Instrument.beam_shift` [2].
+        spot: standard deviation of the beam's spot.
+    """
+
+    place: np.ndarray
+    signal: np.ndarray
+    variance: np.ndarray
+    openings: Sequence[Opening]
+    beam_shift: np.ndarray
+    spot: float
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Pixels along a line.
+
+    Attributes:
+        u, w: distance from the line, and place along it from the middle [pixel].
+        data, std: signal and its noise [detector, pixel].
+        upper, lower: signal of the two sides there [detector, pixel].
+        half: half the length of the line.
+        walls: signal across a wall along the line [detector].
+        fuzz: how far the edge may be from its line in a pixel: there, at its line, or as far before it.
+    """
+
+    u: np.ndarray
+    w: np.ndarray
+    data: np.ndarray
+    std: np.ndarray
+    upper: np.ndarray
+    lower: np.ndarray
+    half: float
+    walls: tuple[LowWall, ...]
+    fuzz: float
+
+    @classmethod
+    def of(cls, line: Line, scan: Scan, signals: Sequence[WallSignal], beyond: float = 0.5) -> "_Strip | None":
+        """Take the pixels along a line and `beyond` its ends; None where too few pixels show its sides."""
+        place = scan.place.reshape(-1, 2)
+        u, w = place @ line.normal - line.offset, place @ line.along - 0.5 * (line.start + line.end)
+        half = 0.5 * (line.end - line.start)
+        values, noise = (a.reshape(len(a), -1) for a in (scan.signal, scan.variance))
+        known = np.isfinite(values).all(0)
+        inside, sides = known & (np.abs(u) < _NEAR) & (np.abs(w) <= half + beyond), []
+        for way in (-1.0, 1.0):
+            beside = known & (way * u > _SIDES[0]) & (way * u < _SIDES[1])
+            weight = np.exp(-0.5 * ((w[inside, None] - w[None, beside]) / _SIDES[2]) ** 2)
+            if not weight.size or weight.sum(1).min() < 1.0:
+                return None
+            sides.append(values[:, beside] @ weight.T / weight.sum(1))
+        walls = tuple(LowWall.of(s, o, line.normal) for s, o in zip(signals, scan.openings, strict=True))
+        std = np.sqrt(np.maximum(noise[:, inside], 0.0))
+        fuzz = math.hypot(_FUZZ, scan.spot)
+        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, fuzz)
+
+    def costs(self, walkers: np.ndarray) -> np.ndarray:
+        """Compute minus the logarithm of the likelihood of every pixel [walker, pixel]; walkers as in `_prior`."""
+        shift, turn, log_height, width, scatter, bend = (walkers[:, i, None] for i in range(6))
+        height, width = np.exp(log_height), np.maximum(width, 1e-3)
+        u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
+        places = []
+        for place, share in ((-self.fuzz, 0.25), (0.0, 0.5), (self.fuzz, 0.25)):
+            total = np.full(u.shape, -math.log(share))
+            is_upper = u + place < 0.0
+            for k, wall in enumerate(self.walls):
+                model, is_wall = wall.profile(u + place, height, width, scatter)
+                side = np.where(is_upper, self.upper[k], self.lower[k])
+                error = np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
+                std = np.sqrt(self.std[k] ** 2 + (side * error) ** 2)
+                rest = (self.data[k] - side * model) / std
+                total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / side)
+            places.append(-total)
+        total = -np.logaddexp(np.logaddexp(places[0], places[1]), places[2])
+        return total / _TEMPERATURE
+
+    def without(self) -> np.ndarray:
+        """Compute the same of a surface without a step [pixel]."""
+        far = np.array([[self.fuzz + 2.0 * _NEAR, 0.0, 0.0, 0.1, 1.0, 0.0]])
+        return np.minimum(self.costs(far)[0], replace(self, upper=self.lower).costs(far)[0])
+
+
+def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
+    """Compute minus the logarithm of the prior [walker].
+
+    Args:
+        walkers: shift of the line [pixels], turn [rad], logarithm of the height, width of the wall [pixels], scattering
+            over the prediction, and bend [pixels] [walker, 6].
+        longest: band of the detector that shows the longest one, over the height.
+    """
+    _, _, log_height, width, scatter, bend = walkers.T
+    band = np.exp(log_height) * longest
+    mean, std, most = _SCATTER
+    is_out = (band < _LONGEST[0]) | (band > _LONGEST[1]) | (width < 0.0) | (width > _WIDEST)
+    is_out |= (scatter < 0.0) | (scatter > most)
+    # all inclinations of the wall are equally likely
+    inclined = np.log1p((width * np.exp(-log_height)) ** 2) + log_height
+    return np.where(is_out, np.inf, inclined + 0.5 * (((scatter - mean) / std) ** 2 + (bend / _BEND) ** 2))
+
+
+def _starts(rng: np.random.Generator, n: int, longest: float, shift: float, turn: float) -> np.ndarray:
+    """Draw n random walkers as in `_prior`, half of them without a bend, half of vertical walls.
+
+    `longest` as there; `shift` [pixels] and `turn` [rad]: the largest.
+    """
+    height = np.exp(rng.uniform(math.log(0.05), math.log(2.0), n)) / longest
+    width = height * np.tan(0.45 * np.pi * rng.random(n)) * rng.integers(0, 2, n)
+    columns = (
+        rng.uniform(-shift, shift, n),
+        rng.uniform(-turn, turn, n),
+        np.log(height),
+        np.minimum(width, _WIDEST * rng.random(n)),
+        rng.uniform(0.0, 1.5, n),
+        rng.normal(0.0, _BEND, n) * rng.integers(0, 2, n),
+    )
+    return np.stack(columns, -1)
+
+
+def _sampled(
+    cost: Callable[[np.ndarray], np.ndarray], first: np.ndarray, moves: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sample a posterior by the stretch move, from the best of some starts.
+
+    Args:
+        cost: minus the logarithm of the posterior of points [point, n] -> [point].
+        first: starts [start, n].
+        moves: of every walker; the second half counts.
+        rng: random numbers.
+
+    Returns:
+        Samples [sample, n] and their costs [sample].
+    """
+    value = cost(first)
+    best = np.argsort(value)[:_WALKERS]
+    at, value, kept = first[best].copy(), value[best].copy(), []
+    half, n = _WALKERS // 2, first.shape[1]
+    groups = np.arange(half), np.arange(half, _WALKERS)
+    for move in range(moves):
+        for mine, others in (groups, groups[::-1]):
+            z = (1.0 + rng.random(half)) ** 2 / 2.0
+            other = at[rng.choice(others, half)]
+            new = other + z[:, None] * (at[mine] - other)
+            moved = cost(new)
+            is_taken = np.log(rng.random(half)) < (n - 1) * np.log(z) + value[mine] - moved
+            at[mine[is_taken]], value[mine[is_taken]] = new[is_taken], moved[is_taken]
+        if move >= moves // 2:
+            kept.append((at.copy(), value.copy()))
+    points, values = zip(*kept, strict=True)
+    return np.concatenate(points), np.concatenate(values)
+
+
+def _moved(line: Line, shift: float, turn: float) -> Line:
+    """Return a line shifted along its normal [pixels] and turned about its middle [rad]."""
+    middle = line.normal * (line.offset + shift) + line.along * 0.5 * (line.start + line.end)
+    half, turned = 0.5 * (line.end - line.start), line._replace(angle=line.angle - math.atan(turn))
+    at = float(middle @ turned.along)
+    return Line(turned.angle, float(middle @ turned.normal), at - half, at + half)
+
+
+def _extended(line: Line, scan: Scan, signals: Sequence[WallSignal], walker: np.ndarray) -> Line:
+    """Extend a line at both ends up to where the pixels speak against a step.
+
+    Where no pixel lies in its band nothing tells whether a step goes on: it does, for a step rarely ends.
+    """
+    reach = float(np.hypot(scan.place[..., 0], scan.place[..., 1]).max())
+    strip = _Strip.of(line, scan, signals, beyond=2.0 * reach)
+    if strip is None:
+        return line
+    flat = walker.copy()
+    flat[5] = 0.0  # a bend is not to be extrapolated
+    gain = strip.costs(flat[None])[0] - strip.without()
+    ends = []
+    for way in (-1.0, 1.0):
+        beyond = way * strip.w > strip.half
+        order = np.argsort(way * strip.w[beyond])
+        place, against = (way * strip.w[beyond])[order], np.cumsum(gain[beyond][order])
+        stop = np.flatnonzero(against - np.minimum.accumulate(np.minimum(against, 0.0)) > _AGAINST)
+        if stop.size:
+            best = int(np.argmin(against[: stop[0] + 1]))
+            ends.append(float(place[best]) if against[best] < 0.0 else strip.half)
+        else:
+            ends.append(float(place.max(initial=strip.half)))
+    middle = 0.5 * (line.start + line.end)
+    return line._replace(start=middle - ends[0], end=middle + ends[1])
+
+
+def fit_step(line: Line, scan: Scan) -> LowStep | None:
+    """Measure the step along a line of dashes.
+
+    Args:
+        line: near the upper edge.
+        scan: data.
+
+    Returns:
+        The step; None where too few pixels show its sides, or no step explains them.
+    """
+    rng, found = np.random.default_rng(0), None
+    for tries, moves, *spread in _ROUNDS:
+        shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
+        signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
+        strip, longest = _Strip.of(line, scan, signals), max(s.length for s in signals)
+        if strip is None or longest <= 0.0:
+            return None
+        points, costs = _sampled(
+            lambda p, strip=strip, longest=longest: _prior(p, longest) + strip.costs(p).sum(1),
+            _starts(rng, int(tries), longest, *spread),
+            moves,
+            rng,
+        )
+        best = points[np.argmin(costs)]
+        gain = float(strip.without().sum() - strip.costs(best[None]).sum())
+        if gain < _GAIN:
+            return None
+        drawn = points[costs < costs.min() + _LOST]
+        height, width = np.exp(drawn[:, 2]), float(drawn[:, 3].mean())
+        line = _moved(line, float(best[0]), float(best[1]))
+        found = LowStep(line, float(height.mean()), float(height.std()), width, gain, signals)
+        line = _extended(line, scan, signals, np.array([0.0, 0.0, *best[2:]]))
+    return found

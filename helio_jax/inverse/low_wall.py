@@ -1,0 +1,74 @@
+"""Signal across a low wall that may slope, for one detector, tabulated for speed.
+
+As `wall_signal`, with a wall that falls by its height h over a horizontal width w: the point at the distance u from the
+upper edge in the raster lies, where it is the lower level, at the horizontal distance x = u + h (t . n) from the edge,
+and is masked from the part of the aperture with q > x / h. The beam sees the wall between u = 0 and u = w - h (t . n).
+Multiple scattering is that of a vertical wall, in proportion to the solid angle of an inclined one at its foot.
+
+Source: own derivation; tests/inverse/test_low_steps.py.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from helio_jax.inverse.wall_signal import Opening, WallSignal
+
+_NODES = 256
+"""Intervals of the tables."""
+
+
+class LowWall(NamedTuple):
+    """Signal across a wall of one detector at evenly spaced arguments from 0 to 1.
+
+    Attributes:
+        masked: fraction of the aperture masked from the lower level, by horizontal distance from the upper edge.
+        reach: distance from which on nothing is masked [heights]; unit of the arguments of `masked`.
+        level: multiple scattering at the distance d from the foot of a vertical wall, by d / (1 + d) [heights].
+        wall: the same on the wall, by height above the foot over that of the wall.
+        facet: direct signal of a wall, in that of the level, by its inclination over 90 deg.
+        shift: t . n.
+    """
+
+    masked: np.ndarray
+    reach: float
+    level: np.ndarray
+    wall: np.ndarray
+    facet: np.ndarray
+    shift: float
+
+    @classmethod
+    def of(cls, signal: WallSignal, opening: Opening, normal: np.ndarray) -> "LowWall":
+        """Tabulate the signal of a vertical wall that falls along a normal [2]."""
+        t = np.linspace(0.0, 1.0, _NODES + 1)
+        reach = max(float(signal.q[-1]), 1e-6)
+        tilt = 0.5 * np.pi * t[:, None]
+        facet = np.maximum(np.cos(tilt) + np.sin(tilt) * (opening.tau @ normal), 0.0) @ opening.weight
+        distance = t / np.maximum(1.0 - t, 1e-3)
+        return cls(signal.masked(reach * t), reach, signal.on_level(distance), signal.on_wall(t), facet, signal.shift)
+
+    def profile(
+        self, u: np.ndarray, height: np.ndarray, width: np.ndarray, scatter: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the signal, in that of the level, and where the wall is [..., pixel].
+
+        Args:
+            u: distance from the upper edge, in the raster [..., pixel].
+            height, width: of the wall [..., 1]; in units of u.
+            scatter: multiple scattering, over that of the cosine law [..., 1].
+        """
+        image = np.maximum(width - height * self.shift, 0.0)
+        x, tilt = np.maximum(u + height * self.shift, 0.0), np.arctan2(height, width)
+        away = np.maximum(x - width, 0.0)
+        more = scatter * (1.0 - np.cos(tilt))
+        low = 1.0 - _at(self.masked, x / (height * self.reach)) + more * _at(self.level, away / (away + height))
+        wall = _at(self.facet, tilt / (0.5 * np.pi)) + more * _at(self.wall, 1.0 - u / np.maximum(image, 1e-9))
+        is_wall = (u > 0.0) & (u < image)
+        return np.where(u <= 0.0, 1.0, np.where(is_wall, wall, low)), is_wall
+
+
+def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Interpolate a table of evenly spaced arguments from 0 to 1."""
+    place = np.clip(t, 0.0, 1.0) * _NODES
+    i = place.astype(np.intp)
+    return table[i] + (place - i) * np.append(np.diff(table), 0.0)[i]

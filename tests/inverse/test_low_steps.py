@@ -1,0 +1,143 @@
+"""Steps lower than a pixel's worth of mask: rasters drawn by an independent mask test, false alarms, scratches."""
+
+import math
+
+import numpy as np
+import pytest
+
+from helio_jax.forward.optics import Raster
+from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.dash_lines import find_dips, find_line
+from helio_jax.inverse.low_wall import LowWall
+from helio_jax.inverse.mask_steps import find_steps
+from helio_jax.inverse.measured_steps import walls_of
+from helio_jax.inverse.quality import floating, regions
+from helio_jax.inverse.wall_signal import opening_of, wall_signal
+from helio_jax.micrograph import MicrographStack
+from tests.inverse.test_mask_bands import NORMAL, OBLIQUE, unit
+
+PITCH, N = 10.0, 61
+
+
+def ramp_share(aperture, instrument, normal, u, height, width):
+    """Compute the direct signal of points of a ramp step, in that of the level [point], by segments and facets.
+
+    Args:
+        u: distance from the image of the upper edge along the normal [um].
+        height, width: of the ramp [um].
+    """
+    shift = np.array(instrument.beam_shift) @ normal
+    s, r = np.pi * (3.0 - math.sqrt(5.0)) * np.arange(400), np.sqrt((np.arange(400) + 0.5) / 400)
+    local = r[:, None] * np.stack([np.cos(s), np.sin(s)], -1) * aperture.semi_axes
+    turned = local @ np.stack([unit(math.degrees(aperture.rotation)), unit(math.degrees(aperture.rotation) + 90.0)])
+    tau = (turned + aperture.center - instrument.spot_position(0.0)[:2]) / instrument.working_distance
+    weight = (1.0 + np.sum(tau**2, -1)) ** -2.0
+    weight, away = weight / weight.sum(), tau @ normal
+    image = max(width - height * shift, 1e-9)
+    is_wall = (u > 0.0) & (u < image)
+    x = np.where(is_wall, width * u / image, u + height * shift)
+    drop = np.where(u <= 0.0, 0.0, np.where(is_wall, height * u / image, height))
+    size = math.hypot(height, width)
+    facet = np.maximum(width + height * away, 0.0) / size
+    is_seen = (x[:, None] + drop[:, None] * away >= 0.0) | (u <= 0.0)[:, None]
+    return np.where(is_wall[:, None], facet, is_seen) @ weight
+
+
+def drawn(turn, height, width=0.0, instrument=NORMAL, seed=0, noise=0.02, offset=0.0) -> MicrographStack:
+    """Draw a straight ramp step [pixels] through the image that falls towards `turn` [deg], without scattering."""
+    rng, normal = np.random.default_rng(seed), unit(turn)
+    axis = PITCH * (np.arange(N) - 0.5 * (N - 1))
+    u = (np.stack(np.meshgrid(axis, axis), -1) @ normal).ravel() - (offset + rng.uniform(-0.5, 0.5)) * PITCH
+    images = [ramp_share(a, instrument, normal, u, PITCH * height, PITCH * width) for a in instrument.apertures()]
+    counts = np.stack(images).reshape(-1, N, N) + noise * rng.standard_normal((3, N, N))
+    return stack_of(counts, noise, instrument)
+
+
+def stack_of(counts, noise, instrument=NORMAL) -> MicrographStack:
+    axis = PITCH * (np.arange(N) - 0.5 * (N - 1))
+    variance = np.full(counts.shape, noise**2)
+    return MicrographStack(counts, axis, axis, instrument, variance=variance, background=np.zeros(3), noise="poisson")
+
+
+@pytest.mark.parametrize("instrument", [NORMAL, OBLIQUE], ids=["normal", "oblique"])
+def test_profile_of_a_ramp(instrument):
+    """Direct signal of ramps of several inclinations as by segments; rejects a wall seen where the beam sees none."""
+    u = np.linspace(-5.0, 25.0, 241)
+    for turn in (10.0, 100.0, 190.0, 280.0):
+        for aperture in instrument.apertures():
+            opening = opening_of(aperture, instrument, 0.0)
+            signal = wall_signal(opening, instrument.beam_shift, unit(turn))
+            for height, width in ((6.0, 0.01), (6.0, 3.0), (4.0, 8.0)):
+                expected = ramp_share(aperture, instrument, unit(turn), u, height, width)
+                wall = LowWall.of(signal, opening, unit(turn))
+                found = wall.profile(u[None], *(np.array([[a]]) for a in (height, width, 0.0)))[0][0]
+                assert np.mean(np.abs(found - expected) < 0.03) > 0.98, (turn, height, width)
+
+
+CASES = [
+    (20.0, 0.45, 0.0, NORMAL),
+    (203.0, 0.25, 0.25, NORMAL),
+    (91.5, 0.4, 0.0, NORMAL),
+    (138.0, 0.3, 0.1, OBLIQUE),
+    (160.0, 0.6, 0.3, OBLIQUE),
+]
+
+
+@pytest.mark.parametrize(("turn", "height", "width", "instrument"), CASES)
+def test_a_step_that_only_dashes_show_is_measured(turn, height, width, instrument):
+    """Height within 3 standard deviations, of at most 35 %; the image is parted from border to border.
+
+    Catches a line that turns the wrong way, ends at its last dash, or falls to the wrong side, and a vertical wall in
+    place of a ramp.
+    """
+    found = find_steps(drawn(turn, height, width, instrument, seed=int(turn)))
+    (step,) = [s for s in found.steps if s.is_used]
+    off = (step.falls_deg - turn + 180.0) % 360.0 - 180.0
+    assert abs(off) < 1.0
+    assert abs(step.height_um - PITCH * height) < 3.0 * step.height_std_um < 3.0 * 0.35 * PITCH * height
+    raster = Raster.regular((N, N), PITCH, PITCH)
+    assert np.sum(np.bincount(regions(*(~cut for cut in walls_of(found, raster))).ravel()) > 100) == 2
+
+
+def test_noise_and_dirt_make_no_line():
+    """Dark pixels anywhere, 0.2 to 3 % of them: no line in 60 images, expected are 0.06; rejects a count alone."""
+    place = np.stack(np.meshgrid(*(np.arange(N) - 0.5 * (N - 1),) * 2), -1)
+    v = np.stack([opening_of(a, NORMAL, 0.0).mean for a in NORMAL.apertures()])
+    n_dips = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        counts = 1.0 + 0.03 * rng.standard_normal((3, N, N))
+        counts[rng.random(counts.shape) < rng.choice([0.002, 0.01, 0.03])] *= 0.2
+        dips = find_dips(counts, np.full(counts.shape, 0.03**2), np.ones(3), np.zeros(counts.shape, bool))
+        n_dips += int(dips.is_dip.sum())
+        assert find_line(dips, place, v) is None, seed
+    assert n_dips > 1000
+
+
+def test_a_scratch_is_no_step():
+    """A line that is dark in all detectors, or in opposite ones in turn, is a groove: no step."""
+    stack = drawn(20.0, 0.0001, seed=3)
+    u = np.stack(np.meshgrid(stack.x, stack.y), -1) @ unit(20.0)
+    groove = np.abs(u) < 0.25 * PITCH
+    assert groove.sum() > 20
+    counts = np.where(groove, 0.2, 1.0) * stack.counts
+    assert not [s for s in find_steps(stack.replace(counts=counts)).steps if s.is_used]
+
+
+def test_a_region_tied_by_a_known_step_does_not_float_on_a_slope():
+    """Two halves of equal medians, 4 um apart at their step: floating if nothing ties them, not if that is known.
+
+    Tilts of both, which move their means but not what they are apart at the step, count for nothing.
+    """
+    x = np.arange(20.0)
+    height = np.broadcast_to(np.where(x < 10, x, x - 10.0), (20, 20))
+    region = np.broadcast_to(np.where(x < 10, 0, 1), (20, 20))
+    samples = np.array([1.0, -1.0])[:, None, None] * (np.where(region == 1, 0.4, 0.0) + 0.3 * (x - 9.5))
+    weight = ((x == 9) / 20.0 - (x == 10) / 20.0) * np.ones((20, 1)) / 0.8
+    known = Anchors(weight[None], np.array([4.0 / 0.8]))
+    (tied,) = known.known_steps(region).values()
+    assert tied[0] == pytest.approx(4.0) and tied[1].sum(where=region == 0) == pytest.approx(1.0)
+    assert floating(height, samples, region)[:, 10:].all()
+    assert not floating(height, samples, region, steps=known.known_steps(region))[:, 10:].any()
+    assert floating(height, 2.0 * samples, region, steps=known.known_steps(region))[:, 10:].all()
+    assert known.known_steps(np.zeros_like(region)) == {}
