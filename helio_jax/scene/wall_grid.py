@@ -14,51 +14,51 @@ from helio_jax.arrays import WALL_PITCHES
 GAP = 1e-3
 """How far from the half-way line the points on both sides of it are [pixels]."""
 LEAST_JUMP = 2.0
-"""By how much more than the next ones two neighbours differ if a wall parts them [pitches]."""
+"""By how much the slope between neighbours that a wall parts exceeds the next ones."""
 
 Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
 """x, y, z of points [y, x], um."""
 
 
-def wall_links(z: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the neighbours that a wall parts: their heights differ far more than those beside them in line.
+def wall_links(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the neighbours that a wall parts: the slope between them is far above the next ones in line.
 
-    A facet two pixels wide is none, however steep, up to `WALL_PITCHES`.
+    A facet two pixels wide is none, however steep, up to a slope of `WALL_PITCHES`.
 
     Args:
+        x, y: positions on the raster [y, x], um; x increases with the column and y with the row.
         z: heights [y, x], um.
-        pitch: um.
 
     Returns:
         Whether a wall parts neighbours along x [y, x - 1], and along y [y - 1, x].
     """
     found = []
-    for heights in (z, z.T):
-        rise = np.pad(np.abs(np.diff(heights, axis=1)), ((0, 0), (1, 1)))
-        jump = rise[:, 1:-1] - np.maximum(rise[:, :-2], rise[:, 2:])
-        found.append((jump > LEAST_JUMP * pitch) | (rise[:, 1:-1] > WALL_PITCHES * pitch))
+    for place, heights in ((x, z), (y.T, z.T)):
+        slope = np.pad(np.abs(np.diff(heights, axis=1)) / np.diff(place, axis=1), ((0, 0), (1, 1)))
+        jump = slope[:, 1:-1] - np.maximum(slope[:, :-2], slope[:, 2:])
+        found.append((jump > LEAST_JUMP) | (slope[:, 1:-1] > WALL_PITCHES))
     return found[0], found[1].T
 
 
-def with_upright_walls(grid: Grid, beam_shift: tuple[float, float], pitch: float) -> tuple[Grid, np.ndarray]:
+def with_upright_walls(grid: Grid, beam_shift: tuple[float, float]) -> tuple[Grid, np.ndarray]:
     """Refine a beam-frame grid to one whose walls are half-way between the pixels, if it has any.
 
     Args:
         grid: x, y, z of the points of the pixels [y, x], um; without occlusion edges (`occluded_vertices`).
         beam_shift: `Instrument.beam_shift` of the grid.
-        pitch: of the raster, um.
 
     Returns:
         x, y, z [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the grid
         as it is.
     """
     z = grid[2]
-    walls = wall_links(z, pitch)
+    places = [p + t * z for p, t in zip(grid[:2], beam_shift, strict=True)]
+    walls = wall_links(*places, z)
     number = np.arange(z.size).reshape(z.shape)
     if not any(w.any() for w in walls):
         return grid, number
     height = _refined_heights(z, *walls)
-    x, y = (_refined_places(p + t * z) - t * height for p, t in zip(grid[:2], beam_shift, strict=True))
+    x, y = (_refined_places(p) - t * height for p, t in zip(places, beam_shift, strict=True))
     return (x, y, height), _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
 
 

@@ -312,7 +312,7 @@ class _Raster:
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
         pixel = self.pixels(at[0].shape)
         if is_fully_seen:
-            at, number = with_upright_walls(at, shift, self.pitch)
+            at, number = with_upright_walls(at, shift)
             body, pixel = surface_body(*at, **substrate), pixel[number]
         else:
             body = with_cavities(surface_body(*at, **substrate), at, behind)

@@ -19,8 +19,17 @@ def test_without_walls_nothing_changes():
     """Neither of noise nor of a facet of 72 degrees, three pixels wide."""
     z = np.random.default_rng(0).normal(0.0, 0.1, X.shape) + 3.0 * np.clip(X - 10.0, 0.0, 3.0 * PITCH)
     points = grid(z)
-    fine, number = with_upright_walls(points, SHIFT, PITCH)
+    fine, number = with_upright_walls(points, SHIFT)
     assert fine is points and np.array_equal(number.ravel(), np.arange(z.size))
+
+
+def test_far_points_around_the_image_are_no_wall():
+    """The substrate 100 um away and 60 um lower: a slope. Rejects a limit of the height alone."""
+    place = np.array([0.0, 2.0, 4.0, 104.0, 5000.0])
+    x, y = np.meshgrid(place, place)
+    z = np.where(np.maximum(x, y) > 10.0, 0.0, 60.0)
+    assert not any(walls.any() for walls in wall_links(x, y, z))
+    assert all(walls.any() for walls in wall_links(x / 50.0, y / 50.0, z))
 
 
 def test_walls_stand_half_way():
@@ -29,7 +38,7 @@ def test_walls_stand_half_way():
     Rejects a ramp from point to point: its heights are between the levels.
     """
     is_high = (X > 9.0) & (Y > 5.0)
-    fine, number = with_upright_walls(grid(20.0 * is_high), SHIFT, PITCH)
+    fine, number = with_upright_walls(grid(20.0 * is_high), SHIFT)
     x, y, z = fine
     assert z.shape == (34, 43) and set(np.unique(z)) == {0.0, 20.0}
     assert np.array_equal(z > 0.0, is_high.ravel()[number])
@@ -44,7 +53,7 @@ def test_surface_stays_closed_and_tilted_levels_plane():
     is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
     plane = 0.2 * X - 0.1 * Y
     z = plane + 18.0 * is_high
-    fine, number = with_upright_walls(grid(z), SHIFT, PITCH)
+    fine, number = with_upright_walls(grid(z), SHIFT)
     x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
     off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
     assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.median(np.abs(off)) < 1e-9
@@ -59,10 +68,10 @@ def test_wall_that_ends():
     Rejects corners that belong to the pixels beside the wall: they leave a hole.
     """
     depth = np.where((X < 22.0) & (np.abs(Y - 10.0) < 0.1), 1.5 * np.clip(22.0 - X, 0.0, None), 0.0)
-    along_x, along_y = wall_links(-depth, PITCH)
+    along_x, along_y = wall_links(X, Y, -depth)
     n_walls = along_y[:, :-1] + along_y[:, 1:].astype(int) + along_x[:-1] + along_x[1:]
     assert (n_walls == 1).any() and (n_walls == 2).any()
-    z = with_upright_walls(grid(-depth), SHIFT, PITCH)[0][2]
+    z = with_upright_walls(grid(-depth), SHIFT)[0][2]
     corners = np.stack([z[i::3, j::3] for i in (1, 2) for j in (1, 2)])
     spread = np.ptp(corners, axis=0)
     assert spread[n_walls <= 1].max() < 2.0 * GAP * depth.max() < 1.0 < spread[n_walls == 2].min()
