@@ -51,15 +51,15 @@ def with_upright_walls(grid: Grid, beam_shift: tuple[float, float]) -> tuple[Gri
         x, y, z [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the grid
         as it is.
     """
-    z = grid[2]
-    places = [p + t * z for p, t in zip(grid[:2], beam_shift, strict=True)]
-    walls = wall_links(*places, z)
+    (x, y, z), (tx, ty) = grid, beam_shift
+    place_x, place_y = x + tx * z, y + ty * z
+    walls = wall_links(place_x, place_y, z)
     number = np.arange(z.size).reshape(z.shape)
     if not any(w.any() for w in walls):
         return grid, number
     height = _refined_heights(z, *walls)
-    x, y = (_refined_places(p) - t * height for p, t in zip(places, beam_shift, strict=True))
-    return (x, y, height), _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
+    fine = _refined_places(place_x) - tx * height, _refined_places(place_y) - ty * height, height
+    return fine, _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
 
 
 def _inner(field: np.ndarray) -> np.ndarray:
