@@ -13,6 +13,8 @@ from helio_jax.arrays import WALL_PITCHES
 
 GAP = 1e-3
 """How far from the half-way line the points on both sides of it are [pixels]."""
+LEVEL_COSINE = 0.87
+"""Least z of the unit normal at the rim of a wall: it falls by less than 30 degrees."""
 LEAST_JUMP = 2.0
 """By how much the slope between neighbours that a wall parts exceeds the next ones."""
 
@@ -40,26 +42,54 @@ def wall_links(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray,
     return found[0], found[1].T
 
 
-def with_upright_walls(grid: Grid, beam_shift: tuple[float, float]) -> tuple[Grid, np.ndarray]:
+def has_level_rims(z: np.ndarray, normals: np.ndarray, is_foot: np.ndarray) -> bool:
+    """Decide whether the edges above occluded points are those of walls, not the limbs of round bodies.
+
+    A round body's hidden side begins where the beam grazes it; half a pixel before, its surface is far lower than at
+    the last pixel that is seen. True where nothing is occluded.
+
+    Args:
+        z: heights [y, x], um.
+        normals: unit normals [y, x, 3].
+        is_foot: points at the foot of a hidden side [y, x].
+    """
+    if not is_foot.any():
+        return True
+    top, upright = z.copy(), normals[..., 2].copy()
+    room = np.pad(np.stack([z, normals[..., 2]]), ((0, 0), (1, 1), (1, 1)), mode="edge")
+    for dy, dx in np.ndindex(3, 3):
+        height, cosine = room[:, dy : dy + len(z), dx : dx + z.shape[1]]
+        is_higher = height > top
+        top, upright = np.where(is_higher, height, top), np.where(is_higher, cosine, upright)
+    return bool(np.mean(upright[is_foot] > LEVEL_COSINE) > 0.5)
+
+
+def with_upright_walls(grid: Grid, behind: Grid, beam_shift: tuple[float, float]) -> tuple[Grid, Grid, np.ndarray]:
     """Refine a beam-frame grid to one whose walls are half-way between the pixels, if it has any.
 
     Args:
-        grid: x, y, z of the points of the pixels [y, x], um; without occlusion edges (`occluded_vertices`).
+        grid: x, y, z of the points of the pixels [y, x], um.
+        behind: the same with the lower ends of occlusion edges moved (`occluded_vertices`).
         beam_shift: `Instrument.beam_shift` of the grid.
 
     Returns:
-        x, y, z [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the grid
-        as it is.
+        Both refined [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the
+        grids as they are.
     """
     (x, y, z), (tx, ty) = grid, beam_shift
     place_x, place_y = x + tx * z, y + ty * z
     walls = wall_links(place_x, place_y, z)
     number = np.arange(z.size).reshape(z.shape)
     if not any(w.any() for w in walls):
-        return grid, number
-    height = _refined_heights(z, *walls)
+        return grid, behind, number
+    height, is_foot = _refined_heights(z, *walls)
     fine = _refined_places(place_x) - tx * height, _refined_places(place_y) - ty * height, height
-    return fine, _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
+    owner = _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
+    moved_x, moved_y, moved_z = (
+        new + np.where(is_foot, (end - start).ravel()[owner], 0.0)
+        for new, start, end in zip(fine, grid, behind, strict=True)
+    )
+    return fine, (moved_x, moved_y, moved_z), owner
 
 
 def _inner(field: np.ndarray) -> np.ndarray:
@@ -78,7 +108,7 @@ def _refined_places(place: np.ndarray) -> np.ndarray:
     return place
 
 
-def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:
+def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the heights of the points: means of the pixels around that no wall parts from the own one.
 
     Args:
@@ -86,27 +116,30 @@ def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> n
         wall_x, wall_y: from `wall_links`.
 
     Returns:
-        Heights [3 y - 2, 3 x - 2], um.
+        Heights, um, and whether a point is at the foot of a wall [3 y - 2, 3 x - 2].
     """
     ny, nx = z.shape
     room = np.pad(z, 1, mode="edge")
     # whether no wall parts columns x - 1 and x [y + 2, x + 1], rows y - 1 and y [y + 1, x + 2]; beyond the border: none
     open_x, open_y = (~np.pad(wall, 1) for wall in (wall_x, wall_y))
 
-    def mean(members: Sequence[tuple[int, int, np.ndarray]]) -> np.ndarray:
+    height, is_foot = np.empty((ny, 3, nx, 3)), np.zeros((ny, 3, nx, 3), bool)
+    height[:, 1, :, 1] = z
+
+    def average(at_y: int, at_x: int, members: Sequence[tuple[int, int, np.ndarray]]) -> None:
         """Average the own pixel and those at (dy, dx) that are joined to it."""
         total, count = z.copy(), np.ones(z.shape)
         for dy, dx, is_joined in members:
-            total += np.where(is_joined, room[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx], 0.0)
+            other = room[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx]
+            total += np.where(is_joined, other, 0.0)
             count += is_joined
-        return z + (1.0 - 2.0 * GAP) * (total / count - z)
+            is_foot[:, 1 + at_y, :, 1 + at_x] |= ~is_joined & (other > z)
+        height[:, 1 + at_y, :, 1 + at_x] = z + (1.0 - 2.0 * GAP) * (total / count - z)
 
-    height = np.empty((ny, 3, nx, 3))
-    height[:, 1, :, 1] = z
     for side in (-1, 1):
         ahead = (1 + side) // 2
-        height[:, 1, :, 1 + side] = mean([(0, side, open_x[1:-1, ahead : ahead + nx])])
-        height[:, 1 + side, :, 1] = mean([(side, 0, open_y[ahead : ahead + ny, 1:-1])])
+        average(0, side, [(0, side, open_x[1:-1, ahead : ahead + nx])])
+        average(side, 0, [(side, 0, open_y[ahead : ahead + ny, 1:-1])])
     for sy, sx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         column, row = (1 + sx) // 2, (1 + sy) // 2
         here_x, there_x = (open_x[1 + dy : 1 + dy + ny, column : column + nx] for dy in (0, sy))
@@ -115,5 +148,5 @@ def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> n
         to_x = here_x | (here_y & there_x & there_y)
         to_y = here_y | (here_x & there_y & there_x)
         to_both = (here_x & there_y) | (here_y & there_x)
-        height[:, 1 + sy, :, 1 + sx] = mean([(0, sx, to_x), (sy, 0, to_y), (sy, sx, to_both)])
-    return _inner(height.reshape(3 * ny, 3 * nx))
+        average(sy, sx, [(0, sx, to_x), (sy, 0, to_y), (sy, sx, to_both)])
+    return _inner(height.reshape(3 * ny, 3 * nx)), _inner(is_foot.reshape(3 * ny, 3 * nx))

@@ -27,7 +27,7 @@ from helio_jax.scene.body import Body
 from helio_jax.scene.border import extend_border, mirror_border
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
-from helio_jax.scene.wall_grid import Grid, with_upright_walls
+from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import passes_for, smooth_along_surface
 from helio_jax.trace.intersect import Hits, Intersector
@@ -294,16 +294,15 @@ class _Raster:
         """Ways in which the surface may go on beyond the image."""
         return CONTINUATIONS[:1] if self.has_flat_surroundings else CONTINUATIONS
 
-    def side(
-        self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level", is_fully_seen: bool = False
-    ) -> SurfaceHypothesis:
+    def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
         """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`.
 
-        Where the beam sees all of it, walls are half-way between the pixels.
+        Walls are half-way between the pixels, unless most of what is occluded lies behind round bodies.
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
         behind = occluded_vertices(*at, normals, shift, share)
+        has_walls = has_level_rims(height, normals, self.is_occluded(height, normals))
         substrate = {"reach": self.reach, "level": 0.0, "beam_shift": shift}
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
@@ -311,11 +310,10 @@ class _Raster:
                 at, behind = self.mirrored(at, behind, level)
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
         pixel = self.pixels(at[0].shape)
-        if is_fully_seen:
-            at, number = with_upright_walls(at, shift)
-            body, pixel = surface_body(*at, **substrate), pixel[number]
-        else:
-            body = with_cavities(surface_body(*at, **substrate), at, behind)
+        if has_walls:
+            at, behind, number = with_upright_walls(at, behind, shift)
+            pixel = pixel[number]
+        body = with_cavities(surface_body(*at, **substrate), at, behind)
         point = np.stack(seen, -1).reshape(-1, 3) + self.lift * normal
         beam_x, beam_y = (
             at + (own - view) * height
@@ -369,7 +367,11 @@ class _Raster:
 
     def sides(self, height: np.ndarray, normals: np.ndarray, way: str = "level") -> list[SurfaceHypothesis]:
         """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
+        shares = OCCLUDED_NODES if self.is_occluded(height, normals).any() else (0.0,)
+        return [self.side(height, normals, share, way) for share in shares]
+
+    def is_occluded(self, height: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Find the pixels at the foot of a side that the beam does not see [y, x]."""
         at = self.surface(self.x, self.y, height)
-        is_fully_seen = np.array_equal(occluded_vertices(*at, normals, self.view_shift, 1.0), at)
-        shares = (0.0,) if is_fully_seen else OCCLUDED_NODES
-        return [self.side(height, normals, share, way, is_fully_seen) for share in shares]
+        below_rim = occluded_vertices(*at, normals, self.view_shift, 1.0)
+        return np.any([a != b for a, b in zip(at, below_rim, strict=True)], axis=0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helio_jax.scene.surfaces import surface_body
-from helio_jax.scene.wall_grid import GAP, wall_links, with_upright_walls
+from helio_jax.scene.wall_grid import GAP, has_level_rims, wall_links, with_upright_walls
 
 PITCH = 2.0
 SHIFT = 0.3, -0.2
@@ -19,8 +19,8 @@ def test_without_walls_nothing_changes():
     """Neither of noise nor of a facet of 72 degrees, three pixels wide."""
     z = np.random.default_rng(0).normal(0.0, 0.1, X.shape) + 3.0 * np.clip(X - 10.0, 0.0, 3.0 * PITCH)
     points = grid(z)
-    fine, number = with_upright_walls(points, SHIFT)
-    assert fine is points and np.array_equal(number.ravel(), np.arange(z.size))
+    fine, behind, number = with_upright_walls(points, points, SHIFT)
+    assert fine is points and behind is points and np.array_equal(number.ravel(), np.arange(z.size))
 
 
 def test_far_points_around_the_image_are_no_wall():
@@ -38,7 +38,7 @@ def test_walls_stand_half_way():
     Rejects a ramp from point to point: its heights are between the levels.
     """
     is_high = (X > 9.0) & (Y > 5.0)
-    fine, number = with_upright_walls(grid(20.0 * is_high), SHIFT)
+    fine, _, number = with_upright_walls(grid(20.0 * is_high), grid(20.0 * is_high), SHIFT)
     x, y, z = fine
     assert z.shape == (34, 43) and set(np.unique(z)) == {0.0, 20.0}
     assert np.array_equal(z > 0.0, is_high.ravel()[number])
@@ -53,7 +53,7 @@ def test_surface_stays_closed_and_tilted_levels_plane():
     is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
     plane = 0.2 * X - 0.1 * Y
     z = plane + 18.0 * is_high
-    fine, number = with_upright_walls(grid(z), SHIFT)
+    fine, _, number = with_upright_walls(grid(z), grid(z), SHIFT)
     x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
     off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
     assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.median(np.abs(off)) < 1e-9
@@ -71,7 +71,28 @@ def test_wall_that_ends():
     along_x, along_y = wall_links(X, Y, -depth)
     n_walls = along_y[:, :-1] + along_y[:, 1:].astype(int) + along_x[:-1] + along_x[1:]
     assert (n_walls == 1).any() and (n_walls == 2).any()
-    z = with_upright_walls(grid(-depth), SHIFT)[0][2]
+    z = with_upright_walls(grid(-depth), grid(-depth), SHIFT)[0][2]
     corners = np.stack([z[i::3, j::3] for i in (1, 2) for j in (1, 2)])
     spread = np.ptp(corners, axis=0)
     assert spread[n_walls <= 1].max() < 2.0 * GAP * depth.max() < 1.0 < spread[n_walls == 2].min()
+
+
+def test_foot_of_a_hidden_side_is_moved():
+    """Points moved below an edge: in the refined grid those at the foot of its wall move, the seen pixel does not."""
+    z = np.where(X > 13.0, 0.0, 20.0)
+    at = grid(z)
+    behind = tuple(np.where(np.isclose(X, 14.0), f - 3.0, f) for f in at)
+    fine, moved, number = with_upright_walls(at, behind, SHIFT)
+    change = np.any([a != b for a, b in zip(fine, moved, strict=True)], axis=0)
+    assert change.any() and np.all(np.isclose(X.ravel()[number[change]], 14.0))
+    assert not change[::3, ::3].any() and np.all(fine[0][change] - moved[0][change] == pytest.approx(3.0))
+
+
+@pytest.mark.parametrize(("tilt_deg", "is_level"), [(20.0, True), (50.0, False)])
+def test_limb_of_a_round_body_is_no_rim(tilt_deg, is_level):
+    """The rim's normal decides, not that of the foot."""
+    z, up = np.where(X > 13.0, 0.0, 20.0), np.broadcast_to([0.0, 0.0, 1.0], (*X.shape, 3))
+    tilted = [np.sin(np.deg2rad(tilt_deg)), 0.0, np.cos(np.deg2rad(tilt_deg))]
+    normals = np.where(np.isclose(X, 12.0)[..., None], tilted, up)
+    assert has_level_rims(z, normals, np.isclose(X, 14.0)) == is_level
+    assert has_level_rims(z, normals, np.zeros(X.shape, bool))
