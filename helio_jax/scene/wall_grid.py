@@ -5,8 +5,6 @@ wall is somewhere between the points: half-way on the average. Every pixel is gi
 own square, and only pixels that no wall parts share their heights.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from helio_jax.arrays import WALL_PITCHES
@@ -109,7 +107,9 @@ def _refined_places(place: np.ndarray) -> np.ndarray:
 
 
 def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the heights of the points: means of the pixels around that no wall parts from the own one.
+    """Compute the heights of the points: means over the pixels around that no wall parts from the own one.
+
+    Towards a wall the surface goes on as it comes: a wall below an edge goes on down.
 
     Args:
         z: heights [y, x], um.
@@ -120,26 +120,34 @@ def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> t
     """
     ny, nx = z.shape
     room = np.pad(z, 1, mode="edge")
+    half_x, half_y = (
+        {side: np.pad(step, 1, mode="edge") for side, step in steps.items()}
+        for steps in (_half_steps(z, wall_x), {k: step.T for k, step in _half_steps(z.T, wall_y.T).items()})
+    )
     # whether no wall parts columns x - 1 and x [y + 2, x + 1], rows y - 1 and y [y + 1, x + 2]; beyond the border: none
     open_x, open_y = (~np.pad(wall, 1) for wall in (wall_x, wall_y))
-
     height, is_foot = np.empty((ny, 3, nx, 3)), np.zeros((ny, 3, nx, 3), bool)
     height[:, 1, :, 1] = z
 
-    def average(at_y: int, at_x: int, members: Sequence[tuple[int, int, np.ndarray]]) -> None:
-        """Average the own pixel and those at (dy, dx) that are joined to it."""
-        total, count = z.copy(), np.ones(z.shape)
-        for dy, dx, is_joined in members:
-            other = room[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx]
-            total += np.where(is_joined, other, 0.0)
+    def average(sy: int, sx: int, joined: dict[tuple[int, int], np.ndarray]) -> None:
+        """Set the points towards (sy, sx): the mean of what the own pixel and those joined to it have there."""
+        total, count = np.zeros(z.shape), np.zeros(z.shape)
+        for (dy, dx), is_joined in {(0, 0): np.ones(z.shape, bool), **joined}.items():
+            window = np.s_[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx]
+            there = room[window] + sum(
+                half[-side if delta else side][window]
+                for half, side, delta in ((half_x, sx, dx), (half_y, sy, dy))
+                if side
+            )
+            total += np.where(is_joined, there, 0.0)
             count += is_joined
-            is_foot[:, 1 + at_y, :, 1 + at_x] |= ~is_joined & (other > z)
-        height[:, 1 + at_y, :, 1 + at_x] = z + (1.0 - 2.0 * GAP) * (total / count - z)
+            is_foot[:, 1 + sy, :, 1 + sx] |= ~is_joined & (room[window] > z)
+        height[:, 1 + sy, :, 1 + sx] = z + (1.0 - 2.0 * GAP) * (total / count - z)
 
     for side in (-1, 1):
         ahead = (1 + side) // 2
-        average(0, side, [(0, side, open_x[1:-1, ahead : ahead + nx])])
-        average(side, 0, [(side, 0, open_y[ahead : ahead + ny, 1:-1])])
+        average(0, side, {(0, side): open_x[1:-1, ahead : ahead + nx]})
+        average(side, 0, {(side, 0): open_y[ahead : ahead + ny, 1:-1]})
     for sy, sx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         column, row = (1 + sx) // 2, (1 + sy) // 2
         here_x, there_x = (open_x[1 + dy : 1 + dy + ny, column : column + nx] for dy in (0, sy))
@@ -148,5 +156,21 @@ def _refined_heights(z: np.ndarray, wall_x: np.ndarray, wall_y: np.ndarray) -> t
         to_x = here_x | (here_y & there_x & there_y)
         to_y = here_y | (here_x & there_y & there_x)
         to_both = (here_x & there_y) | (here_y & there_x)
-        average(sy, sx, [(0, sx, to_x), (sy, 0, to_y), (sy, sx, to_both)])
+        average(sy, sx, {(0, sx): to_x, (sy, 0): to_y, (sy, sx): to_both})
     return _inner(height.reshape(3 * ny, 3 * nx)), _inner(is_foot.reshape(3 * ny, 3 * nx))
+
+
+def _half_steps(z: np.ndarray, walls: np.ndarray) -> dict[int, np.ndarray]:
+    """Compute the change of heights over half a pixel towards the columns -1 and +1 beside [y, x], um.
+
+    Towards a wall: as on the other side of the pixel, but not past what is beyond the wall.
+    """
+    step = np.pad(np.diff(z, axis=1), ((0, 0), (1, 1)))
+    is_open = np.pad(~walls, ((0, 0), (1, 1)), constant_values=True)
+    out = {}
+    for side, ahead, back in ((1, np.s_[:, 1:], np.s_[:, :-1]), (-1, np.s_[:, :-1], np.s_[:, 1:])):
+        to_other = side * step[ahead]
+        goes_on = 0.5 * side * np.where(is_open[back], step[back], 0.0)
+        goes_on = np.where(to_other > 0.0, np.minimum(goes_on, to_other), np.maximum(goes_on, to_other))
+        out[side] = np.where(is_open[ahead], 0.5 * to_other, goes_on)
+    return out

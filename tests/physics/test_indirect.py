@@ -83,9 +83,11 @@ def predictions(name: str, **changes):
     hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     height, normals = hits.point[:, 2].reshape(grid_x.shape), hits.normal.reshape(*grid_x.shape, 3)
     stack = MicrographStack(np.zeros((3, *height.shape)), x, y, scene.instrument)
-    with mock.patch(
-        "helio_jax.workflows.corrections.OCCLUDED_NODES", (0.0, 0.0)
-    ):  # the sheet along the beam, as radiosity has it
+    about = "helio_jax.workflows.corrections."
+    with (  # as radiosity has them: the sheet along the beam, walls as ramps from pixel to pixel
+        mock.patch(about + "OCCLUDED_NODES", (0.0, 0.0)),
+        mock.patch(about + "has_level_rims", lambda *_: False),
+    ):
         traced, ours = (
             make_predictor(stack, 2_000_000, scene.substrate_size, multiple=model)(height, normals).multiple
             for model in ("traced", "radiosity")

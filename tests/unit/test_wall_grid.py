@@ -49,14 +49,14 @@ def test_walls_stand_half_way():
 
 
 def test_surface_stays_closed_and_tilted_levels_plane():
-    """A tilted plane with a ring-shaped wall: one sheet, and off the plane by at most half a pixel's rise, at walls."""
+    """A tilted plane with a ring-shaped wall: one sheet, both levels plane up to the wall but in its single corners."""
     is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
     plane = 0.2 * X - 0.1 * Y
     z = plane + 18.0 * is_high
     fine, _, number = with_upright_walls(grid(z), grid(z), SHIFT)
     x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
     off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
-    assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.median(np.abs(off)) < 1e-9
+    assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.mean(np.abs(off) > 1e-9) < 0.03
     edges = np.sort(surface_body(*fine).faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, times = np.unique(edges, axis=0, return_counts=True)
     assert times.max() == 2 and np.sum(times == 1) == 2 * (np.sum(fine[2].shape) - 2)
