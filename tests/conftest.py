@@ -1,5 +1,6 @@
 """Shared fixtures of the tests."""
 
+import gc
 import os
 import shutil
 import sys
@@ -74,6 +75,7 @@ def _few_memory_maps():
     maps = Path("/proc/self/maps")
     if "jax" in sys.modules and maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
         sys.modules["jax"].clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
