@@ -32,7 +32,7 @@ def smooth_along_surface(
         images: [image, y, x].
         normals: unit normals [y, x, 3].
         points: of the surface, sample frame [y, x, 3], um.
-        pitch: of the raster, um.
+        pitch: of the raster, the larger of both, um.
         passes: at least 1.
 
     Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004) 664, eq. 3; passes: Dammertz, Sewtz, Hanika and

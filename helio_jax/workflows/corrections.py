@@ -322,9 +322,9 @@ class _Raster:
         return SurfaceHypothesis(self, beam_x, beam_y, Hits.on_mesh(point, normal), body, pixel, Intersector(body))
 
     @property
-    def pitch(self) -> float:
-        """Larger pitch, um."""
-        return max(pitch(self.x[0]), pitch(self.y[:, 0]))
+    def pitches(self) -> tuple[float, float]:
+        """Pitch along x and y, um."""
+        return pitch(self.x[0]), pitch(self.y[:, 0])
 
     def pixels(self, shape: tuple[int, ...]) -> np.ndarray:
         """Number the pixels of the image; in a grid with more points around it, the nearest one's of each [point]."""
@@ -333,7 +333,7 @@ class _Raster:
     def smoothed(self, images: np.ndarray, height: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
         """Smooth images [image, y, x] along a surface of heights [y, x], um, and unit normals [y, x, 3]."""
         points = np.stack(self.surface(self.x, self.y, height), -1)
-        return smooth_along_surface(images, normals, points, self.pitch, passes)
+        return smooth_along_surface(images, normals, points, max(self.pitches), passes)
 
     def denoised(self, height: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
@@ -344,7 +344,7 @@ class _Raster:
         mean = self.smoothed(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), height, normals)
         smooth = np.moveaxis(mean[:3], 0, -1)
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
-        is_near = np.abs(mean[3] - height) < MAX_SMOOTHING_STEP * self.pitch
+        is_near = np.abs(mean[3] - height) < MAX_SMOOTHING_STEP * min(self.pitches)
         return np.where(is_near, mean[3], height), smooth
 
     def surface(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Grid:
@@ -354,7 +354,7 @@ class _Raster:
     def mirrored(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
         """Mirror a grid at the image's border; the occluded side of what is added stays on the sheet along the beam."""
         n = int(MIRRORED * min(self.x.shape))
-        dx, dy = pitch(self.x[0]), pitch(self.y[:, 0])
+        dx, dy = self.pitches
         x, y = np.meshgrid(
             *(p[0] + step * np.arange(-n, p.size + n) for p, step in ((self.x[0], dx), (self.y[:, 0], dy)))
         )
