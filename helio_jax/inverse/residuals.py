@@ -179,18 +179,16 @@ class LawResponse(eqx.Module):
     """How the multiple scattering follows the numbers of the law: alike in all pixels, as an exponential.
 
     Attributes:
-        multiple: multiple scattering as predicted [detector, y, x].
-        at: numbers of its law, in prior standard deviations from their means [number].
-        rate: derivative of its logarithm by them [number].
+        at: numbers of the law of the prediction, in prior standard deviations from their means [number].
+        rate: derivative of the logarithm of the multiple scattering by them [number].
     """
 
-    multiple: Any
     at: Any
     rate: Any
 
-    def change(self, numbers: jax.Array) -> jax.Array:
-        """Compute the change of the multiple scattering [detector, y, x] at other numbers."""
-        return self.multiple * jnp.expm1(jnp.sum(self.rate * (numbers - self.at)))
+    def exponent(self, numbers: jax.Array) -> jax.Array:
+        """Compute the change of that logarithm at other numbers."""
+        return jnp.sum(self.rate * (numbers - self.at))
 
 
 class Edges(eqx.Module):
@@ -218,7 +216,8 @@ class FixedTerms(eqx.Module):
         patches: 1 in the pixels of each patch, 0 elsewhere [patch, y, x].
         inverse_sigma: robust weight over standard deviation, 0 where not observed [detector, y, x].
         form_factors: their expansion.
-        multiple: multiple scattering, per albedo of the own patch [detector, y, x].
+        multiple: multiple scattering as predicted, per albedo of the own patch [detector, y, x].
+        intercept: of its linear model in the own normal (`state.linearised_in_normal`), likewise [detector, y, x].
         occluded: change of the data by one standard deviation of where the occluded side stands, likewise
             [detector, y, x].
         surroundings: change of the data by one standard deviation of how the sample goes on beyond the image, likewise
@@ -247,6 +246,7 @@ class FixedTerms(eqx.Module):
     inverse_sigma: Any
     form_factors: FormFactors
     multiple: Any
+    intercept: Any
     occluded: Any
     surroundings: Any
     noise_bias: Any
@@ -347,10 +347,11 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     if law is not None:
         single = single * mean_over_aperture(law, moved_optics(fixed.optics, moves), surface.height, normal)
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
-    multiple = fixed.multiple
+    exponent = p.multiple * parameters.log_multiple
     if fixed.law_response is not None:
-        multiple = multiple + fixed.law_response.change(parameters.law)
-    multiple = multiple * jnp.exp(p.multiple * parameters.log_multiple)[:, None, None]
+        exponent = exponent + fixed.law_response.exponent(parameters.law)
+    # its own scale only: the intercept holds several times the multiple scattering, which `factors` subtract again
+    multiple = fixed.intercept + jnp.expm1(exponent)[:, None, None] * fixed.multiple
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
     if parameters.surroundings.size:
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings

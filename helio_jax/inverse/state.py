@@ -41,7 +41,7 @@ class Held:
         corrections: made for `surface`.
         surface: heights and slopes.
         masked: masked form factors as a linear model in the own normal [detector, 3, y, x].
-        multiple: intercept of that model: multiple scattering plus what `masked` subtracts of it [detector, y, x].
+        intercept: of that model: multiple scattering plus what `masked` subtracts of it [detector, y, x].
         sigma: standard deviation of the data, prediction errors included, infinite where not observed [detector, y, x].
         moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
         moved: the moves at which they were made [move, detector].
@@ -53,7 +53,7 @@ class Held:
     corrections: Corrections
     surface: Surface
     masked: np.ndarray
-    multiple: np.ndarray
+    intercept: np.ndarray
     sigma: np.ndarray
     moves: np.ndarray
     moved: np.ndarray
@@ -156,13 +156,13 @@ def _largest_change(image: np.ndarray) -> np.ndarray:
 def _held(problem: FitProblem, corrections: Corrections, surface: Surface, parameters: Parameters) -> Held:
     """Derive what a solve needs of corrections made for a surface, without responses."""
     normals, moved = surface.normals(problem.shift), problem.moves(parameters)
-    masked, multiple = linearised_in_normal(corrections, normals)
+    masked, intercept = linearised_in_normal(corrections, normals)
     albedo = problem.patches_at(parameters).albedo
     variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
     moves = np.zeros((len(moved), *corrections.masked.shape))
     law = np.asarray(parameters.law)
-    return Held(corrections, surface, masked, multiple, sigma, moves, moved, (), np.zeros(law.size), law)
+    return Held(corrections, surface, masked, intercept, sigma, moves, moved, (), np.zeros(law.size), law)
 
 
 def set_corrections(problem: FitProblem, state: FitState, corrections: Corrections, surface: Surface) -> FitState:

@@ -203,7 +203,8 @@ def freeze(
         patches=problem.patches.members,
         inverse_sigma=inverse_sigma * problem.stride,
         form_factors=pixels.factors,
-        multiple=held.multiple,
+        multiple=held.corrections.multiple,
+        intercept=held.intercept,
         occluded=_or_nothing(held.corrections.occluded, problem),
         surroundings=_or_nothing(held.corrections.surroundings, problem),
         noise_bias=pixels.noise_bias,
@@ -221,7 +222,7 @@ def freeze(
         slope_scale_y=scale_y,
         priors=priors,
         optics=problem.optics,
-        law_response=None if priors.law is None else LawResponse(held.corrections.multiple, held.law_at, held.law_rate),
+        law_response=None if priors.law is None else LawResponse(held.law_at, held.law_rate),
         dx=dx,
         dy=dy,
         slow_axis=problem.order.slow_axis,
@@ -232,7 +233,7 @@ def freeze(
 
 def _common_modes(held: Held, gain: np.ndarray) -> CommonModes:
     """Stack the responses, filled up with empty ones, so that one compilation serves different numbers of them."""
-    n, shape = len(held.responses), held.multiple.shape
+    n, shape = len(held.responses), held.intercept.shape
     room = MODE_BLOCK * max(1, -(-n // MODE_BLOCK))
     weights, change = np.zeros((room, *shape[1:])), np.zeros((room, *shape))
     for i, response in enumerate(held.responses):
