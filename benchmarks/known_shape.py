@@ -11,9 +11,10 @@ incidence +-1 deg, gains x0.5 to x2, offsets 1 to 3 times the signal, albedo rat
 fit is told the instrument as stated, the ball's radius and the variance of the noise, nothing else. Printed: root mean
 square of the pulls (value - true) / stated s.d. of every parameter that the scans determine, chi-square per pixel.
 
-With `--then-refine` a pyramid is traced with the same drawn instrument, untilted, and read out like a measured scan,
-other gains and offsets included. `hx.reconstruct` makes heights of it by the calibrated instrument, and for comparison
-by the instrument as stated.
+With `--then-refine` a pyramid is traced with the same drawn instrument, untilted, as another scan of the campaign: the
+same gains, offsets and pedestal, at another place of the stage, with drift, offsets of scan lines and noise of its own.
+`hx.reconstruct` makes heights of it by the calibrated instrument, and for comparison without its read-out, and by the
+instrument as stated.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,8 @@ from helio_jax.calibration.known_objects import KnownObject  # noqa: E402
 from helio_jax.calibration.known_report import as_record, calibrated_instrument  # noqa: E402
 from helio_jax.calibration.unknowns import OBJECT  # noqa: E402
 from helio_jax.errors import GuardError  # noqa: E402
+from helio_jax.forward.form_factor import substrate_signal  # noqa: E402
+from helio_jax.forward.optics import Optics  # noqa: E402
 from helio_jax.forward.readout import pedestal_modes  # noqa: E402
 from helio_jax.instrument import Instrument  # noqa: E402
 from helio_jax.workflows.calibrate_known import calibrate_known  # noqa: E402
@@ -49,6 +52,11 @@ TWIN_RAYS = 512
 KNOWN = "ball radius=1000"
 PYRAMID = {"kind": "pyramid", "size_um": SUBSTRATE, "base_um": 700.0, "top_um": 300.0, "height_um": 140.0}
 PYRAMID_PITCH = 30.0
+REACH = 0.3 * FIELD
+"""Largest distance of its scan from the ball's on the stage, along each axis [um]."""
+N_PEDESTAL = 9
+"""Shapes of a cubic pedestal."""
+INSTRUMENTS = "calibrated", "without read-out", "as stated"
 
 
 def draw(seed: int, stated: Instrument) -> tuple[Instrument, dict[str, float]]:
@@ -84,29 +92,55 @@ def scan(seed: int, size: int, rays: int) -> tuple[hx.MicrographStack, dict[str,
     numbers |= {name: math.radians(truth[name]) for name in ("tilt x", "tilt y")}
     axis = (np.arange(size) - 0.5 * (size - 1)) * FIELD / size
     scene = known_scene(KnownObject.parse(KNOWN), numbers, true, axis, axis, substrate_um=SUBSTRATE)
-    return read_out(scene, axis, stated, rays, seed, "poisson"), truth
+    return read_out(scene, axis, stated, rays, seed, "poisson", Campaign.draw(seed, true), np.zeros(2)), truth
+
+
+class Campaign(NamedTuple):
+    """What all scans of a campaign share: signal of the substrate, gain, offset, pedestal over the stage."""
+
+    signal: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+    pedestal: np.ndarray
+
+    @classmethod
+    def draw(cls, seed: int, true: Instrument) -> "Campaign":
+        """Draw the read-out of a seed."""
+        rng, n = np.random.default_rng([seed, 11]), len(true.detector)
+        signal = SIGNAL * 2.0 ** rng.uniform(-1.0, 1.0, n)
+        offset = signal * rng.uniform(1.0, 3.0, n)
+        pedestal = signal[:, None] * rng.normal(0.0, PEDESTAL, (n, N_PEDESTAL))
+        return cls(signal, signal / np.asarray(substrate_signal(Optics.of(true))), offset, pedestal)
 
 
 def read_out(
-    scene: SceneFile, axis: np.ndarray, stated: Instrument, rays: int, seed: int, noise: str
+    scene: SceneFile,
+    axis: np.ndarray,
+    stated: Instrument,
+    rays: int,
+    seed: int,
+    noise: str,
+    campaign: Campaign,
+    stage: np.ndarray,
 ) -> hx.MicrographStack:
-    """Trace a scene; return what a real detector would read, the variance known where the noise is "poisson"."""
+    """Trace a scene; return what real detectors would read, the variance known where the noise is "poisson"."""
     size = axis.size
     beam = scene.beam.model_copy(update={"source": "uniform"})  # a spot of finite size, which the fit does not know
     traced = hx.simulate(scene.model_copy(update={"beam": beam}), rays=rays, seed=seed + 1, maps=False).only()
-    probability = traced.counts.reshape(-1, size, size)
-    rng, (v, u) = np.random.default_rng([seed, 7]), np.meshgrid(*[np.linspace(-1.0, 1.0, size)] * 2, indexing="ij")
-    modes, images, variance = pedestal_modes(u, v, 3)[0], [], []
-    for image in probability:
-        signal = SIGNAL * 2.0 ** rng.uniform(-1.0, 1.0)
-        reading = signal * (image / np.median(image) + rng.uniform(1.0, 3.0))
-        reading += np.tensordot(rng.normal(0.0, PEDESTAL * signal, len(modes)), modes, 1)
-        reading += DRIFT * signal * np.sin(2.5 * v + rng.uniform(0.0, 2.0 * np.pi))
+    assert traced.n_rays
+    probability = traced.counts.reshape(-1, size, size) / traced.n_rays
+    rng, time_of_line = np.random.default_rng([seed, 7]), np.linspace(-1.0, 1.0, size)[:, None]
+    x, y = ((axis + s) / (0.5 * FIELD) for s in stage)
+    modes, images, variance = pedestal_modes(*np.meshgrid(x, y), 3)[0], [], []
+    for image, signal, gain, offset, pedestal in zip(probability, *campaign, strict=True):
+        reading = gain * image + offset + np.tensordot(pedestal, modes, 1)
+        reading += DRIFT * signal * np.sin(2.5 * time_of_line + rng.uniform(0.0, 2.0 * np.pi))
         reading += rng.normal(0.0, LINES * signal, (size, 1))
         images.append(reading + rng.normal(0.0, signal / SNR, image.shape))
         variance.append(np.full(image.shape, (signal / SNR) ** 2))
     known = np.array(variance) if noise == "poisson" else None
-    return hx.MicrographStack(np.array(images), axis, axis, stated, variance=known, noise=noise, name=f"twin {seed}")
+    about = {"variance": known, "noise": noise, "name": f"twin {seed}", "stage_position": np.append(stage, 0.0)}
+    return hx.MicrographStack(np.array(images), axis, axis, stated, **about)
 
 
 def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument]) -> dict[str, dict[str, float | None]]:
@@ -121,9 +155,12 @@ def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument])
     scene, out = SceneFile.model_validate(tables | {"truth": region}), {}
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).tolist()
     as_list = SceneFile.model_validate(tables | {"scan": {"kind": "list", "points_um": points}})
+    campaign = Campaign.draw(seed, true)
+    stage = np.random.default_rng([seed, 13]).uniform(-REACH, REACH, 2)
     for name, instrument in instruments.items():
         try:
-            rec = hx.reconstruct(read_out(as_list, axis, instrument, rays, seed + 5000, "measured"), method="refine")
+            stack = read_out(as_list, axis, instrument, rays, seed + 5000, "measured", campaign, stage)
+            rec = hx.reconstruct(stack, method="refine")
         except GuardError as e:
             print(f"twin {seed}, instrument {name}: refused: {e}")
             continue
@@ -144,7 +181,9 @@ def evaluate(seed: int, size: int, twin_rays: int, then_refine: bool, **changes:
     about = {name: record[name] for name in ("chi_square", "robust_chi_square", "inflation", "is_converged", "rounds")}
     about |= {"seed": seed, "pixels": size, "pulls": pulls, "determined": determined, "s": time.time() - begin}
     if then_refine:
-        instruments = {"calibrated": calibrated_instrument(fit), "as stated": fit.stated}
+        calibrated = calibrated_instrument(fit)
+        without = calibrated.model_copy(update={"readout": None})
+        instruments = dict(zip(INSTRUMENTS, (calibrated, without, fit.stated), strict=True))
         about["heights"] = heights(seed, size, twin_rays, instruments)
     return about
 
@@ -163,7 +202,7 @@ def collect(found: list[dict[str, Any]]) -> list[rows.Row]:
     out.append(rows.row("1", "chi-square per pixel", text, "0.95 to 1.1", bool(0.95 <= np.median(chi) <= 1.1)))
     lost = [f["seed"] for f in found if not f["is_converged"]]
     out.append(rows.row("1", "fits that have not converged", f"{len(lost)} of {len(found)} {lost}", "0", not lost))
-    for name in ("calibrated", "as stated"):
+    for name in INSTRUMENTS:
         of = [f["heights"][name] for f in found if name in f.get("heights", {})]
         refused = sum("heights" in f for f in found) - len(of)
         if refused:

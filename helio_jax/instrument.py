@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from helio_jax.campaign import CampaignReadout
 from helio_jax.detector import Aperture, Cone, Detector
 from helio_jax.drawable import Drawable
 from helio_jax.errors import SceneError
@@ -206,6 +207,7 @@ class Instrument(Drawable, Settings):
     plate: Plate
     uncertainty: Uncertainty = Uncertainty()
     covariance: Covariance | None = None
+    readout: CampaignReadout | None = None
     detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")
@@ -290,7 +292,7 @@ class Instrument(Drawable, Settings):
         for (incidence, azimuth), of_beam in members.items():
             beam = self.beam.changed(incidence_deg=incidence, azimuth_deg=azimuth)
             detectors = tuple(self.detector[k].model_copy(update={"beam_deg": None}) for k in of_beam)
-            out.append((self.model_copy(update={"beam": beam, "detector": detectors}), tuple(of_beam)))
+            out.append((self.model_copy(update={"beam": beam, "detector": detectors, "readout": None}), tuple(of_beam)))
         return tuple(out)
 
     @property

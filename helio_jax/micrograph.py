@@ -25,13 +25,18 @@ class Calibration:
         priors: settings of the fit (table [reconstruct.refine]) that state how uncertain the calibration is; a setting
             that the user gives wins. Numbers or lists of numbers.
         without_multiple: whether predicted multiple scattering was subtracted from the counts.
+        warnings: what to know before heights are trusted.
     """
 
     method: Literal["border", "constant_albedo"]
     priors: Mapping[str, Any] = field(default_factory=dict)
     without_multiple: bool = False
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "warnings", tuple(self.warnings))
+        if not all(isinstance(text, str) for text in self.warnings):
+            raise InputFileError("calibration.warnings must be texts")
         if self.method not in ("border", "constant_albedo"):
             raise InputFileError(f"calibration.method must be border or constant_albedo, got {self.method!r}")
         if not isinstance(self.priors, Mapping) or not isinstance(self.without_multiple, bool):
@@ -58,8 +63,8 @@ class ScanAlignment:
             object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
-SIMULATED_PARTS = "by_order", "effuse", "plate", "masked", "shadowed"
-"""Fields that only the simulation of one scan on its own raster has: what is made of scans has none of them."""
+OF_ONE_SCAN = "by_order", "effuse", "plate", "masked", "shadowed", "stage_position"
+"""Fields that only one scan on its own raster has: what is made of scans has none of them."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -88,6 +93,8 @@ class MicrographStack(OnRaster):
             background are then scaled to `dwell` seconds in every pixel. None: `dwell` everywhere.
         fast_axis: axis along which the scan moves fastest.
         sample_rotation: rotation of the sample about the plate normal [rad].
+        stage_position: position of the stage (x, y, height) where the beam position is 0, 0 [3], um, so that stage
+            position = stage_position + beam position in x and y; None: unknown.
         noise: "expected" (noise-free expectation), "poisson" (counts) or "measured".
         unit: unit of the counts ("counts", "A").
         name: short name of the scan.
@@ -117,6 +124,7 @@ class MicrographStack(OnRaster):
     dwell_map: np.ndarray | None = None
     fast_axis: Literal["x", "y"] = "x"
     sample_rotation: float = 0.0
+    stage_position: np.ndarray | None = None
     noise: Literal["expected", "poisson", "measured"] = "expected"
     unit: str = "counts"
     name: str = "scan"
@@ -137,6 +145,7 @@ class MicrographStack(OnRaster):
             "dwell_map": shape[1:],
             "positions": (self.x.size, 2),
             "by_order": (None, *shape),
+            "stage_position": (3,),
         }
         is_background_image = self.background is not None and np.ndim(self.background) == 3
         others["background"] = shape if is_background_image else shape[:1]

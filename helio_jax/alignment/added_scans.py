@@ -12,7 +12,7 @@ import numpy as np
 
 from helio_jax.arrays import as_float_array, pitch
 from helio_jax.errors import InputFileError
-from helio_jax.micrograph import SIMULATED_PARTS, MicrographStack
+from helio_jax.micrograph import OF_ONE_SCAN, MicrographStack
 
 OFF_RASTER = 0.01
 """Positions of a list may be off the raster's by this share of its pitch."""
@@ -62,7 +62,7 @@ def add_scans(first: MicrographStack, *others: MicrographStack) -> MicrographSta
     counts, variance, background = mean(1, 1), mean(2, 2), mean(3, 1)
     if background is not None:
         background = np.where(total > 0.0, background, 0.0)
-    dropped = dict.fromkeys(SIMULATED_PARTS)
+    dropped = dict.fromkeys(OF_ONE_SCAN)
     return first.replace(
         counts=counts,
         variance=variance,
@@ -139,7 +139,7 @@ def add_positions(
         raise error(f"{first.name}: states no dwell time: set it (MicrographStack.dwell)")
     turn = first.sample_rotation if rotation_deg is None else math.radians(rotation_deg)
     made = first.replace(
-        **dict.fromkeys((*SIMULATED_PARTS, "is_observed", "variance")),
+        **dict.fromkeys((*OF_ONE_SCAN, "is_observed", "variance")),
         counts=(recorded * first.dwell / seconds)[:, None],
         x=np.arange(float(n)),
         y=np.zeros(1),
@@ -173,7 +173,7 @@ def _empty_raster(stack: MicrographStack, rasters: Sequence[MicrographStack]) ->
             "they lie"
         )
     first = of_instrument[0]
-    dropped = dict.fromkeys(SIMULATED_PARTS)
+    dropped = dict.fromkeys(OF_ONE_SCAN)
     return first.replace(
         counts=np.full(first.shape, np.nan),
         is_observed=np.zeros(first.shape, bool),

@@ -17,7 +17,7 @@ import numpy as np
 from helio_jax.detector import Aperture
 from helio_jax.errors import InputFileError
 from helio_jax.instrument import Instrument
-from helio_jax.micrograph import SIMULATED_PARTS, MicrographStack
+from helio_jax.micrograph import OF_ONE_SCAN, MicrographStack
 
 MAX_PERMUTED = 4
 """Up to so many detectors all orders of the images are tried; with more only shifts and reversals along the ring."""
@@ -104,7 +104,7 @@ def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> Mi
     x, y = turn.axes(stack.x, stack.y)
     is_odd = turn.turn_deg % 180 == 90
     fast = {"x": "y", "y": "x"}[stack.fast_axis] if is_odd else stack.fast_axis
-    return stack.replace(x=x, y=y, fast_axis=fast, **fields)
+    return stack.replace(x=x, y=y, fast_axis=fast, stage_position=None, **fields)
 
 
 def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
@@ -127,7 +127,7 @@ def bin_stack(stack: MicrographStack, max_pixels: int) -> MicrographStack:
     background = stack.background
     if background is not None and background.ndim == 3:
         background = of(background)
-    dropped = dict.fromkeys((*SIMULATED_PARTS, "parallax", "parallax_height"))
+    dropped = dict.fromkeys((*OF_ONE_SCAN, "parallax", "parallax_height"))
     return stack.replace(
         counts=of(stack.counts),
         x=stack.x[: columns * n].reshape(columns, n).mean(1),

@@ -15,7 +15,7 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Detector, Instrument
-from helio_jax.micrograph import SIMULATED_PARTS, MicrographSet, MicrographStack, ScanAlignment
+from helio_jax.micrograph import OF_ONE_SCAN, MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
@@ -220,7 +220,7 @@ def resample(
                 level = np.broadcast_to(stack.background[k], image.shape)  # type: ignore[index]
                 background.append(SplineImage.of(level, known, stack.x, stack.y).at(places)[0])
     first = scans.stacks[0]
-    dropped = dict.fromkeys((*SIMULATED_PARTS, "calibration", "dwell_map"))
+    dropped = dict.fromkeys((*OF_ONE_SCAN, "calibration", "dwell_map"))
     return first.replace(
         counts=np.stack(counts),
         x=x,

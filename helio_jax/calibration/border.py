@@ -1,17 +1,22 @@
 """First calibration of a measured scan on its flat border: spikes, noise, slow drift, background and gain.
 
 Measured stack (counts with unknown background and gain) -> the same stack in units of the beam, ready for a fit.
-Drift and gain are estimated on the border, whose expected signal is known; the background from the darkest pixels:
-there the sample masks the whole aperture, and the counts above the background are multiple scattering, an assumed
-fraction of the substrate's signal. These are first estimates: `Calibration.priors` leave gain, offset, drift and
-offsets of scan lines as unknowns to the fit. Needs a flat border and a masked spot in each image.
+Drift and gain are estimated on the border, whose expected signal is known. The background is that of the measuring
+campaign where the instrument states one ([readout], `shared_background`) and the border does not contradict it. Else it
+comes from the darkest pixels: there the sample masks the whole aperture, and the counts above the background are
+multiple scattering, an assumed fraction of the substrate's signal; each image needs a masked spot then. These are first
+estimates: `Calibration.priors` leave gain, offset, drift and offsets of scan lines as unknowns to the fit.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
+from scipy.stats import chi2
 
 from helio_jax.arrays import border_mask, robust_std
 from helio_jax.calibration.noise_model import estimate_noise, find_spikes, line_noise
+from helio_jax.calibration.shared_background import shared_background
 from helio_jax.errors import GuardError
 from helio_jax.micrograph import Calibration, MicrographStack
 from helio_jax.settings import Settings
@@ -20,6 +25,12 @@ _PRIORS = {"gain_std": 0.3, "offset_std": 0.3, "max_rounds": 6}
 _DRIFT_PRIORS = {"drift_std": 0.2}
 """Priors of the fit: relative standard deviation of the gain, standard deviations of background and residual drift over
 the substrate's signal, and its iterations: with an unknown instrument heights converge more slowly."""
+_KNOWN_DRIFT_STD = 0.05
+"""That of the drift where the background is the campaign's."""
+_FALSE_ALARM = 1e-4
+"""Probability at which the border of a scan contradicts the background of its campaign by chance."""
+LEAST_KNOWN = 0.3
+"""The campaign's background is used where its standard deviation is below this share of the signal."""
 
 
 class CalibrateSettings(Settings):
@@ -33,6 +44,10 @@ class CalibrateSettings(Settings):
     """Quantile of each image that is taken for a wholly masked spot."""
     masked_share: float = Field(default=0.27, ge=0.0, lt=0.9)
     """Multiple scattering in such a spot, as a fraction of the substrate's signal (0.27 in the simulated sphere A)."""
+    readout: bool = True
+    """Whether the background is taken from the instrument's [readout] where there is one."""
+    readout_std: float = Field(default=0.02, ge=0.0, le=1.0)
+    """By how much it may differ from scan to scan of a campaign [standard deviation, over the substrate's signal]."""
     drift: bool = True
     """Whether drift is subtracted and left as an unknown of the fit."""
     noise_model: bool = True
@@ -86,6 +101,59 @@ def _without_faults(stack: MicrographStack, settings: CalibrateSettings) -> tupl
     return stack, record
 
 
+class _Background(NamedTuple):
+    """Background of a scan as it was found.
+
+    Attributes:
+        mean: [detector, y, x] or [detector, 1, 1], counts.
+        source: where it comes from, in words.
+        priors: settings of the fit that go with it.
+        warnings: why the campaign's was not used.
+    """
+
+    mean: np.ndarray
+    source: str
+    priors: dict[str, float]
+    warnings: tuple[str, ...] = ()
+
+
+def _of_darkest_pixels(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettings) -> _Background:
+    """Estimate the background by the darkest pixels."""
+    steady = _steady(stack, frame, settings)
+    flat = np.nanmedian(steady[:, frame], axis=1)
+    darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)
+    background = darkest - settings.masked_share / (1.0 - settings.masked_share) * (flat - darkest)
+    return _Background(background[:, None, None], "darkest pixels", {})
+
+
+def _find_background(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettings) -> _Background:
+    """Take the background from the campaign; where that is not known, or contradicted, from the darkest pixels."""
+    readout = stack.instrument.readout
+    if readout is None or not settings.readout:
+        return _of_darkest_pixels(stack, frame, settings)
+    shared = shared_background(stack, readout)
+    level_std = np.hypot(shared.level_std / shared.signal, settings.readout_std)
+    above = _steady(stack.replace(counts=stack.counts - shared.mean), frame, settings)
+    ratio = np.nanmedian(above[:, frame], axis=1) / shared.signal
+    # the level of the border is measured: an error of the background changes the signal above it by as much
+    weight = level_std**-2.0
+    misfit = float(np.sum(weight * (ratio - np.sum(weight * ratio) / np.sum(weight)) ** 2))
+    why = ""
+    if np.any(level_std > LEAST_KNOWN):
+        why = f"it is known to {np.max(level_std):.0%} of the signal only: the scan lies outside of the stage window"
+    elif not np.all(ratio > 0.0) or (len(ratio) > 1 and chi2.sf(misfit, len(ratio) - 1) < _FALSE_ALARM):
+        each = zip(stack.instrument.detector_names, ratio, level_std, strict=True)
+        numbers = ", ".join(f"{name!r} {r:.2f} +- {std:.2f}" for name, r, std in each)
+        why = f"with it the border's signal, relative to the campaign's, would be {numbers}, which do not agree"
+    if why:
+        text = f"the background of the instrument file ([readout]) was NOT used: {why}. Taken from the darkest pixels"
+        return _of_darkest_pixels(stack, frame, settings)._replace(warnings=(text,))
+    priors = {"offset_std": float(np.max(level_std))}
+    if settings.drift:
+        priors["drift_std"] = float(np.hypot(_KNOWN_DRIFT_STD, np.max(shared.shape_std / shared.signal)))
+    return _Background(shared.mean, "campaign" if shared.is_placed else "campaign, stage position unknown", priors)
+
+
 def calibrate_on_border(
     stack: MicrographStack, flat_signal: np.ndarray, settings: CalibrateSettings
 ) -> MicrographStack:
@@ -98,37 +166,38 @@ def calibrate_on_border(
 
     Raises:
         GuardError: a detector's border is not brighter than its background, so that it has no signal.
+        SceneError: the instrument's read-out is of other detectors or of another unit.
     """
     frame = border_mask(stack.shape[1:], settings.border_fraction)
     stack, record = _without_faults(stack, settings)
     assert stack.variance is not None  # `_without_faults` estimates it
-    steady = _steady(stack, frame, settings)
-    flat = np.nanmedian(steady[:, frame], axis=1)
-    darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)
-    background = darkest - settings.masked_share / (1.0 - settings.masked_share) * (flat - darkest)
-    for detector, level, dark in zip(stack.instrument.detector, flat, background, strict=True):
-        if not level > dark:
+    found = _find_background(stack, frame, settings)
+    steady = _steady(stack.replace(counts=stack.counts - found.mean), frame, settings)
+    signal, background = np.nanmedian(steady[:, frame], axis=1), np.mean(found.mean, axis=(1, 2))
+    for detector, above, dark in zip(stack.instrument.detector, signal, background, strict=True):
+        if not above > 0.0:
             raise GuardError(
-                f"detector {detector.name!r} has no signal: its flat border ({level:g} {stack.unit}) is not brighter "
-                f"than its background ({dark:g}); check the channel and that the border of the image is flat"
+                f"detector {detector.name!r} has no signal: its flat border ({above + dark:g} {stack.unit}) is not "
+                f"brighter than its background ({dark:g}); check the channel and that the border of the image is flat"
             )
-    gain = (flat - background) / flat_signal
+    gain = signal / flat_signal
     scale = gain[:, None, None]
     pixel_std = np.sqrt(np.nanmedian(np.where(frame, stack.variance, np.nan), axis=(1, 2)))
     of_lines = line_noise(stack, steady, frame)
-    lines = float(np.sqrt(np.mean((of_lines / (flat - background)) ** 2)))
+    lines = float(np.sqrt(np.mean((of_lines / signal) ** 2)))
     record["line_noise"] = of_lines.tolist()
-    priors = _PRIORS | (_DRIFT_PRIORS if settings.drift else {})
+    priors = _PRIORS | (_DRIFT_PRIORS if settings.drift else {}) | found.priors
     priors |= {"line_std": lines} if settings.lines and lines > 0 else {}
-    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": flat.tolist()}
-    record |= {"snr": ((flat - background) / pixel_std).tolist(), "pixel_std": pixel_std.tolist()}
+    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": (signal + background).tolist()}
+    record |= {"background_from": found.source, "warnings": list(found.warnings)}
+    record |= {"snr": (signal / pixel_std).tolist(), "pixel_std": pixel_std.tolist()}
     record["settings"] = settings.model_dump(mode="json")
     return stack.replace(
-        counts=(steady - background[:, None, None]) / scale,
+        counts=steady / scale,
         variance=stack.variance / scale**2,
         background=None,
         n_rays=1.0,
         unit="detected per beam atom",
-        calibration=Calibration("border", priors),
+        calibration=Calibration("border", priors, warnings=found.warnings),
         provenance={**stack.provenance, "calibrate": record},
     )

@@ -6,6 +6,7 @@ import numpy as np
 
 from helio_jax.arrays import robust_std
 from helio_jax.calibration.known_shape import KnownFit
+from helio_jax.calibration.shared_background import campaign_readout
 from helio_jax.geometry_prior import geometry_covariance
 from helio_jax.instrument import Covariance, Instrument, Uncertainty
 
@@ -45,9 +46,10 @@ def table(fit: KnownFit) -> list[Row]:
 def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
     """List gain, substrate's signal, offset, line noise and noise of every detector of every scan, in counts."""
     out = []
-    for scan, linear, std, lines, seen, expected in zip(
-        fit.scans, fit.linear, fit.linear_std, fit.line_std, fit.seen, fit.expected, strict=True
+    for scan, linear, covariance, lines, seen, expected in zip(
+        fit.scans, fit.linear, fit.linear_covariance, fit.line_std, fit.seen, fit.expected, strict=True
     ):
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         for k, name in enumerate(fit.instrument.detector_names):
             background = np.tensordot(linear[k, 1:], scan.columns.modes, 1)
             signal = float(np.median((expected[k] - background)[~seen.is_object & ~seen.is_masked.any(0)]))
@@ -162,7 +164,9 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
         "tilt_deg": stated.tilt_deg,
     }
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
-    return fit.instrument.model_copy(update={"uncertainty": uncertainty, "covariance": covariance})
+    signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)
+    found = {"uncertainty": uncertainty, "covariance": covariance, "readout": campaign_readout(fit, signals)}
+    return fit.instrument.model_copy(update=found)
 
 
 def as_record(fit: KnownFit) -> dict[str, Any]:

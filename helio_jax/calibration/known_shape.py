@@ -80,6 +80,9 @@ class KnownScan:
         columns: linear unknowns of the read-out.
         signal: about that of the substrate, in counts [detector].
         slow_axis: of the raster.
+        stage: stage position (x, y) of the raster's middle [2], um; None: unknown.
+        half_width: of the raster in x and y [2], um.
+        dwell: dwell time per pixel [s], or None; `unit`: of the counts.
     """
 
     name: str
@@ -92,6 +95,10 @@ class KnownScan:
     columns: Columns
     signal: np.ndarray
     slow_axis: int
+    stage: np.ndarray | None
+    half_width: np.ndarray
+    dwell: float | None
+    unit: str
 
     @property
     def n_linear(self) -> int:
@@ -124,6 +131,7 @@ def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShap
     reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
     low, high = np.nanquantile(np.where(used, counts, np.nan).reshape(len(counts), -1), [0.01, 0.6], axis=1)
     slow = 0 if stack.fast_axis == "x" else 1
+    middle = np.array([0.5 * (axis[0] + axis[-1]) for axis in (stack.x, stack.y)])
     return KnownScan(
         stack.name,
         counts,
@@ -135,6 +143,10 @@ def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShap
         readout_columns(stack.x, stack.y, slow, settings),
         high - low,
         slow,
+        None if stack.stage_position is None else stack.stage_position[:2] + middle,
+        0.5 * np.array([np.ptp(stack.x), np.ptp(stack.y)]),
+        stack.dwell,
+        stack.unit,
     )
 
 
@@ -148,7 +160,8 @@ class KnownFit:
         names, units, stated_values, priors, values, stds: of the free unknowns, in the units shown.
         covariance: of the free unknowns over their prior standard deviations, inflated.
         n_shared: of them are those of the instrument, the first ones.
-        linear, linear_std: of every scan, gain and the columns [detector, column].
+        linear: of every scan, gain and the columns [detector, column].
+        linear_covariance: of these, detector by detector [detector, column, column], per scan.
         residuals: in standard deviations, NaN where not used [detector, y, x], per scan.
         expected: readings [detector, y, x], per scan.
         weights: robust weights of the pixels [detector, y, x], per scan.
@@ -171,7 +184,7 @@ class KnownFit:
     covariance: np.ndarray
     n_shared: int
     linear: list[np.ndarray]
-    linear_std: list[np.ndarray]
+    linear_covariance: list[np.ndarray]
     residuals: list[np.ndarray]
     expected: list[np.ndarray]
     weights: list[np.ndarray]
@@ -593,7 +606,10 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
         for a, k in zip(u, fit.layout.scan_of, strict=True)
     ]
     prior, stated = np.array([a.prior for a in u]), np.array([a.stated for a in u])
-    parts = np.split(std, fit.offsets[:-1])[1:]
+    linear_covariance = []
+    for first, size in zip(fit.offsets[:-1], fit.prior, strict=True):
+        own = covariance[first : first + size.size, first : first + size.size].reshape(*size.shape, *size.shape)
+        linear_covariance.append(np.einsum("kikj,ki,kj->kij", own, size, size))
     residuals, expected, seen = [], [], []
     for i, scan in enumerate(fit.scans):
         at = fit.layout.of_scan(i, fit.x)
@@ -603,7 +619,7 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     return KnownFit(
         fit.fitted(), fit.stated, fit.scans, names, [a.unit for a in u], stated, prior, stated + prior * fit.x,
         prior * std[:n], covariance[:n, :n], fit.layout.n_shared, fit.linear,
-        [p * s.reshape(p.shape) for p, s in zip(fit.prior, parts, strict=True)],
+        linear_covariance,
         residuals, expected, fit.weights, seen, fit.lines, chi_square, float(inflation), rounds, is_converged,
     )  # fmt: skip
 

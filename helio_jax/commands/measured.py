@@ -234,6 +234,8 @@ def calibrate(
     found = calibrate_file(stack, output, **given)
     assert found.calibration is not None  # just made
     record, priors = found.provenance["calibrate"], found.calibration.priors
+    for text in found.calibration.warnings:
+        say(f"warning: {text}")
     if as_json:
         about = {"priors": dict(priors), "detectors": found.instrument.detector_names}
         print(json.dumps({**record, **about}))
@@ -253,6 +255,7 @@ def calibrate(
             f"{law:>17}{spikes:>8}"
         )
     print(f"flat: signal above the background; prior standard deviation of the background: {priors['offset_std']:.0%}")
+    print(f"background from: {record['background_from']}")
     print(f"{output}\n{output.with_suffix('.png')}")
 
 

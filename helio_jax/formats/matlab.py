@@ -265,10 +265,24 @@ def _bshem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tup
         "x": _centred(n_rows, _raw_pitch(path, scan, "vert", n_rows) * pm),
         "y": _centred(n_columns, _raw_pitch(path, scan, "hori", n_columns) * pm),
         "dwell": get_number(path, scan, "dwell_time", low=0.0) * 1e-3,
+        "stage_position": _stage_position(path, scan, pm),
         "fast_axis": "y" if fast == "horizontal" else "x",
         "noise": "measured",
     }
     return fields, _measured_notes("raw[::-1, ::-1].T, the scan runs from +x, +y to -x, -y", fast, variance)
+
+
+def _stage_position(path: str, scan: dict[str, Any], unit: float) -> np.ndarray | None:
+    """Return the stage's x, y and height [um] in the middle of a B-SHeM scan; None where the file does not state them.
+
+    x = -vert and y = -hori, as the raster is read; `pos` holds the axes of the stage, the third is its height.
+    """
+    ranges = [scan.get(f"{direction}_range") for direction in ("vert", "hori")]
+    place = np.asarray(scan.get("pos", ()), float).ravel()
+    if any(np.size(r) != 2 for r in ranges) or place.size < 3:
+        return None
+    x, y = (-float(np.mean(np.asarray(r, float))) for r in ranges)
+    return unit * np.array([x, y, place[2]])
 
 
 def _ashem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:

@@ -63,6 +63,7 @@ STACK_FIELDS = (
     Field("dwell", "dwell_time", "s", "dwell time per pixel"),
     Field("dwell_map", "dwell_map", "s", "dwell time of every pixel; counts are scaled to dwell_time"),
     Field("sample_rotation", "sample_rotation", "rad", "rotation of the sample about the plate normal"),
+    Field("stage_position", "stage_position", "um", "stage position (x, y, height) where the beam position is 0, 0"),
     Field("fast_axis", "fast_axis", "", "axis along which the scan moves fastest"),
     Field("noise", "noise", "", "expected, poisson or measured counts"),
     Field("unit", "unit", "", "unit of the counts"),

@@ -25,7 +25,7 @@ from helio_jax.inverse.methods import warnings_of
 from helio_jax.inverse.posterior import MAX_PIXELS
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.micrograph import SIMULATED_PARTS, Micrographs, MicrographSet, MicrographStack
+from helio_jax.micrograph import OF_ONE_SCAN, Micrographs, MicrographSet, MicrographStack
 from helio_jax.planning.dwell import Cost, DwellTimes, Groups, spend
 from helio_jax.planning.positions import Positions, block_size, nearest_pixels, number_blocks, round_dwell
 from helio_jax.workflows.heights import Report, calibrate, fit_scans
@@ -440,7 +440,7 @@ def _like(first: MicrographStack, rotation_deg: float) -> MicrographStack:
     """Make a scan like the first one at another rotation, not recorded yet: its counts only fill its place."""
     level = float(np.median(first.counts[first.is_observed]))
     filled = np.full(first.shape, level)
-    dropped = dict.fromkeys((*SIMULATED_PARTS, "dwell_map"))
+    dropped = dict.fromkeys((*OF_ONE_SCAN, "dwell_map"))
     return first.replace(
         counts=filled,
         variance=None if first.variance is None else np.full(first.shape, max(level, 1.0)),

@@ -1,0 +1,68 @@
+"""What the detectors read in all scans of one measuring campaign: table `[readout]` of an instrument file.
+
+Most counts of a real detector do not come from the sample. This background changes smoothly with the position of the
+stage and, as far as scans of one campaign tell, not from scan to scan. `helio calibrate --known` writes the table,
+`helio_jax.calibration.campaign_background` reads it for another scan.
+"""
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from helio_jax.settings import Settings
+
+
+class DetectorReadout(Settings):
+    """One detector: table `[[readout.detector]]`, in the unit of the readings."""
+
+    name: str = Field(min_length=1, max_length=64)
+    """Name of the detector."""
+    signal: float = Field(gt=0.0)
+    """What the level substrate adds to the background. The sum of both is known much better than either."""
+    background: tuple[float, ...] = Field(min_length=1, max_length=50)
+    """Background: in the middle of the stage window, then amplitudes of the shapes of `hx.pedestal_modes` over it."""
+    std: tuple[float, ...]
+    """Standard deviation of each of these numbers."""
+    correlation: tuple[tuple[float, ...], ...]
+    """Their correlation matrix."""
+
+    @model_validator(mode="after")
+    def _is_a_covariance(self) -> "DetectorReadout":
+        n = len(self.background)
+        if len(self.std) != n or [len(row) for row in self.correlation] != [n] * n:
+            raise ValueError(f"std and correlation must be of {n} numbers, as background: one each, and a square table")
+        matrix = np.array(self.correlation)
+        if min(self.std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
+            raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
+        return self
+
+    def covariance(self) -> np.ndarray:
+        """Compute the covariance of the numbers of `background`."""
+        return np.array(self.correlation) * np.outer(self.std, self.std)
+
+
+class CampaignReadout(Settings):
+    """Read-out of a measuring campaign: table `[readout]` of an instrument file."""
+
+    unit: str = Field(default="counts", max_length=32)
+    """Unit of the readings."""
+    dwell_s: float | None = Field(default=None, gt=0.0)
+    """Dwell time per pixel that the readings belong to; others are scaled by it [s]. Default: unknown, never scaled."""
+    window_um: tuple[float, float]
+    """Half the width of the stage window in x and y, over which the background is a polynomial [um]."""
+    stage_um: tuple[float, float] | None = None
+    """Stage position (x, y) of its middle; default: unknown, then only the mean background is taken from here [um]."""
+    degree: int = Field(ge=0, le=6)
+    """Degree of the polynomial."""
+    detector: tuple[DetectorReadout, ...] = Field(min_length=1, max_length=64)
+
+    @model_validator(mode="after")
+    def _has_a_window(self) -> "CampaignReadout":
+        if min(self.window_um) <= 0.0:
+            raise ValueError(f"window_um must be > 0 in x and y, got {list(self.window_um)}")
+        n = (self.degree + 1) * (self.degree + 2) // 2
+        for d in self.detector:
+            if len(d.background) != n:
+                raise ValueError(
+                    f"a background of degree {self.degree} has {n} numbers, got {len(d.background)} for {d.name!r}"
+                )
+        return self
