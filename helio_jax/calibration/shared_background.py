@@ -14,8 +14,8 @@ from helio_jax.errors import SceneError
 from helio_jax.forward.readout import pedestal_modes
 from helio_jax.micrograph import MicrographStack
 
-_GRID = 12
-"""Points along each axis at which one polynomial is expanded in the shapes of another window."""
+_U, _V = np.meshgrid(*[np.linspace(-1.0, 1.0, 12)] * 2)
+"""Places in a window, in units of half of it, at which a polynomial is expanded in the shapes of another window."""
 
 
 class SharedBackground(NamedTuple):
@@ -64,13 +64,12 @@ def campaign_readout(fit: KnownFit, signals: np.ndarray) -> CampaignReadout:
     columns = [i for i, name in enumerate(names) if name == "offset" or name.startswith("pedestal")]
     degree = next(d for d in range(10) if (d + 1) * (d + 2) // 2 == len(columns))
     rows = [1 + i for i in columns]  # the gain comes first
-    places = np.meshgrid(*[np.linspace(-1.0, 1.0, _GRID)] * 2)
     detectors = []
     for k, name in enumerate(fit.instrument.detector_names):
         information, vector = np.zeros((len(rows), len(rows))), np.zeros(len(rows))
         for i, (scan, center) in enumerate(zip(scans, centers, strict=True)):
-            there = [(center[a] + p * scan.half_width[a] - middle[a]) / half[a] for a, p in enumerate(places)]
-            common, own = (_shapes(*at, degree).reshape(len(rows), -1) for at in (there, places))
+            u, v = ((center[a] + p * scan.half_width[a] - middle[a]) / half[a] for a, p in enumerate((_U, _V)))
+            common, own = (_shapes(*at, degree).reshape(len(rows), -1) for at in ((u, v), (_U, _V)))
             change = np.linalg.lstsq(own.T, common.T, rcond=None)[0]  # own amplitudes of common ones
             weight = np.linalg.inv(fit.linear_covariance[i][k][np.ix_(rows, rows)])
             information += change.T @ weight @ change
@@ -117,16 +116,12 @@ def shared_background(stack: MicrographStack, readout: CampaignReadout) -> Share
     scale = stack.dwell / readout.dwell_s if stack.dwell and readout.dwell_s else 1.0
     is_placed = stack.stage_position is not None and readout.stage_um is not None
     shape, means, levels, spreads = stack.shape[1:], [], [], []
-    x, y = np.meshgrid(stack.x, stack.y)
+    u, v = _U, _V
     if stack.stage_position is not None and readout.stage_um is not None:
-        x, y = (
-            (a + b - c) / w
-            for a, b, c, w in zip((x, y), stack.stage_position[:2], readout.stage_um, readout.window_um, strict=True)
-        )
-        design = _shapes(x, y, readout.degree).reshape(-1, x.size)
-    else:
-        places = np.meshgrid(*[np.linspace(-1.0, 1.0, _GRID)] * 2)
-        design = _shapes(*places, readout.degree).reshape(-1, _GRID**2)
+        place = np.array([*np.meshgrid(stack.x, stack.y)]) + stack.stage_position[:2, None, None]
+        u, v = (place[a] - readout.stage_um[a] for a in range(2))
+        u, v = u / readout.window_um[0], v / readout.window_um[1]
+    design = _shapes(u, v, readout.degree).reshape(-1, u.size)
     for d in found:
         covariance, expected = d.covariance(), np.array(d.background) @ design
         average = design.mean(1)
@@ -134,7 +129,7 @@ def shared_background(stack: MicrographStack, readout: CampaignReadout) -> Share
         level, spread = average @ covariance @ average, float(np.mean(np.sum(rest * (covariance @ rest), 0)))
         if not is_placed:
             level, spread = level + float(np.var(expected)), spread + float(np.var(expected))
-            expected = np.full(x.size, expected.mean())
+            expected = np.full(shape, expected.mean())
         means.append(expected.reshape(shape))
         levels.append(math.sqrt(max(level, 0.0)))
         spreads.append(math.sqrt(max(spread, 0.0)))

@@ -279,9 +279,10 @@ def _stage_position(path: str, scan: dict[str, Any], unit: float) -> np.ndarray 
     """
     ranges = [scan.get(f"{direction}_range") for direction in ("vert", "hori")]
     place = np.asarray(scan.get("pos", ()), float).ravel()
-    if any(np.size(r) != 2 for r in ranges) or place.size < 3:
+    vert, hori = (np.asarray(() if r is None else r, float).ravel() for r in ranges)
+    if vert.size != 2 or hori.size != 2 or place.size < 3:
         return None
-    x, y = (-float(np.mean(np.asarray(r, float))) for r in ranges)
+    x, y = -float(vert.mean()), -float(hori.mean())
     return unit * np.array([x, y, place[2]])
 
 
