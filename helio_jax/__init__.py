@@ -29,6 +29,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated
   detector            apertures in the plate and cones at infinity
+  campaign            read-out that the scans of a measuring campaign share
   instrument          beam, plate and detectors, and the geometry that follows from them
   geometry_prior      joint prior of sample distance and aperture directions, as an instrument file states it
   micrograph          MicrographStack, MicrographSet
@@ -163,6 +164,7 @@ calibration/          background, gain, drift and noise; instruments by known sh
   unknowns            what is unknown in an instrument and a scan; priors
   known_model         detection probability of a known object's scan (JAX)
   known_shape         the fit of an instrument to known shapes
+  shared_background   background of a campaign: joined from calibrated scans, predicted for another one
   known_report        table, chi-square by region, verdict, instrument with covariance
 alignment/            rotated scans onto one raster; orientation of arrays
   align               entry: a set of scans -> one stack

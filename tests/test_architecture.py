@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors", "spelling", "validity", "texts"},
     {"arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
-    {"detector"},
+    {"detector", "campaign"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction", "geometry_prior"},
     {"scene"},
