@@ -49,8 +49,9 @@ class CampaignReadout(Settings):
     """Dwell time per pixel that the readings belong to; others are scaled by it [s]. Default: unknown, never scaled."""
     window_um: tuple[float, float]
     """Half the width of the stage window in x and y, over which the background is a polynomial [um]."""
-    stage_um: tuple[float, float] | None = None
-    """Stage position (x, y) of its middle; default: unknown, then only the mean background is taken from here [um]."""
+    stage_um: tuple[float, float, float] | None = None
+    """Stage position (x, y) of its middle, and the height of the stage, to which the plate's sample distance belongs;
+    default: unknown, then only the mean background is taken from here [um]."""
     degree: int = Field(ge=0, le=6)
     """Degree of the polynomial."""
     detector: tuple[DetectorReadout, ...] = Field(min_length=1, max_length=64)

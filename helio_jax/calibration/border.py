@@ -29,6 +29,8 @@ _KNOWN_DRIFT_STD = 0.05
 """That of the drift where the background is the campaign's."""
 _FALSE_ALARM = 1e-4
 """Probability at which the border of a scan contradicts the background of its campaign by chance."""
+SAME_HEIGHT_UM = 5.0
+"""Difference of the stage's heights up to which a scan has the sample distance of the campaign [um]."""
 LEAST_KNOWN = 0.3
 """The campaign's background is used where its standard deviation is below this share of the signal."""
 
@@ -108,7 +110,7 @@ class _Background(NamedTuple):
         mean: [detector, y, x] or [detector, 1, 1], counts.
         source: where it comes from, in words.
         priors: settings of the fit that go with it.
-        warnings: why the campaign's was not used.
+        warnings: why the campaign's was not used, and that its sample distance does not hold.
     """
 
     mean: np.ndarray
@@ -145,13 +147,20 @@ def _find_background(stack: MicrographStack, frame: np.ndarray, settings: Calibr
         each = zip(stack.instrument.detector_names, ratio, level_std, strict=True)
         numbers = ", ".join(f"{name!r} {r:.2f} +- {std:.2f}" for name, r, std in each)
         why = f"with it the border's signal, relative to the campaign's, would be {numbers}, which do not agree"
+    warnings = ()
+    if abs(shared.raised) > SAME_HEIGHT_UM:
+        warnings = (
+            f"the stage stood {shared.raised:+.0f} um from its height in the scans that calibrated the instrument: the "
+            "sample distance of its file is not that of this scan; set plate.sample_distance_um, or its uncertainty",
+        )
     if why:
         text = f"the background of the instrument file ([readout]) was NOT used: {why}. Taken from the darkest pixels"
-        return _of_darkest_pixels(stack, frame, settings)._replace(warnings=(text,))
+        return _of_darkest_pixels(stack, frame, settings)._replace(warnings=(*warnings, text))
     priors = {"offset_std": float(np.max(level_std))}
     if settings.drift:
         priors["drift_std"] = float(np.hypot(_KNOWN_DRIFT_STD, np.max(shared.shape_std / shared.signal)))
-    return _Background(shared.mean, "campaign" if shared.is_placed else "campaign, stage position unknown", priors)
+    source = "campaign" if shared.is_placed else "campaign, stage position unknown"
+    return _Background(shared.mean, source, priors, warnings)
 
 
 def calibrate_on_border(

@@ -80,7 +80,7 @@ class KnownScan:
         columns: linear unknowns of the read-out.
         signal: about that of the substrate, in counts [detector].
         slow_axis: of the raster.
-        stage: stage position (x, y) of the raster's middle [2], um; None: unknown.
+        stage: stage position (x, y, height) of the raster's middle [3], um; None: unknown.
         half_width: of the raster in x and y [2], um.
         dwell: dwell time per pixel [s], or None; `unit`: of the counts.
     """
@@ -131,7 +131,7 @@ def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShap
     reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
     low, high = np.nanquantile(np.where(used, counts, np.nan).reshape(len(counts), -1), [0.01, 0.6], axis=1)
     slow = 0 if stack.fast_axis == "x" else 1
-    middle = np.array([0.5 * (axis[0] + axis[-1]) for axis in (stack.x, stack.y)])
+    middle = np.array([0.5 * (axis[0] + axis[-1]) for axis in (stack.x, stack.y)] + [0.0])
     return KnownScan(
         stack.name,
         counts,
@@ -143,7 +143,7 @@ def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShap
         readout_columns(stack.x, stack.y, slow, settings),
         high - low,
         slow,
-        None if stack.stage_position is None else stack.stage_position[:2] + middle,
+        None if stack.stage_position is None else stack.stage_position + middle,
         0.5 * np.array([np.ptp(stack.x), np.ptp(stack.y)]),
         stack.dwell,
         stack.unit,

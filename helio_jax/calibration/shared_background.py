@@ -27,6 +27,7 @@ class SharedBackground(NamedTuple):
         level_std: standard deviation of its mean over the image [detector].
         shape_std: root mean square standard deviation of what remains without that mean [detector].
         is_placed: whether the stage positions of both are known; if not, `mean` has no shape.
+        raised: height of the stage above that of the calibrated scans, um; 0 where it is unknown.
     """
 
     signal: np.ndarray
@@ -34,6 +35,7 @@ class SharedBackground(NamedTuple):
     level_std: np.ndarray
     shape_std: np.ndarray
     is_placed: bool
+    raised: float
 
 
 def _shapes(u: np.ndarray, v: np.ndarray, degree: int) -> np.ndarray:
@@ -56,7 +58,7 @@ def campaign_readout(fit: KnownFit, signals: np.ndarray) -> CampaignReadout:
     is_placed = all(scan.stage is not None for scan in scans)
     is_alike = len({(scan.dwell, scan.unit) for scan in scans}) == 1
     scans = scans if is_placed and is_alike else scans[:1]
-    centers = [np.zeros(2) if scan.stage is None else scan.stage for scan in scans]
+    centers = [np.zeros(2) if scan.stage is None else scan.stage[:2] for scan in scans]
     low = np.min([c - s.half_width for c, s in zip(centers, scans, strict=True)], 0)
     high = np.max([c + s.half_width for c, s in zip(centers, scans, strict=True)], 0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -89,7 +91,7 @@ def campaign_readout(fit: KnownFit, signals: np.ndarray) -> CampaignReadout:
         unit=scans[0].unit,
         dwell_s=scans[0].dwell,
         window_um=(float(half[0]), float(half[1])),
-        stage_um=(float(middle[0]), float(middle[1])) if scans[0].stage is not None else None,
+        stage_um=None if scans[0].stage is None else (float(middle[0]), float(middle[1]), float(scans[0].stage[2])),
         degree=degree,
         detector=tuple(detectors),
     )
@@ -116,11 +118,12 @@ def shared_background(stack: MicrographStack, readout: CampaignReadout) -> Share
     scale = stack.dwell / readout.dwell_s if stack.dwell and readout.dwell_s else 1.0
     is_placed = stack.stage_position is not None and readout.stage_um is not None
     shape, means, levels, spreads = stack.shape[1:], [], [], []
-    u, v = _U, _V
+    u, v, raised = _U, _V, 0.0
     if stack.stage_position is not None and readout.stage_um is not None:
         place = np.array([*np.meshgrid(stack.x, stack.y)]) + stack.stage_position[:2, None, None]
         u, v = (place[a] - readout.stage_um[a] for a in range(2))
         u, v = u / readout.window_um[0], v / readout.window_um[1]
+        raised = float(stack.stage_position[2] - readout.stage_um[2])
     design = _shapes(u, v, readout.degree).reshape(-1, u.size)
     for d in found:
         covariance, expected = d.covariance(), np.array(d.background) @ design
@@ -135,5 +138,5 @@ def shared_background(stack: MicrographStack, readout: CampaignReadout) -> Share
         spreads.append(math.sqrt(max(spread, 0.0)))
     signal = np.array([d.signal for d in found])
     return SharedBackground(
-        scale * signal, scale * np.array(means), scale * np.array(levels), scale * np.array(spreads), is_placed
+        scale * signal, scale * np.array(means), scale * np.array(levels), scale * np.array(spreads), is_placed, raised
     )

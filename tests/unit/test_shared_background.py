@@ -41,7 +41,11 @@ def fit_of(bshem, stages, stds, rng) -> KnownFit:
             found[k, 1:11] = np.linalg.lstsq(modes.T, hill(x, y, k).ravel(), rcond=None)[0]
         scans.append(
             SimpleNamespace(
-                stage=np.array(stage), half_width=np.full(2, 600.0), dwell=1.0, unit="counts", columns=columns
+                stage=np.array([*stage, -1660.0]),
+                half_width=np.full(2, 600.0),
+                dwell=1.0,
+                unit="counts",
+                columns=columns,
             )
         )
         factor = np.linalg.cholesky(0.6 * np.eye(n) + 0.4)
@@ -70,7 +74,9 @@ def scan(bshem, readout, stage: Any, *, noise=0.0, offset=(0.0, 0.0, 0.0), brigh
 def test_scans_are_joined_over_the_stage(bshem):
     """Cubic backgrounds of two windows give that of a third place, to 1e-5. Catches a wrong place, scale or axis."""
     readout = readout_of(bshem, [(0.0, 0.0), (900.0, -400.0)])
-    assert readout.stage_um == pytest.approx((450.0, -200.0)) and readout.window_um == pytest.approx((1050.0, 800.0))
+    assert readout.stage_um == pytest.approx((450.0, -200.0, -1660.0)) and readout.window_um == pytest.approx(
+        (1050.0, 800.0)
+    )
     found = shared_background(scan(bshem, readout, (500.0, 100.0)), readout)
     x, y = np.meshgrid(AXIS + 500.0, AXIS + 100.0)
     for k in range(3):
@@ -133,6 +139,10 @@ def test_the_border_takes_it_or_names_what_disagrees(bshem):
     assert wrong.calibration.priors["offset_std"] == 0.3
     unused = calibrate(scan(bshem, readout, (500.0, 100.0), noise=20.0), readout=False)
     assert unused.provenance["calibrate"]["background_from"] == "darkest pixels" and not unused.calibration.warnings
+    raised = scan(bshem, readout, (500.0, 100.0), noise=20.0)
+    raised = calibrate(raised.replace(stage_position=np.array([500.0, 100.0, -1560.0])))
+    assert "+100 um" in raised.calibration.warnings[0]
+    assert raised.provenance["calibrate"]["background_from"] == "campaign"
     far = calibrate(scan(bshem, readout, (9000.0, 100.0), noise=20.0))
     assert "outside of the stage window" in far.calibration.warnings[0]
 
