@@ -228,7 +228,12 @@ def _instrument_rows(instrument: Instrument) -> Rows:
     said = ", ".join(
         f"{k.rpartition('_')[0].replace('_', ' ')} {v:g} {k.rpartition('_')[2]}" for k, v in stated.items()
     )
-    return [*rows, ("uncertainty", said or "none stated: the geometry counts as exact")]
+    rows.append(("uncertainty", said or "none stated: the geometry counts as exact"))
+    if (readout := instrument.readout) is not None:
+        error = max(d.std[0] / d.signal for d in readout.detector)
+        place = "" if readout.stage_um else ", stage position unknown"
+        rows.append(("read-out", f"background of a campaign, known to {share(error)} of the signal{place}"))
+    return rows
 
 
 def _scene_rows(scene: Scene) -> Rows:

@@ -18,21 +18,42 @@ _COMMENT = """# Instrument file: the geometry that helio reconstruct fitted to {
 
 """
 
+_WIDTH = 120
+"""Longest line that is kept [characters]."""
+
 
 def to_toml(tables: Mapping[str, Any]) -> str:
     """Format a tree of JSON-compatible values as TOML, one line per value below each top table; None is omitted.
 
-    A list of tables becomes one table after the other.
+    A list of tables becomes one table after the other; below a table, and a matrix row after row, where a line is too
+    short for it.
     """
-    listed = {k: v for k, v in tables.items() if isinstance(v, list) and v and all(isinstance(t, Mapping) for t in v)}
+    listed = {k: v for k, v in tables.items() if _is_list_of(v, Mapping)}
     values = {k: v for k, v in tables.items() if not isinstance(v, Mapping) and v is not None and k not in listed}
-    lines = [f"{_key(k)} = {value_text(v)}" for k, v in values.items()]
+    lines = [_line(k, v) for k, v in values.items()]
     for name, found in tables.items():
         head = f"[[{_key(name)}]]" if name in listed else f"[{_key(name)}]"
         for table in found if name in listed else [found] if isinstance(found, Mapping) else []:
-            lines += ["", head]
-            lines += [f"{_key(k)} = {value_text(v)}" for k, v in table.items() if v is not None]
+            known = {k: _line(k, v) for k, v in table.items() if v is not None}
+            long = [k for k, line in known.items() if _is_list_of(table[k], Mapping) and len(line) > _WIDTH]
+            lines += ["", head, *(line for k, line in known.items() if k not in long)]
+            for k in long:
+                for part in table[k]:
+                    below = [_line(key, v) for key, v in part.items() if v is not None]
+                    lines += ["", f"[[{_key(name)}.{_key(k)}]]", *below]
     return "\n".join(lines) + "\n"
+
+
+def _is_list_of(value: Any, kind: type) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(v, kind) for v in value)
+
+
+def _line(key: str, value: Any) -> str:
+    """Format a key and its value: on one line, or a long matrix one row a line."""
+    line = f"{_key(key)} = {value_text(value)}"
+    if len(line) <= _WIDTH or not _is_list_of(value, list):
+        return line
+    return f"{_key(key)} = [\n" + "".join(f"    {value_text(row)},\n" for row in value) + "]"
 
 
 def value_text(value: Any) -> str:

@@ -69,6 +69,9 @@ def calibrate_known_files(
     what = f"Instrument calibrated by helio calibrate --known {' '.join(map(repr, shapes))} on {names}."
     about = f"Robust chi-square {robust_chi_square(fit):.2f} per pixel, standard deviations x {fit.inflation:.2f}."
     where = "sample_distance_um is that of these scans' stage height. [covariance]: how the errors belong together."
-    write_calibrated(calibrated_instrument(fit), output, "\n".join((what, about, f"{ON_TWINS.capitalize()}.", where)))
+    shared = "[readout]: signal and background of the detectors, which other scans of this campaign share."
+    write_calibrated(
+        calibrated_instrument(fit), output, "\n".join((what, about, f"{ON_TWINS.capitalize()}.", where, shared))
+    )
     save_known_shape(fit, picture)
     return record | {"files": [str(output), str(picture)]}
