@@ -14,7 +14,7 @@ tests/unit/test_conventions.py tests each sentence.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -145,3 +145,18 @@ def substrate_level(height: np.ndarray) -> float:
 def substrate_mask(height: np.ndarray) -> np.ndarray:
     """Return True in the border's pixels at or below `substrate_level` of heights [y, x]."""
     return border_mask(height.shape, BORDER_WIDTH) & (height <= substrate_level(height))
+
+
+def check_correlation(n: int, std: Sequence[float], correlation: Sequence[Sequence[float]]) -> None:
+    """Check standard deviations and a correlation matrix, rounded as in a file.
+
+    Raises:
+        ValueError: not of n numbers, a negative deviation, or no correlation matrix.
+    """
+    if len(std) != n or [len(row) for row in correlation] != [n] * n:
+        raise ValueError(f"std and correlation must be of {n} numbers: one each, and a square table")
+    matrix = np.array(correlation)
+    if min(std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
+        raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
+    if np.linalg.eigvalsh(matrix).min() < -0.01:
+        raise ValueError("correlation must not have negative eigenvalues: calibrate anew")

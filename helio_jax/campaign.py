@@ -2,12 +2,13 @@
 
 Most counts of a real detector do not come from the sample. This background changes smoothly with the position of the
 stage and, as far as scans of one campaign tell, not from scan to scan. `helio calibrate --known` writes the table,
-`helio_jax.calibration.campaign_background` reads it for another scan.
+`calibration.shared_background` reads it for another scan.
 """
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from helio_jax.arrays import check_correlation
 from helio_jax.settings import Settings
 
 
@@ -27,12 +28,7 @@ class DetectorReadout(Settings):
 
     @model_validator(mode="after")
     def _is_a_covariance(self) -> "DetectorReadout":
-        n = len(self.background)
-        if len(self.std) != n or [len(row) for row in self.correlation] != [n] * n:
-            raise ValueError(f"std and correlation must be of {n} numbers, as background: one each, and a square table")
-        matrix = np.array(self.correlation)
-        if min(self.std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
-            raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
+        check_correlation(len(self.background), self.std, self.correlation)
         return self
 
     def covariance(self) -> np.ndarray:

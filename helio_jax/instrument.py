@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from helio_jax.arrays import check_correlation
 from helio_jax.campaign import CampaignReadout
 from helio_jax.detector import Aperture, Cone, Detector
 from helio_jax.drawable import Drawable
@@ -186,13 +187,9 @@ class Covariance(Settings):
     @model_validator(mode="after")
     def _is_a_covariance(self) -> "Covariance":
         n = len(self.parameters)
-        if len(self.units) != n or len(self.std) != n or [len(row) for row in self.correlation] != [n] * n:
-            raise ValueError(f"units, std and correlation must be of {n} parameters: one each, and a square table")
-        matrix = np.array(self.correlation)
-        if min(self.std) < 0.0 or not np.allclose(matrix, matrix.T, atol=1e-3) or not np.allclose(np.diag(matrix), 1.0):
-            raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
-        if np.linalg.eigvalsh(matrix).min() < -0.01:
-            raise ValueError("correlation must not have negative eigenvalues: calibrate anew")
+        if len(self.units) != n:
+            raise ValueError(f"units must be of {n} parameters, got {len(self.units)}: calibrate anew")
+        check_correlation(n, self.std, self.correlation)
         return self
 
     def matrix(self) -> np.ndarray:

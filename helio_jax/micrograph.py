@@ -163,6 +163,8 @@ class MicrographStack(OnRaster):
             raise error(f"variance must be >= 0, got {self.variance[observed].min():g} at an observed pixel")
         if self.dwell_map is not None:
             self._check_dwell_map()
+        if self.stage_position is not None and not np.all(np.isfinite(self.stage_position)):
+            raise error(f"stage_position must be three finite numbers [um], got {self.stage_position.tolist()}")
         planes = None if self.alignment is None else self.alignment.time_planes
         if planes is not None and len(planes) != shape[0]:
             raise error(f"alignment.time_planes must hold one plane for each of {shape[0]} images, got {len(planes)}")

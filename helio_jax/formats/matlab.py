@@ -277,13 +277,13 @@ def _stage_position(path: str, scan: dict[str, Any], unit: float) -> np.ndarray 
 
     x = -vert and y = -hori, as the raster is read; `pos` holds the axes of the stage, the third is its height.
     """
-    ranges = [scan.get(f"{direction}_range") for direction in ("vert", "hori")]
-    place = np.asarray(scan.get("pos", ()), float).ravel()
-    vert, hori = (np.asarray(() if r is None else r, float).ravel() for r in ranges)
-    if vert.size != 2 or hori.size != 2 or place.size < 3:
+    try:
+        names = "vert_range", "hori_range", "pos"
+        vert, hori, axes = (get_array(path, scan.get(name), f"meas_list.{name}", 1) for name in names)
+    except InputFileError:
         return None
-    x, y = -float(vert.mean()), -float(hori.mean())
-    return unit * np.array([x, y, place[2]])
+    place = unit * np.array([-vert.mean(), -hori.mean(), *axes[2:3]])
+    return place if place.size == 3 and np.all(np.isfinite(place)) else None
 
 
 def _ashem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:

@@ -300,6 +300,22 @@ def test_bshem_faults_are_named(changes, channels, match, import_tree):
         import_tree(make_bshem_tree(**changes), make_bshem(0.75, channels))
 
 
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        (np.array([1.0, 2.0, -1.66e9, 0.0]), [-20.0, -45.0, -1660.0]),
+        (None, None),
+        ("unknown", None),
+        (np.array([1.0, 2.0]), None),
+        (np.array([1.0, 2.0, np.nan]), None),
+    ],
+)
+def test_bshem_stage_position(place, expected, import_tree):
+    """x = -vert, y = -hori, the third axis is the height. Catches other axes, signs, units, and a crash without any."""
+    found = import_tree(make_bshem_tree(**({} if place is None else {"pos": place})), make_bshem(0.75)).stage_position
+    assert (found is None) if expected is None else found == pytest.approx(expected)
+
+
 def test_bshem_shows_the_same_side_as_the_reference(bshem_scan, reference):
     """Catches each of the other 7 orientations of the pictures, and swapped detectors.
 
@@ -330,6 +346,7 @@ def test_bshem_real_scan(bshem_scan):
     np.testing.assert_allclose(bshem_scan.x, (np.arange(121) - 60) * 30.0)
     np.testing.assert_allclose(bshem_scan.y, (np.arange(121) - 60) * 30.0)
     assert (bshem_scan.dwell, bshem_scan.fast_axis) == (1.0, "y")
+    np.testing.assert_allclose(bshem_scan.stage_position, [26_600.0, 0.0, -1660.0], atol=0.01)
     # noise per pixel of channels 4, 3, 2 is 111, 88, 107
     np.testing.assert_allclose(bshem_scan.std_error[:, 0, 0], [111, 88, 107], rtol=0.06)
 
