@@ -56,7 +56,7 @@ REACH = 0.3 * FIELD
 """Largest distance of its scan from the ball's on the stage, along each axis [um]."""
 N_PEDESTAL = 9
 """Shapes of a cubic pedestal."""
-INSTRUMENTS = "calibrated", "without read-out", "as stated"
+INSTRUMENTS: tuple[str, ...] = "calibrated", "without read-out", "as stated"
 
 
 def draw(seed: int, stated: Instrument) -> tuple[Instrument, dict[str, float]]:
@@ -130,8 +130,8 @@ def read_out(
     assert traced.n_rays
     probability = traced.counts.reshape(-1, size, size) / traced.n_rays
     rng, time_of_line = np.random.default_rng([seed, 7]), np.linspace(-1.0, 1.0, size)[:, None]
-    x, y = ((axis + s) / (0.5 * FIELD) for s in stage)
-    modes, images, variance = pedestal_modes(*np.meshgrid(x, y), 3)[0], [], []
+    u, v = np.meshgrid(*((axis + s) / (0.5 * FIELD) for s in stage))
+    modes, images, variance = pedestal_modes(u, v, 3)[0], [], []
     for image, signal, gain, offset, pedestal in zip(probability, *campaign, strict=True):
         reading = gain * image + offset + np.tensordot(pedestal, modes, 1)
         reading += DRIFT * signal * np.sin(2.5 * time_of_line + rng.uniform(0.0, 2.0 * np.pi))
