@@ -238,7 +238,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             extrapolation = aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-    if problem.is_level_free and s.bias_pairs and not is_interrupted:
+    if problem.is_biased_by_noise and s.bias_pairs and not is_interrupted:
         try:
             if report:
                 report(len(changes) - 1, s.max_rounds, f"{said}; simulating the bias by noise")

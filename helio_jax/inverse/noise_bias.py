@@ -3,7 +3,8 @@
 Two slopes in every pixel follow the noise, and the signal is curved in them: however many pixels there are, their
 noise moves what all of them have in common. `second_order_noise_bias` and `edge_scale` compensate most of it. The rest
 hardly matters where a flat border holds the level. With a free one, a combination of level, gains and offsets is known
-little better than their priors, and a hundredth of what is compensated moves it by its error bar.
+little better than their priors, and a hundredth of what is compensated moves it by its error bar. So it is with a drift
+that is unknown: pyramids of SNR 25 came out 4 % too flat, those of SNR 100 right.
 """
 
 import zlib

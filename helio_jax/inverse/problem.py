@@ -260,6 +260,14 @@ class FitProblem:
         p = self.prior_means()
         return bool(p.distance.size or p.aim.size or p.drift.shape[1])
 
+    @property
+    def is_biased_by_noise(self) -> bool:
+        """Whether the noise of the slopes moves a combination of heights and instrument by its error bar.
+
+        A flat border alone holds the level, but not against an unknown drift, which the relief resembles.
+        """
+        return self.is_level_free or bool(self.settings.drift_std)
+
     def moves(self, parameters: Parameters) -> np.ndarray:
         """Compute distance [um], polar angle and azimuth [rad] beyond the stated ones [move, detector]."""
         with jax.enable_x64(True):

@@ -87,8 +87,8 @@ class RefineSettings(Settings):
     """Whether pits in a flat substrate and objects on it are looked for where the data contradict a fit; what is found
     is kept where it explains the images better. Only with a flat border."""
     bias_pairs: int = Field(default=4, ge=0, le=1000)
-    """Pairs of fits to simulated data, of opposite noise, that estimate the bias by noise; only with a free border. A
-    pair takes about as long as two outer iterations."""
+    """Pairs of fits to simulated data, of opposite noise, that estimate the bias by noise; only with a free border or
+    an unknown drift. A pair takes about as long as two outer iterations."""
     samples: int = Field(default=32, ge=0, le=10_000)
     """Samples of the posterior, from which the standard deviation of every height is taken; 0: no error bars."""
     multiple: Literal["traced", "radiosity"] = "traced"

@@ -12,8 +12,10 @@ from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
+from helio_jax.inverse import fit
 from helio_jax.inverse.convergence import aitken, remaining_error
 from helio_jax.inverse.fit import fit_heights, with_posterior
+from helio_jax.inverse.noise_bias import noise_bias
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, set_corrections, update_corrections
@@ -221,3 +223,25 @@ def test_the_factor_of_the_multiple_scattering_scales_nothing_else(bshem):
     multiple = state.held.corrections.multiple
     assert np.max(np.hypot(state.surface.slope_x, state.surface.slope_y)) > 0.5
     np.testing.assert_allclose(change, np.expm1(0.1) * multiple, rtol=1e-9, atol=1e-9 * multiple.max())
+
+
+@pytest.mark.parametrize(("drift", "n_calls"), [(0.0, 0), (0.05, 1)])
+def test_the_bias_by_noise_is_subtracted_where_a_drift_is_unknown(bshem, monkeypatch, drift, n_calls):
+    """A flat border holds the level against the gains, not against a drift. Catches a bias that is left in the heights.
+
+    What it amounts to: docs/calibrate.md.
+    """
+    calls, none = [], nothing_more(None, None)
+    surface, _ = bump()
+    signal = form_factor(Optics.of(bshem), surface.height)[:, 2]
+    settings = ReconstructSettings(refine=RefineSettings(drift_std=drift, max_rounds=1, bias_pairs=1))
+    raster = Raster.regular(SHAPE, PITCH)
+    problem = FitProblem.of(signal, (0.03 * signal) ** 2, bshem, raster, surface, settings)
+
+    def counted(problem, state, n_pairs):
+        calls.append(n_pairs)
+        return noise_bias(problem, state, n_pairs)
+
+    monkeypatch.setattr(fit, "noise_bias", counted)
+    fit_heights(problem, surface, lambda *_, **__: none)
+    assert calls == [1] * n_calls
