@@ -63,7 +63,9 @@ class ScanAlignment:
             object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
-OF_ONE_SCAN = "by_order", "effuse", "plate", "masked", "shadowed", "stage_position"
+SIMULATED_PARTS = "by_order", "effuse", "plate", "masked", "shadowed"
+"""Fields that only the simulation of one scan on its own raster has."""
+OF_ONE_SCAN = *SIMULATED_PARTS, "stage_position"
 """Fields that only one scan on its own raster has: what is made of scans has none of them."""
 
 

@@ -31,8 +31,8 @@ _FALSE_ALARM = 1e-4
 """Probability at which the border of a scan contradicts the background of its campaign by chance."""
 SAME_HEIGHT_UM = 5.0
 """Difference of the stage's heights up to which a scan has the sample distance of the campaign [um]."""
-LEAST_KNOWN = 0.3
-"""The campaign's background is used where its standard deviation is below this share of the signal."""
+MAX_LEVEL_STD = 0.3
+"""Largest standard deviation of the campaign's background with which it is used, over the signal."""
 
 
 class CalibrateSettings(Settings):
@@ -107,13 +107,15 @@ class _Background(NamedTuple):
     """Background of a scan as it was found.
 
     Attributes:
-        mean: [detector, y, x] or [detector, 1, 1], counts.
+        above: counts above it, without drift [detector, y, x]; NaN where not observed.
+        level: its mean over the image [detector], counts.
         source: where it comes from, in words.
         priors: settings of the fit that go with it.
         warnings: why the campaign's was not used, and that its sample distance does not hold.
     """
 
-    mean: np.ndarray
+    above: np.ndarray
+    level: np.ndarray
     source: str
     priors: dict[str, float]
     warnings: tuple[str, ...] = ()
@@ -125,7 +127,7 @@ def _of_darkest_pixels(stack: MicrographStack, frame: np.ndarray, settings: Cali
     flat = np.nanmedian(steady[:, frame], axis=1)
     darkest = np.nanquantile(steady.reshape(len(steady), -1), settings.dark_quantile, axis=1)
     background = darkest - settings.masked_share / (1.0 - settings.masked_share) * (flat - darkest)
-    return _Background(background[:, None, None], "darkest pixels", {})
+    return _Background(steady - background[:, None, None], background, "darkest pixels", {})
 
 
 def _find_background(stack: MicrographStack, frame: np.ndarray, settings: CalibrateSettings) -> _Background:
@@ -141,8 +143,9 @@ def _find_background(stack: MicrographStack, frame: np.ndarray, settings: Calibr
     weight = level_std**-2.0
     misfit = float(np.sum(weight * (ratio - np.sum(weight * ratio) / np.sum(weight)) ** 2))
     why = ""
-    if np.any(level_std > LEAST_KNOWN):
-        why = f"it is known to {np.max(level_std):.0%} of the signal only: the scan lies outside of the stage window"
+    if np.any(level_std > MAX_LEVEL_STD):
+        cause = "the scan may lie outside of the stage window" if shared.is_placed else "the stage position is unknown"
+        why = f"it is known to {np.max(level_std):.0%} of the signal only: {cause}"
     elif not np.all(ratio > 0.0) or (len(ratio) > 1 and chi2.sf(misfit, len(ratio) - 1) < _FALSE_ALARM):
         each = zip(stack.instrument.detector_names, ratio, level_std, strict=True)
         numbers = ", ".join(f"{name!r} {r:.2f} +- {std:.2f}" for name, r, std in each)
@@ -160,7 +163,7 @@ def _find_background(stack: MicrographStack, frame: np.ndarray, settings: Calibr
     if settings.drift:
         priors["drift_std"] = float(np.hypot(_KNOWN_DRIFT_STD, np.max(shared.shape_std / shared.signal)))
     source = "campaign" if shared.is_placed else "campaign, stage position unknown"
-    return _Background(shared.mean, source, priors, warnings)
+    return _Background(above, np.mean(shared.mean, axis=(1, 2)), source, priors, warnings)
 
 
 def calibrate_on_border(
@@ -181,9 +184,8 @@ def calibrate_on_border(
     stack, record = _without_faults(stack, settings)
     assert stack.variance is not None  # `_without_faults` estimates it
     found = _find_background(stack, frame, settings)
-    steady = _steady(stack.replace(counts=stack.counts - found.mean), frame, settings)
-    signal, background = np.nanmedian(steady[:, frame], axis=1), np.mean(found.mean, axis=(1, 2))
-    for detector, above, dark in zip(stack.instrument.detector, signal, background, strict=True):
+    signal = np.nanmedian(found.above[:, frame], axis=1)
+    for detector, above, dark in zip(stack.instrument.detector, signal, found.level, strict=True):
         if not above > 0.0:
             raise GuardError(
                 f"detector {detector.name!r} has no signal: its flat border ({above + dark:g} {stack.unit}) is not "
@@ -192,17 +194,17 @@ def calibrate_on_border(
     gain = signal / flat_signal
     scale = gain[:, None, None]
     pixel_std = np.sqrt(np.nanmedian(np.where(frame, stack.variance, np.nan), axis=(1, 2)))
-    of_lines = line_noise(stack, steady, frame)
+    of_lines = line_noise(stack, found.above, frame)
     lines = float(np.sqrt(np.mean((of_lines / signal) ** 2)))
     record["line_noise"] = of_lines.tolist()
     priors = _PRIORS | (_DRIFT_PRIORS if settings.drift else {}) | found.priors
     priors |= {"line_std": lines} if settings.lines and lines > 0 else {}
-    record |= {"gain": gain.tolist(), "background": background.tolist(), "flat": (signal + background).tolist()}
+    record |= {"gain": gain.tolist(), "background": found.level.tolist(), "flat": (signal + found.level).tolist()}
     record |= {"background_from": found.source, "warnings": list(found.warnings)}
     record |= {"snr": (signal / pixel_std).tolist(), "pixel_std": pixel_std.tolist()}
     record["settings"] = settings.model_dump(mode="json")
     return stack.replace(
-        counts=steady / scale,
+        counts=found.above / scale,
         variance=stack.variance / scale**2,
         background=None,
         n_rays=1.0,

@@ -165,8 +165,8 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     }
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
     signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)
-    found = {"uncertainty": uncertainty, "covariance": covariance, "readout": campaign_readout(fit, signals)}
-    return fit.instrument.model_copy(update=found)
+    readout = campaign_readout(fit, signals)
+    return fit.instrument.model_copy(update={"uncertainty": uncertainty, "covariance": covariance, "readout": readout})
 
 
 def as_record(fit: KnownFit) -> dict[str, Any]:

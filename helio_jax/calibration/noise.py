@@ -11,7 +11,7 @@ from pydantic import Field
 
 from helio_jax.calibration.response import ScanTime, lagging, slow_drift
 from helio_jax.errors import SceneError
-from helio_jax.micrograph import OF_ONE_SCAN, MicrographStack
+from helio_jax.micrograph import SIMULATED_PARTS, MicrographStack
 from helio_jax.settings import Settings
 
 _STREAM = 0x6E6F697365  # keeps the noise's random numbers apart from the tracer's for equal seeds
@@ -156,6 +156,6 @@ def _dwell_share(stack: MicrographStack, settings: NoiseSettings) -> np.ndarray:
 
 def _as_measured(stack: MicrographStack) -> MicrographStack:
     """Keep of noisy counts only what an experiment knows; the variance is then that of the counts."""
-    unknown = ("background", *OF_ONE_SCAN, "n_rays")
+    unknown = ("background", *SIMULATED_PARTS, "n_rays")
     variance = np.where(stack.is_observed, np.maximum(stack.counts, 1.0), 0.0)
     return stack.replace(noise="measured", variance=variance, **dict.fromkeys(unknown))

@@ -19,7 +19,7 @@ _U, _V = np.meshgrid(*[np.linspace(-1.0, 1.0, 12)] * 2)
 
 
 class SharedBackground(NamedTuple):
-    """Background of a scan as its campaign lets expect it, in the unit of its counts.
+    """Background of a scan as predicted from its campaign, in the unit of its counts.
 
     Attributes:
         signal: of the level substrate [detector].
@@ -66,13 +66,15 @@ def campaign_readout(fit: KnownFit, signals: np.ndarray) -> CampaignReadout:
     columns = [i for i, name in enumerate(names) if name == "offset" or name.startswith("pedestal")]
     degree = next(d for d in range(10) if (d + 1) * (d + 2) // 2 == len(columns))
     rows = [1 + i for i in columns]  # the gain comes first
+    changes = []  # own amplitudes of common ones
+    for scan, center in zip(scans, centers, strict=True):
+        u, v = ((center[a] + p * scan.half_width[a] - middle[a]) / half[a] for a, p in enumerate((_U, _V)))
+        common, own = (_shapes(*at, degree).reshape(len(rows), -1) for at in ((u, v), (_U, _V)))
+        changes.append(np.linalg.lstsq(own.T, common.T, rcond=None)[0])
     detectors = []
     for k, name in enumerate(fit.instrument.detector_names):
         information, vector = np.zeros((len(rows), len(rows))), np.zeros(len(rows))
-        for i, (scan, center) in enumerate(zip(scans, centers, strict=True)):
-            u, v = ((center[a] + p * scan.half_width[a] - middle[a]) / half[a] for a, p in enumerate((_U, _V)))
-            common, own = (_shapes(*at, degree).reshape(len(rows), -1) for at in ((u, v), (_U, _V)))
-            change = np.linalg.lstsq(own.T, common.T, rcond=None)[0]  # own amplitudes of common ones
+        for i, change in enumerate(changes):
             weight = np.linalg.inv(fit.linear_covariance[i][k][np.ix_(rows, rows)])
             information += change.T @ weight @ change
             vector += change.T @ weight @ fit.linear[i][k, rows]
@@ -116,14 +118,13 @@ def shared_background(stack: MicrographStack, readout: CampaignReadout) -> Share
         )
     found = [by_name[name] for name in stack.instrument.detector_names]
     scale = stack.dwell / readout.dwell_s if stack.dwell and readout.dwell_s else 1.0
-    is_placed = stack.stage_position is not None and readout.stage_um is not None
     shape, means, levels, spreads = stack.shape[1:], [], [], []
-    u, v, raised = _U, _V, 0.0
+    u, v, is_placed, raised = _U, _V, False, 0.0
     if stack.stage_position is not None and readout.stage_um is not None:
         place = np.array([*np.meshgrid(stack.x, stack.y)]) + stack.stage_position[:2, None, None]
         u, v = (place[a] - readout.stage_um[a] for a in range(2))
         u, v = u / readout.window_um[0], v / readout.window_um[1]
-        raised = float(stack.stage_position[2] - readout.stage_um[2])
+        is_placed, raised = True, float(stack.stage_position[2] - readout.stage_um[2])
     design = _shapes(u, v, readout.degree).reshape(-1, u.size)
     for d in found:
         covariance, expected = d.covariance(), np.array(d.background) @ design

@@ -250,8 +250,8 @@ class _Reconstructing:
         trace = make_predictor(stack, VERDICT_PATHS, self.settings.refine.substrate_um, **known)
         make_predict = self._make_predict(stack)
         rec = reconstruct_stack(stack, self.settings, make_predict, report, trace, stack.parallax_height)
-        known = () if stack.calibration is None else stack.calibration.warnings
-        rec = replace(rec, provenance={**rec.provenance, **this_run()}, warnings=(*rec.warnings, *known))
+        of_calibration = () if stack.calibration is None else stack.calibration.warnings
+        rec = replace(rec, provenance={**rec.provenance, **this_run()}, warnings=(*rec.warnings, *of_calibration))
         assumed = self.settings.refine.law if self.settings.method == "refine" else "cosine"
         others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind not in ("cosine", assumed)]
         if not others:
