@@ -6,13 +6,15 @@ python benchmarks/known_shape.py --collect          (rows over all twins in the 
 
 A twin is a scan of a ball of known radius whose burial is not known, traced (`hx.simulate`, never `hx.render`) by an
 instrument drawn at random: plate shift up to 0.25 D, rotation +-2 deg, scale +-5 %, distance +-10 %, tilt +-3 deg,
-incidence +-1 deg, gains x0.5 to x2, offsets 1 to 3 times the signal, albedo ratio 0.85 to 1.1. To the counts come noise
-(the substrate's signal is 25 times that of one pixel), a pedestal over the stage, drift and offsets of scan lines. The
-fit is told the instrument as stated, the ball's radius and the variance of the noise, nothing else. Printed: root mean
-square of the pulls (value - true) / stated s.d. of every parameter that the scans determine, chi-square per pixel.
+incidence +-1 deg, gains x0.5 to x2, offsets 1 to 3 times the signal, albedo ratio 0.85 to 1.1, scattering by
+cos^(1 + m) with m from -0.1 to 0.2. To the counts come noise (the substrate's signal is 25 times that of one pixel), a
+pedestal over the stage, drift and offsets of scan lines. The fit is told the instrument as stated, the ball's radius
+and the variance of the noise, nothing else. Printed: root mean square of the pulls (value - true) / stated s.d. of all
+parameters that the scans determine, chi-square per pixel.
 
 With `--then-refine` a pyramid is traced with the same drawn instrument, untilted, as another scan of the campaign: the
-same gains, offsets and pedestal, at another place of the stage, with drift, offsets of scan lines and noise of its own.
+same gains, offsets, pedestal and scattering law, at another place of the stage, with drift, offsets of scan lines and
+noise of its own.
 `hx.reconstruct` makes heights of it by the calibrated instrument, and for comparison without its read-out, and by the
 instrument as stated.
 """
@@ -78,6 +80,7 @@ def draw(seed: int, stated: Instrument) -> tuple[Instrument, dict[str, float]]:
         "sample distance": far * distance, "incidence": true.beam.incidence_deg, "tilt x": tilt[0], "tilt y": tilt[1],
         "object x": rng.uniform(-150.0, 150.0), "object y": rng.uniform(-150.0, 150.0),
         "height": rng.uniform(630.0, 740.0), "log albedo ratio": math.log(ratio),
+        "exponent": np.random.default_rng([seed, 17]).uniform(-0.1, 0.2),
         # the tracer's brighter surface has the albedo 1, the fit's substrate
         "log multiple scattering": -max(0.0, math.log(ratio)),
     }  # fmt: skip
@@ -145,10 +148,11 @@ def read_out(
 
 def heights(seed: int, size: int, rays: int, instruments: dict[str, Instrument]) -> dict[str, dict[str, float | None]]:
     """Refine a pyramid that the drawn instrument of a seed has scanned, by each of some instruments."""
-    true, _ = draw(seed, hx.load_scene(str(ROOT / "scenes" / "measured_sphere_a.toml")).instrument)
+    true, truth = draw(seed, hx.load_scene(str(ROOT / "scenes" / "measured_sphere_a.toml")).instrument)
     axis = (np.arange(size) - 0.5 * (size - 1)) * PYRAMID_PITCH
     tables = true.idealised().model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
-    tables |= {"name": "pyramid", "sample": PYRAMID | {"azimuth_deg": 20.0}}
+    tables |= {"name": "pyramid", "sample": PYRAMID | {"azimuth_deg": 20.0, "material": "own"}}
+    tables["material"] = {"own": {"kind": "power", "exponent": truth["exponent"]}}
     tables["scan"] = {"nx": size, "ny": size, "pixel_size_um": PYRAMID_PITCH, "pitch": "sample"}
     reach = 0.75 * PYRAMID["base_um"]
     region = {"region_radius_um": reach, "substrate_radius_um": reach, "height_um": PYRAMID["height_um"]}

@@ -1,8 +1,8 @@
-"""What the detectors read in all scans of one measuring campaign: table `[readout]` of an instrument file.
+"""What all scans of one measuring campaign share: tables `[readout]` and `[law]` of an instrument file.
 
 Most counts of a real detector do not come from the sample. This background changes smoothly with the position of the
-stage and, as far as scans of one campaign tell, not from scan to scan. `helio calibrate --known` writes the table,
-`calibration.shared_background` reads it for another scan.
+stage and, as far as scans of one campaign tell, not from scan to scan. `helio calibrate --known` writes both tables,
+`calibration.shared_background` reads the read-out for another scan, `inverse.law_prior` the law.
 """
 
 import numpy as np
@@ -63,3 +63,12 @@ class CampaignReadout(Settings):
                     f"a background of degree {self.degree} has {n} numbers, got {len(d.background)} for {d.name!r}"
                 )
         return self
+
+
+class CampaignLaw(Settings):
+    """Scattering law of the samples of a measuring campaign, cos^(1 + m): table `[law]` of an instrument file."""
+
+    exponent: float = Field(gt=-1.0, le=50.0)
+    """m; 0 is the cosine law."""
+    std: float = Field(gt=0.0, le=1.0)
+    """Standard deviation of m, that between samples included."""

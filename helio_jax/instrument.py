@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from helio_jax.arrays import check_correlation
-from helio_jax.campaign import CampaignReadout
+from helio_jax.campaign import CampaignLaw, CampaignReadout
 from helio_jax.detector import Aperture, Cone, Detector
 from helio_jax.drawable import Drawable
 from helio_jax.errors import SceneError
@@ -205,6 +205,7 @@ class Instrument(Drawable, Settings):
     uncertainty: Uncertainty = Uncertainty()
     covariance: Covariance | None = None
     readout: CampaignReadout | None = None
+    law: CampaignLaw | None = None
     detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
 
     @model_validator(mode="after")

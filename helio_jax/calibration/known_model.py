@@ -173,7 +173,7 @@ _fitted = compiled(lambda model, *about: model.fitted(*about))
 def _fitted_and_derivative(model: ScanModel, unknowns: Any, multiple: Multiple, width: Any, member: Any) -> Any:
     value, push = jax.linearize(lambda u: model.fitted(u, multiple, width, member), unknowns)
     ways = jnp.eye(len(unknowns), dtype=value[0].dtype)[multiple.free]
-    return value, jax.lax.map(push, ways)
+    return value, jax.vmap(push)(ways)  # at once: slices of apertures are evaluated anew in every push
 
 
 def probability(model: ScanModel, unknowns: np.ndarray, multiple: Multiple) -> np.ndarray:

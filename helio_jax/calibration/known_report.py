@@ -7,6 +7,7 @@ import numpy as np
 from helio_jax.arrays import robust_std
 from helio_jax.calibration.known_shape import KnownFit
 from helio_jax.calibration.shared_background import campaign_readout
+from helio_jax.campaign import CampaignLaw
 from helio_jax.geometry_prior import geometry_covariance
 from helio_jax.instrument import Covariance, Instrument, Uncertainty
 
@@ -17,6 +18,8 @@ LARGE_CHI_SQUARE = 1.2
 INFLATED = 1.2
 FAR = 3.0
 """Prior standard deviations from the stated value beyond which the scans contradict the instrument file."""
+LAW_SPREAD = 0.05
+"""Assumed standard deviation of the exponent of the scattering law between samples of one campaign."""
 _MIN_PIXELS = 12
 
 
@@ -44,10 +47,10 @@ def table(fit: KnownFit) -> list[Row]:
 
 
 def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
-    """List gain, substrate's signal, offset, line noise and noise of every detector of every scan, in counts."""
+    """List gain, substrate's signal, offset, line noise, noise and error of the model of all detectors, in counts."""
     out = []
-    for scan, linear, covariance, lines, seen, expected in zip(
-        fit.scans, fit.linear, fit.linear_covariance, fit.line_std, fit.seen, fit.expected, strict=True
+    for scan, linear, covariance, lines, error, seen, expected in zip(
+        fit.scans, fit.linear, fit.linear_covariance, fit.line_std, fit.model_error, fit.seen, fit.expected, strict=True
     ):
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         for k, name in enumerate(fit.instrument.detector_names):
@@ -63,6 +66,7 @@ def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
                     "offset": float(linear[k, 1]),
                     "offset_std": float(std[k, 1]),
                     "line_std": float(lines[k]),
+                    "model_error": dict(zip(("substrate", "object"), error[k].tolist(), strict=True)),
                     "noise": float(np.median(scan.sigma[k])),
                 }
             )
@@ -118,6 +122,16 @@ def verdict(fit: KnownFit) -> list[str]:
             f"the model does not explain all of the scans: robust chi-square {chi:.2f} per pixel"
             + (f", largest on the {places}" if places else "")
         )
+    errors = [
+        (row["model_error"]["object"] / row["substrate_signal"], f"{row['detector']!r} in {row['scan']}")
+        for row in readout_rows(fit)
+    ]
+    if max(errors)[0] > 0.0:
+        named = "; ".join(f"{share:.1%} for {name}" for share, name in sorted(errors, reverse=True)[:3] if share > 0.0)
+        out.append(
+            f"the object differs from the model by more than noise, tile by tile ({named}, of the substrate's signal): "
+            "dust, its shape or its scattering law; the standard deviations allow for it"
+        )
     if fit.inflation > INFLATED:
         out.append(
             f"misfit and correlated residuals enlarge all standard deviations {fit.inflation:.2f} times: an effect "
@@ -166,7 +180,23 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
     signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)
     readout = campaign_readout(fit, signals)
-    return fit.instrument.model_copy(update={"uncertainty": uncertainty, "covariance": covariance, "readout": readout})
+    found = {"uncertainty": uncertainty, "covariance": covariance, "readout": readout, "law": campaign_law(fit)}
+    return fit.instrument.model_copy(update=found)
+
+
+def campaign_law(fit: KnownFit) -> CampaignLaw | None:
+    """Join the exponents of the scattering law that the scans have; None where the cosine law was taken as known.
+
+    Other samples may differ by `LAW_SPREAD`, or by as much as those of these scans do.
+    """
+    found = [i for i, name in enumerate(fit.names) if name.startswith("exponent")]
+    if not found:
+        return None
+    value, std = fit.values[found], fit.stds[found]
+    mean = float(np.average(value, weights=std**-2))
+    spread = max(LAW_SPREAD, float(np.std(value)))
+    own = float(np.sum(std**-2)) ** -0.5
+    return CampaignLaw(exponent=float(f"{mean:.4g}"), std=float(f"{np.hypot(own, spread):.3g}"))
 
 
 def as_record(fit: KnownFit) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 The unknowns of `unknowns`, each with a prior, are fitted to one or several scans at once; plate, beam and apertures are
 common to all scans, each scan has its own object and read-out. Weights are robust (Cauchy); offsets of single scan
-lines are marginalised, their variance estimated from the residuals. Weights, multiple scattering, and on which part of
-the scene every pixel lies (expectation-maximisation), are computed anew in every round, for its geometry.
+lines, and errors of the model that tiles of pixels share, are marginalised, their variances estimated from the
+residuals (`common_errors`). Weights, multiple scattering, and on which part of the scene every pixel lies
+(expectation-maximisation), are computed anew in every round, for its geometry.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from helio_jax.arrays import pitch, robust_std
+from helio_jax.calibration.common_errors import Groups, common_std, group_means, scan_lines, tiles, whitened
 from helio_jax.calibration.known_model import (
     Multiple,
     ScanModel,
@@ -48,22 +50,33 @@ that is closer to an outline than this are left out: its masks and its multiple 
 object's place for a linear step, and differ between the parts. They still tell on which part it lies."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
+TILES_ACROSS = 6
+"""Tiles across an object within which the model's error is the same, if each of them has `TILE` pixels or more."""
 CONVERGED = 0.1
 """The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
+NEAR, ERROR_ROUNDS = 1.0, 3
+"""Errors of the model are estimated once no unknown changes by more standard deviations in a round: before, misfit is
+that of the unknowns. They are held after so many rounds: estimated from residuals that they have shaped they wander."""
 RADIOSITY_PIXELS = 25, 25, 61
 """Pixels along the longer side of the raster on which multiple scattering is derived, about: in the
 first rounds and all later ones. On a coarse raster they are wrong about an object's foot, where it is strongest."""
-STALE = 8.0
-"""Change of an unknown [standard deviations] after which derivatives of the multiple scattering are computed anew."""
+STALE, OLD = 8.0, 0.5
+"""Changes of an unknown [standard deviations] after which the derivatives of the multiple scattering are computed anew,
+and after which it is traced anew."""
+THRIFT = 8
+"""So many times fewer paths are traced while the unknowns still move far."""
 SPIKE = 6.0
 """A pixel that differs from all its neighbours by so many standard deviations is left out."""
-_STEPS = 8
-_SEARCH_PIXELS = 31
+_STEPS, _FTOL = 30, (1e-4, 1e-6)
+"""Steps of a round, and relative change of the cost at which it ends: far off, and near."""
+_SEARCH_PIXELS, _FIRST_PIXELS = 31, 61
+"""Pixels along the longer side of the thinned raster on which the object is searched, and the unknowns are first
+fitted."""
 _SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
-"""First search: pixels of the thinned raster, reach over the width of the image, points along each axis."""
-Trace = Callable[[int, Instrument, dict[str, float]], np.ndarray]
-"""Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, and the numbers of the object
-by their names [um, rad]. The substrate's albedo is at most 1, so is the object's."""
+"""First search: reach over the width of the image, points along each axis."""
+Trace = Callable[[int, Instrument, dict[str, float], int], np.ndarray]
+"""Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, the numbers of the object by
+their names [um, rad], how many times fewer paths will do. The substrate's albedo is at most 1, so is the object's."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +180,7 @@ class KnownFit:
         weights: robust weights of the pixels [detector, y, x], per scan.
         seen: where the pixels lie, per scan.
         line_std: offsets of single scan lines, counts [detector], per scan.
+        model_error: of tiles of the substrate and of the object, counts [detector, part], per scan.
         chi_square: mean square of the weighted residuals over their expected one.
         inflation: by which the standard deviations were enlarged for misfit and correlated residuals.
         rounds, is_converged: of the fit.
@@ -190,6 +204,7 @@ class KnownFit:
     weights: list[np.ndarray]
     seen: list[Seen]
     line_std: list[np.ndarray]
+    model_error: list[np.ndarray]
     chi_square: float
     inflation: float
     rounds: int
@@ -226,24 +241,6 @@ class _Layout:
         place = self.place[number]
         out[self.free[number]] += (self.scale * x)[place]
         return out
-
-
-def line_whitening(weighted: np.ndarray, inverse: np.ndarray, line_std: np.ndarray, slow_axis: int) -> np.ndarray:
-    """Whiten images [..., detector, y, x] that are divided by their noise, for offsets of whole scan lines.
-
-    With u = 1 / sigma of a line's pixels the covariance of the divided data is 1 + L^2 u u^T; its inverse square root
-    is 1 - c u u^T with c = (1 - (1 + L^2 |u|^2)^-1/2) / |u|^2.
-
-    Args:
-        weighted: data over their noise.
-        inverse: of the noise, 0 where there are no data [detector, y, x].
-        line_std: standard deviation L of the offsets [detector].
-        slow_axis: of the raster; a line lies along the other.
-    """
-    along = 2 - slow_axis  # of [detector, y, x]
-    size = np.sum(inverse**2, along, keepdims=True)
-    c = (1.0 - 1.0 / np.sqrt(1.0 + line_std[:, None, None] ** 2 * size)) / np.maximum(size, 1e-300)
-    return weighted - c * inverse * np.sum(weighted * inverse, along - 3, keepdims=True)
 
 
 def _linear_start(scan: KnownScan, model: np.ndarray, inverse: np.ndarray, settings: KnownShapeSettings) -> np.ndarray:
@@ -303,9 +300,13 @@ def _find_place(
     return place, best
 
 
-def _coarse(scan: KnownScan) -> KnownScan:
-    """Thin a scan for the first search."""
-    stride = max(1, round(max(scan.model.raster.shape) / _SEARCH_PIXELS))
+def _stride(scan: KnownScan, pixels: int) -> int:
+    """Return which rows and columns leave about so many pixels along the longer side: every how manyth."""
+    return max(1, round(max(scan.model.raster.shape) / pixels))
+
+
+def _thinned(scan: KnownScan, stride: int) -> KnownScan:
+    """Keep every `stride`-th row and column of a scan."""
     thin = (slice(None), slice(None, None, stride), slice(None, None, stride))
     columns = scan.columns._replace(modes=scan.columns.modes[thin])
     images = {name: getattr(scan, name)[thin] for name in ("counts", "sigma", "is_used")}
@@ -319,13 +320,21 @@ class _Fit:
         self, stated: Instrument, scans: list[KnownScan], settings: KnownShapeSettings, trace: Trace | None
     ) -> None:
         self.stated, self.scans, self.settings, self.trace = stated, scans, settings, trace
+        self.is_first = False  # whether another fit, of all pixels, follows
+        self.rounds_before = 0  # of such a first fit: their outline and their radiosity are coarse
         self.layout = _Layout(instrument_unknowns(stated, settings), scans)
         self.x = np.zeros(len(self.layout.unknowns))
+        self.line_groups = [scan_lines(s.model.raster.shape, s.slow_axis) for s in scans]
         self.lines = [np.zeros(len(s.counts)) for s in scans]
+        self.tiles = [_tiles_of(see(s.model, self.layout.of_scan(i, self.x))) for i, s in enumerate(scans)]
+        self.model_error = [np.zeros((len(s.counts), 2)) for s in scans]  # of substrate and object [detector, part]
+        self.is_near = False  # whether misfit is the model's error, no longer that of the unknowns
+        self.error_rounds = 0
         self.multiple: list[Multiple] = [
             no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
         ]
         self.expanded_at = [np.full(len(self.x), np.inf) for _ in scans]
+        self.traced_at = [np.full(len(self.x), np.inf) for _ in scans]  # with all paths
         self.width = [OUTLINE[0] * pitch(s.model.raster.y) for s in scans]
         self.deviation = np.ones(len(self.x))
         self.weights = [np.ones(s.counts.shape) for s in scans]
@@ -341,6 +350,15 @@ class _Fit:
         self.mean = [a.copy() for a in self.linear]
         self.prior = [s.linear_priors(a[:, 0], settings) for s, a in zip(scans, self.linear, strict=True)]
         self.offsets = np.cumsum([len(self.x), *(a.size for a in self.linear)])
+
+    def start_at(self, first: "_Fit") -> None:
+        """Begin where a fit of fewer pixels has ended, as near."""
+        self.x, self.linear, self.deviation = first.x, first.linear, first.deviation
+        self.weights = [
+            w if w.shape == s.counts.shape else np.ones(s.counts.shape)
+            for w, s in zip(first.weights, self.scans, strict=True)
+        ]
+        self.is_near, self.rounds_before = True, max(len(OUTLINE), len(RADIOSITY_PIXELS))
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """Split whitened unknowns into those of the geometry, and the linear ones of the scans [detector, column]."""
@@ -361,6 +379,13 @@ class _Fit:
         about = self.layout.of_scan(i, x), self.multiple[i], self.width[i], self.member[i]
         return fitted(self.scans[i].model, *about)
 
+    def whitened(self, i: int, weighted: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Whiten images [..., detector, y, x] for the errors that lines and tiles share; to first order in either."""
+        lines, of_tile = self.line_groups[i], self.tiles[i]
+        std = np.repeat(self.lines[i][:, None], lines.n, axis=1)
+        weighted = whitened(weighted, inverse, std, lines)
+        return whitened(weighted, inverse, self.model_error[i][:, np.arange(of_tile.n) % 2], of_tile)
+
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Compute all residuals: of the data of all scans, of their outlines, and the priors."""
         x, linear = self.split(z)
@@ -369,7 +394,7 @@ class _Fit:
             image, outline = self.image(i, x)
             inverse = self.inverse(i)
             misfit = (_expected(scan, linear[i], image) - scan.counts) * inverse
-            out.append(line_whitening(misfit, inverse, self.lines[i], scan.slow_axis).ravel())
+            out.append(self.whitened(i, misfit, inverse).ravel())
             outlines.append((outline * self.outlined[i]).ravel())
         return np.concatenate([*out, *outlines, z])
 
@@ -384,8 +409,8 @@ class _Fit:
             (value, _), (slopes, outline_slopes) = fitted_and_derivative(scan.model, *about)
             inverse = self.inverse(i)
 
-            def put(column: int, image: np.ndarray, i=i, scan=scan, inverse=inverse) -> None:
-                out[rows[i], column] = line_whitening(image * inverse, inverse, self.lines[i], scan.slow_axis).ravel()
+            def put(column: int, image: np.ndarray, i=i, inverse=inverse) -> None:
+                out[rows[i], column] = self.whitened(i, image * inverse, inverse).ravel()
 
             for column, slope, of_outline in zip(self.layout.place[i], slopes, outline_slopes, strict=True):
                 put(column, linear[i][:, 0, None, None] * slope * self.layout.scale[column])
@@ -401,7 +426,7 @@ class _Fit:
 
     def update(self, number: int) -> None:
         """Compute multiple scattering, parts, weights and lines, at the present unknowns."""
-        instrument = self.fitted()
+        instrument, number = self.fitted(), number + self.rounds_before
         for i, scan in enumerate(self.scans):
             at = self.layout.of_scan(i, self.x)
             own, seen = scan.model.object_of(at), see(scan.model, at)
@@ -429,16 +454,35 @@ class _Fit:
                 cauchy_weight(misfit / scan.sigma, self.settings.robust_limit * scale), nan=0.0
             )
             if number > 0:
-                self.lines[i] = _line_std(scan, misfit, self.weights[i])
+                self._estimate_common_errors(i, seen, np.nan_to_num(misfit))
+        self.error_rounds += self.is_near
+
+    def _estimate_common_errors(self, i: int, seen: Seen, misfit: np.ndarray) -> None:
+        """Estimate the errors of scan lines, and of tiles without them, from a misfit [detector, y, x], counts."""
+        if self.error_rounds >= ERROR_ROUNDS:
+            return
+        weight, lines = self.inverse(i) ** 2, self.line_groups[i]
+        mean, total = group_means(misfit, weight, lines)
+        self.lines[i] = common_std(mean, total)
+        variance = self.lines[i][:, None] ** 2
+        share = variance * total / (1.0 + variance * total)  # of the mean that is the line's own
+        if not self.is_near:
+            return
+        self.tiles[i] = _tiles_of(seen)
+        mean, total = group_means(misfit - lines.spread(share * mean), weight, self.tiles[i])
+        self.model_error[i] = np.stack([common_std(mean[:, p::2], total[:, p::2], is_sure=True) for p in (0, 1)], 1)
 
     def _scattered_again(self, number: int, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
         """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
         scan, traced = self.scans[i], None
+        if np.max(np.abs(self.x - self.traced_at[i]) / self.deviation) < OLD:
+            return self.multiple[i]
         if self.trace is not None:
             own = {name: float(v) for name, v in scan.model.object_of(at).items()}
             bright = np.exp(np.maximum(0.0, own["log albedo ratio"]))  # the tracer's brighter surface has the albedo 1
             albedo = np.where(seen.is_object, np.exp(own["log albedo ratio"]), 1.0) / bright
-            traced = self.trace(i, instrument, own) / albedo * bright
+            traced = self.trace(i, instrument, own, 1 if self.is_near else THRIFT) / albedo * bright
+            self.traced_at[i] = self.x if self.is_near else self.traced_at[i]
         moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
         if traced is not None and number >= len(RADIOSITY_PIXELS) and np.max(moved) < STALE:
             return self.multiple[i].shifted(traced, at)
@@ -492,18 +536,11 @@ def _membership(
     return weight / weight.sum(0)
 
 
-def _line_std(scan: KnownScan, misfit: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Estimate the standard deviation of the offsets of single scan lines [detector], counts."""
-    along = 2 - scan.slow_axis
-    w = np.where(np.isfinite(misfit), weights / scan.sigma**2, 0.0)
-    total = np.maximum(w.sum(along), 1e-300)
-    mean = np.sum(w * np.nan_to_num(misfit), along) / total
-    out = []
-    for value, weight in zip(mean, total, strict=True):
-        known = weight > 1e-200
-        spread = float(robust_std(value[known] - np.median(value[known]))) ** 2 if known.sum() > 3 else 0.0
-        out.append(np.sqrt(max(spread - float(np.median(1.0 / weight[known])), 0.0)) if known.any() else 0.0)
-    return np.array(out)
+def _tiles_of(seen: Seen) -> Groups:
+    """Divide a scan into tiles; those of the object are apart from those of the substrate."""
+    where = np.nonzero(seen.is_object)
+    across = max((int(np.ptp(w)) + 1 for w in where if w.size), default=0)
+    return tiles(seen.is_object, max(TILE, round(across / TILES_ACROSS)))
 
 
 def _started(
@@ -513,7 +550,8 @@ def _started(
     found = []
     for known in scan.known.starts():
         trial = replace(scan, known=known, own=object_unknowns(known, stack_reach, settings))
-        layout, coarse = _Layout(instrument_unknowns(stated, settings), [trial]), _coarse(trial)
+        layout = _Layout(instrument_unknowns(stated, settings), [trial])
+        coarse = _thinned(trial, _stride(trial, _SEARCH_PIXELS))
         base, is_ball = layout.start[0], known.kind == "ball"
         reach = 2.0 * _SEARCH_REACH * stack_reach * np.array([1.0, float(is_ball)])
         nothing = no_multiple(coarse.model, base, layout.free[0])
@@ -561,10 +599,29 @@ def fit_known_shapes(
         if scan.known.kind != "flat":
             reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
             scans[i], _ = _started(stated, scan, settings, reach)
-    fit = _Fit(stated, scans, settings, trace)
-    number, is_converged, note = 0, False, "start"
-    for number in range(settings.max_rounds):
-        report(number, settings.max_rounds, note)
+    fit, rounds, is_converged = _Fit(stated, scans, settings, trace), 0, False
+    strides = [_stride(scan, _FIRST_PIXELS) for scan in scans]
+    if max(strides) > 1:
+        first = [_thinned(scan, stride) for scan, stride in zip(scans, strides, strict=True)]
+        thinned = trace and (lambda i, *about: trace(i, *about)[:, :: strides[i], :: strides[i]])
+        coarse = _Fit(stated, first, settings, thinned)
+        coarse.is_first = True
+        rounds, _ = _run(coarse, settings.max_rounds, rounds, report)
+        fit.start_at(coarse)
+    if rounds < settings.max_rounds:
+        rounds, is_converged = _run(fit, settings.max_rounds, rounds, report)
+    return _result(fit, rounds, is_converged)
+
+
+def _run(fit: _Fit, max_rounds: int, done: int, report: Callable[[int, int, str], None]) -> tuple[int, bool]:
+    """Run the rounds of a fit; one on a thinned raster (`_Fit.is_first`) ends when it is near.
+
+    Returns:
+        Rounds so far, `done` of them before, and whether the fit has converged.
+    """
+    note = "start" if not done else "all pixels"
+    for number in range(max_rounds - done):
+        report(done + number, max_rounds, note)
         fit.update(number)
         solved = least_squares(
             fit.residuals,
@@ -573,7 +630,7 @@ def fit_known_shapes(
             x_scale="jac",  # type: ignore[arg-type]
             max_nfev=_STEPS,
             xtol=1e-6,
-            ftol=1e-7,
+            ftol=_FTOL[fit.is_near],
         )
         before = fit.x
         fit.x, fit.linear = fit.split(solved.x)
@@ -581,10 +638,14 @@ def fit_known_shapes(
         fit.deviation = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[: len(fit.x)]
         change = float(np.max(np.abs(fit.x - before) / fit.deviation))
         note = f"largest change {change:.2g} standard deviations, cost {2.0 * solved.cost:.5g}"
-        if number > 1 and change < CONVERGED:
-            is_converged = True
-            break
-    return _result(fit, number + 1, is_converged)
+        is_at_minimum = number > 1 and solved.status > 0
+        if is_at_minimum and fit.is_near and change < CONVERGED:
+            return done + number + 1, True
+        if is_at_minimum and change < NEAR:
+            if fit.is_first:
+                return done + number + 1, False
+            fit.is_near = True
+    return max_rounds, False
 
 
 def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
@@ -620,7 +681,8 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
         fit.fitted(), fit.stated, fit.scans, names, [a.unit for a in u], stated, prior, stated + prior * fit.x,
         prior * std[:n], covariance[:n, :n], fit.layout.n_shared, fit.linear,
         linear_covariance,
-        residuals, expected, fit.weights, seen, fit.lines, chi_square, float(inflation), rounds, is_converged,
+        residuals, expected, fit.weights, seen, fit.lines, fit.model_error, chi_square, float(inflation), rounds,
+        is_converged,
     )  # fmt: skip
 
 

@@ -30,6 +30,10 @@ _UNITS = {
 }
 
 
+PATHS, RAYS = 2_000_000, (64, 512)
+"""Default number of traced paths, and of paths per pixel: least and most."""
+
+
 class KnownShapeSettings(Settings):
     """The fit of an instrument to objects of known shape: `helio calibrate --known`, `--set KEY=VALUE`.
 
@@ -56,7 +60,7 @@ class KnownShapeSettings(Settings):
     """Of the substrate's tilt against the plate, about x and y [deg]."""
     albedo: float = Field(default=0.1, ge=0.0, le=1.0)
     """Of the albedo of the object over the substrate's."""
-    exponent: float = Field(default=0.0, ge=0.0, le=1.0)
+    exponent: float = Field(default=0.1, ge=0.0, le=1.0)
     """Of m in a scattering law cos^(1 + m); 0: the cosine law."""
     multiple: float = Field(default=0.05, ge=0.0, le=1.0)
     """Of the multiple scattering, relative."""
@@ -80,9 +84,14 @@ class KnownShapeSettings(Settings):
     """How often multiple scattering and weights are computed anew."""
     substrate_um: float = Field(default=8000.0, gt=0.0, le=1e6)
     """Side of the substrate about the image's middle, as far as it scatters [um]."""
-    rays: int = Field(default=512, ge=0, le=100_000)
+    rays: int | None = Field(default=None, ge=0, le=100_000)
     """Paths per pixel by which the multiple scattering is traced; 0: it is computed by radiosity alone. Few of them
-    make its fitted factor too small, as noise in a regressor does."""
+    make its fitted factor too small, as noise in a regressor does. Default: 2 million paths, 64 to 512 per pixel."""
+
+    def rays_of(self, n_pixels: int) -> int:
+        """Number of paths per pixel of a raster of so many pixels."""
+        least, most = RAYS
+        return int(np.clip(PATHS // n_pixels, least, most)) if self.rays is None else self.rays
 
 
 class Unknown(NamedTuple):

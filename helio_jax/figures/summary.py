@@ -233,6 +233,8 @@ def _instrument_rows(instrument: Instrument) -> Rows:
         error = max(d.std[0] / d.signal for d in readout.detector)
         place = "" if readout.stage_um else ", stage position unknown"
         rows.append(("read-out", f"background of a campaign, known to {share(error)} of the signal{place}"))
+    if (law := instrument.law) is not None:
+        rows.append(("law", f"cos^(1 + m) with m = {law.exponent:.3g} +- {law.std:.2g}"))
     return rows
 
 

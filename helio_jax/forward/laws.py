@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.forward.optics import Optics
-from helio_jax.scene.scattering import COSINE_LAW, BroadSpecularLaw, RoughDiffuseLaw, Shape, Term
+from helio_jax.scene.scattering import COSINE_LAW, BroadSpecularLaw, CosinePowerLaw, RoughDiffuseLaw, Term, tabulated
 
 MIN_COS = 0.05
 """Facets seen under a smaller cosine take the value of this one: powers of the cosine have no slope at the horizon."""
@@ -64,8 +64,7 @@ class PowerLaw(eqx.Module):
 
     def terms(self) -> tuple[Term, ...]:
         """Make the law of the tracer."""
-        theta = np.radians(np.linspace(0.0, 90.0, 181))
-        return _tabulated(theta, np.maximum(np.cos(theta), 0.0) ** max(1.0 + float(self.exponent), 0.0))
+        return CosinePowerLaw(exponent=float(np.clip(self.exponent, -0.99, 50.0))).terms()
 
 
 class LobeLaw(eqx.Module):
@@ -151,7 +150,7 @@ class MonotoneLaw(eqx.Module):
         theta = np.radians(np.linspace(0.0, 90.0, 181))
         cos = np.maximum(np.cos(theta), 0.0)
         with jax.enable_x64(True):
-            return _tabulated(theta, cos * np.asarray(self._value(jnp.asarray(cos))))
+            return (tabulated(theta, cos * np.asarray(self._value(jnp.asarray(cos)))),)
 
 
 Law = PowerLaw | LobeLaw | RoughLaw | MonotoneLaw
@@ -247,10 +246,3 @@ def _lobe_norm(cos_in: Any, sigma: Any) -> jax.Array:
     for term in terms[:0:-1]:  # Clenshaw's sum of Chebyshev polynomials
         last, before = term + 2.0 * x * last - before, last
     return terms[0] + x * last - before
-
-
-def _tabulated(theta: np.ndarray, intensity: np.ndarray) -> tuple[Term, ...]:
-    """Make the tracer's law of an intensity per steradian that depends on the angle to the normal alone [theta]."""
-    phi = np.array([0.0, np.pi])
-    table = np.broadcast_to(intensity[None, :, None], (1, theta.size, phi.size)).copy()
-    return (Term(Shape.TABLE, 1.0, axes=(np.zeros(1), theta, phi), intensity=table),)

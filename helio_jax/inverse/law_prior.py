@@ -6,6 +6,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.stats import chi2
 
+from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError
 from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw
 from helio_jax.inverse.residuals import LawPrior
@@ -30,9 +31,16 @@ class LawNumber(NamedTuple):
     std: float
 
 
-def law_prior(settings: RefineSettings) -> LawPrior | None:
-    """Return the prior of a law's numbers, about those of the cosine law; None where it is the cosine law."""
+def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> LawPrior | None:
+    """Return the prior of a law's numbers; None where it is the cosine law.
+
+    Args:
+        settings: of the fit. A law that they name has a prior about the numbers of the cosine law.
+        stated: law of the instrument file, for settings that name none.
+    """
     s = settings
+    if s.law == "as_stated" and stated is not None:
+        return LawPrior(PowerLaw(stated.exponent), PowerLaw(stated.std))
     if s.law == "power":
         return LawPrior(PowerLaw(0.0), PowerLaw(s.law_std))
     if s.law == "broad_specular":
@@ -46,8 +54,13 @@ def law_prior(settings: RefineSettings) -> LawPrior | None:
     return None
 
 
-def check_images(settings: RefineSettings, n_images: int) -> None:
-    """Raise GuardError where the images are too few for the law."""
+def check_law(settings: RefineSettings, stated: CampaignLaw | None, n_images: int) -> None:
+    """Raise GuardError where the images are too few for the law, or the multiple scattering is not modelled by it."""
+    if settings.law == "as_stated" and stated is not None and settings.multiple == "radiosity":
+        raise GuardError(
+            "reconstruct.refine.multiple = 'radiosity' knows the cosine law only, the instrument file states another "
+            "one in [law]: set multiple = 'traced', or law = 'cosine'"
+        )
     if settings.law == "monotone" and n_images < LEAST_IMAGES:
         raise GuardError(
             f"reconstruct.refine.law = 'monotone' needs {LEAST_IMAGES} or more images, got {n_images}: take another "
@@ -66,7 +79,8 @@ def numbers_of(prior: LawPrior | None) -> list[LawNumber]:
 def cosine_probability(prior: LawPrior, whitened: np.ndarray, covariance: np.ndarray) -> float:
     """Compute how often numbers of the cosine law would come out as far from it as fitted ones, or farther, by chance.
 
-    The width of a lobe does not count: a lobe without atoms is the cosine law whatever its width.
+    The cosine law's numbers are 0. The width of a lobe does not count: a lobe without atoms is the cosine law whatever
+    its width.
 
     Args:
         prior: of the law.
@@ -74,5 +88,7 @@ def cosine_probability(prior: LawPrior, whitened: np.ndarray, covariance: np.nda
         covariance: posterior covariance, in these units [number, number].
     """
     n = 1 if isinstance(prior.mean, LobeLaw) else len(whitened)
-    chi_square = whitened[:n] @ np.linalg.solve(covariance[:n, :n], whitened[:n])
+    mean, std = (np.asarray(ravel_pytree(part)[0]) for part in (prior.mean, prior.std))
+    from_cosine = (whitened + mean / std)[:n]
+    chi_square = from_cosine @ np.linalg.solve(covariance[:n, :n], from_cosine)
     return float(chi2.sf(chi_square, n))

@@ -144,7 +144,7 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
         )
     if fit.parameters.aim.size or fit.parameters.distance.size:
         found.append(GEOMETRY_WARNING)
-    if fit.parameters.law.size:
+    if fit.problem.settings.has_own_law:
         found.append(LAW_WARNING)
     return tuple(found)
 

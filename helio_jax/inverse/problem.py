@@ -21,10 +21,10 @@ from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.law_prior import check_images, law_prior, numbers_of
+from helio_jax.inverse.law_prior import check_law, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.quality import MIN_REGION, regions
-from helio_jax.inverse.residuals import Parameters, Priors, law_of, moves_of
+from helio_jax.inverse.residuals import LawPrior, Parameters, Priors, law_of, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 LEVEL_STD = 0.1
@@ -116,7 +116,7 @@ class FitProblem:
         else:
             geometry = GeometryPrior.of(given)
         s, shape = settings.refine, signal.shape[1:]
-        check_images(s, len(signal))
+        check_law(s, None if given is None else given.law, len(signal))
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
         modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
@@ -196,6 +196,11 @@ class FitProblem:
         return self.geometry_prior.distance_std
 
     @property
+    def law_prior(self) -> LawPrior | None:
+        """Prior of the scattering law; None: the cosine law."""
+        return law_prior(self.settings, None if self.instrument is None else self.instrument.law)
+
+    @property
     def priors(self) -> Priors:
         """Prior standard deviations of the parameters."""
         s, median = self.settings, self.median_signal
@@ -211,7 +216,7 @@ class FitProblem:
             "tilt": self.tilt_std,
             "patch": s.patch_albedo_std,
         }
-        return Priors(law=law_prior(s), **{name: np.asarray(value, float) for name, value in numbers.items()})
+        return Priors(law=self.law_prior, **{name: np.asarray(value, float) for name, value in numbers.items()})
 
     def prior_means(self) -> Parameters:
         """Make the parameters at their prior means, all 0; those that are known have no entries."""
@@ -227,7 +232,7 @@ class FitProblem:
             "albedo": (n, n),
             "drift": (k, self.drift_modes.shape[1]),
             "lines": (k, lines),
-            "law": len(numbers_of(law_prior(s))),
+            "law": len(numbers_of(self.law_prior)),
             "distance": 1 if s.geometry and self.distance_std else 0,
             "tilt": 2 if s.geometry and self.tilt_std else 0,
             "aim": (k, 2) if s.geometry and self.geometry.is_aimed else 0,

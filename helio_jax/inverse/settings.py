@@ -34,8 +34,9 @@ class RefineSettings(Settings):
     """Largest degree of the drift's polynomials along the slow and the fast axis of the scan."""
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
     """Prior standard deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
-    law: Literal["cosine", "power", "broad_specular", "rough_diffuse", "monotone"] = "cosine"
-    """Scattering law of the sample. `cosine`: known; the others have unknown numbers, about those of the cosine law.
+    law: Literal["as_stated", "cosine", "power", "broad_specular", "rough_diffuse", "monotone"] = "as_stated"
+    """Scattering law of the sample. `as_stated`: that of the instrument file's [law], within its standard deviation;
+    the cosine law where it has none. `cosine`: known; the others have unknown numbers, about those of the cosine law.
     `power`: exponent m of cos^(1 + m); `broad_specular`: share and width of a lobe about the mirror's direction, the
     rest by the cosine law; `rough_diffuse`: roughness r of the energy-preserving Oren-Nayar model; `monotone`: any
     density that falls with the angle to the normal, by its exponent at 7 angles (needs 5 or more images)."""
@@ -111,12 +112,17 @@ class RefineSettings(Settings):
         """Number of paths of a prediction in a search and in the test of a fit."""
         return max(self.paths(n_pixels) // SEARCH_THRIFT, 1000)
 
+    @property
+    def has_own_law(self) -> bool:
+        """Whether these settings name a law with unknown numbers."""
+        return self.law not in ("as_stated", "cosine")
+
     @model_validator(mode="after")
     def _has_law(self) -> "RefineSettings":
         for key in ("law_std", "law_width_deg", "law_width_std_deg"):
-            if self.law == "cosine" and getattr(self, key) != RefineSettings.model_fields[key].default:
+            if not self.has_own_law and getattr(self, key) != RefineSettings.model_fields[key].default:
                 raise ValueError(f"{key} has no use with the known cosine law: set law, too, e.g. law = 'power'")
-        if self.law != "cosine" and self.multiple == "radiosity":
+        if self.has_own_law and self.multiple == "radiosity":
             raise ValueError(
                 "multiple = 'radiosity' knows the cosine law only: set it to 'traced' where a law is fitted"
             )

@@ -205,6 +205,25 @@ class RoughDiffuseLaw(LawModel):
         return (Term(Shape.ROUGH, self.albedo, (self.roughness,)),)
 
 
+class CosinePowerLaw(LawModel):
+    """cos^(1 + m) of the angle to the normal, from whatever side the atom comes."""
+
+    kind: Literal["power"] = "power"
+    exponent: float = Field(gt=-1.0, le=50.0)
+    """m of cos^(1 + m); 0 is the cosine law."""
+
+    def terms(self, base_dir: Path = Path()) -> tuple[Term, ...]:
+        theta = np.radians(np.linspace(0.0, 90.0, 181))
+        return (tabulated(theta, np.maximum(np.cos(theta), 0.0) ** (1.0 + self.exponent), self.albedo),)
+
+
+def tabulated(theta: np.ndarray, intensity: np.ndarray, albedo: float = 1.0) -> Term:
+    """Make a law of an intensity per steradian that depends on the angle to the normal alone [theta]."""
+    phi = np.array([0.0, np.pi])
+    table = np.broadcast_to(intensity[None, :, None], (1, theta.size, phi.size)).copy()
+    return Term(Shape.TABLE, albedo, axes=(np.zeros(1), theta, phi), intensity=table)
+
+
 class DiffractionLaw(CoherentLaw):
     """2-D diffraction: the direction's component along the surface changes by wavelength * (n b1 + m b2).
 
@@ -324,6 +343,7 @@ PureLaw = (
     | BackscatteringLaw
     | CosineSpecularLaw
     | RoughDiffuseLaw
+    | CosinePowerLaw
     | DiffractionLaw
     | TableLaw
 )

@@ -41,8 +41,8 @@ def calibrate_known(
         raise SceneError(f"got {len(shapes)} known shapes for {len(stacks)} scans: give one for each, or one for all")
     known = [KnownObject.parse(text) for text in shapes] * (len(stacks) if len(shapes) == 1 else 1)
     chosen = (settings or KnownShapeSettings()).changed(**changes)
-    numbers = {"rays": chosen.rays, "substrate_um": chosen.substrate_um}
-    trace = multiple_tracer(list(stacks), known, **numbers) if chosen.rays else None
+    rays = min(chosen.rays_of(stack.counts[0].size) for stack in stacks)
+    trace = multiple_tracer(list(stacks), known, rays=rays, substrate_um=chosen.substrate_um) if rays else None
     return fit_known_shapes(list(stacks), known, chosen, trace=trace, report=report or (lambda *_: None))
 
 
@@ -69,7 +69,7 @@ def calibrate_known_files(
     what = f"Instrument calibrated by helio calibrate --known {' '.join(map(repr, shapes))} on {names}."
     about = f"Robust chi-square {robust_chi_square(fit):.2f} per pixel, standard deviations x {fit.inflation:.2f}."
     where = "sample_distance_um is that of these scans' stage height. [covariance]: how the errors belong together."
-    shared = "[readout]: signal and background of the detectors, which other scans of this campaign share."
+    shared = "Other scans of this campaign share [readout], signal and background of the detectors, and [law]."
     write_calibrated(
         calibrated_instrument(fit), output, "\n".join((what, about, f"{ON_TWINS.capitalize()}.", where, shared))
     )

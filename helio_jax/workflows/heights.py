@@ -251,13 +251,8 @@ class _Reconstructing:
         make_predict = self._make_predict(stack)
         rec = reconstruct_stack(stack, self.settings, make_predict, report, trace, stack.parallax_height)
         of_calibration = () if stack.calibration is None else stack.calibration.warnings
-        rec = replace(rec, provenance={**rec.provenance, **this_run()}, warnings=(*rec.warnings, *of_calibration))
-        assumed = self.settings.refine.law if self.settings.method == "refine" else "cosine"
-        others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind not in ("cosine", assumed)]
-        if not others:
-            return rec
-        law = f"NOT the {assumed.replace('_', ' ')} law, which heights assume, holds for {', '.join(others)}"
-        return replace(rec, warnings=(*rec.warnings, law))
+        warnings = (*rec.warnings, *of_calibration, *_law_warnings(stack, self.settings))
+        return replace(rec, provenance={**rec.provenance, **this_run()}, warnings=warnings)
 
     def _make_predict(self, stack: MicrographStack) -> Callable[[int], Predict]:
         refine = self.settings.refine
@@ -267,3 +262,21 @@ class _Reconstructing:
             return make_predictor(stack, n_rays, refine.substrate_um, **about)
 
         return make_predict
+
+
+def _law_warnings(stack: MicrographStack, settings: ReconstructSettings) -> list[str]:
+    """List where heights assume another scattering law than that of the sample or of the instrument file."""
+    refine, stated, out = settings.refine, stack.instrument.law, []
+    assumed = refine.law if settings.method == "refine" and refine.has_own_law else "cosine"
+    if stated is not None and refine.law == "as_stated":
+        if settings.method == "refine":
+            assumed = "power"
+        else:
+            out.append(
+                f"{settings.method} assumes the cosine law, the instrument states cos^{1.0 + stated.exponent:.2f}: "
+                "steep slopes are off; refine takes it into account"
+            )
+    others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind not in ("cosine", assumed)]
+    if others:
+        out.append(f"NOT the {assumed.replace('_', ' ')} law, which heights assume, holds for {', '.join(others)}")
+    return out

@@ -13,6 +13,8 @@ from helio_jax.workflows.pipeline import simulate
 from helio_jax.workflows.scene_file import SceneFile
 
 _GROUND, _OBJECT = "substrate", "object"
+LEAST_RAYS = 64
+"""Paths per pixel of a trace that may have fewer: the noise of fewer is misfit that the unknowns would explain."""
 
 
 def known_scene(
@@ -28,7 +30,7 @@ def known_scene(
 
     Args:
         known: what kind of object.
-        numbers: place, tilt, shape and albedo by the names of `unknowns.OBJECT` [um, rad].
+        numbers: place, tilt, shape, albedo and law by the names of `unknowns.OBJECT` [um, rad].
         instrument: of the scan.
         x, y: its beam positions, um.
         substrate_um: side of the substrate.
@@ -44,11 +46,13 @@ def known_scene(
     else:
         edge = {"position_um": o["object x"], "facing_deg": deg * math.remainder(o["object azimuth"], 2.0 * math.pi)}
         sample |= {"kind": "step", "height_um": o["height"], "slope_deg": deg * o["slope"], **edge}
-    law = {"kind": "cosine"}
+    law = {"kind": "power", "exponent": o["exponent"]} if o["exponent"] else {"kind": "cosine"}
     tables = instrument.idealised().model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)  # a list, for the pitches of x and y may differ
     tables |= {"name": "known object", "sample": sample, "scan": {"kind": "list", "points_um": points.tolist()}}
-    if known.kind == "ball":
+    if known.kind != "ball":
+        sample["material"], tables["material"] = _GROUND, {_GROUND: law}
+    else:
         # nothing reflects more than it receives: of the two, the brighter one has the albedo 1
         tables["material"] = {
             _GROUND: law | {"albedo": min(1.0, 1.0 / ratio)},
@@ -59,16 +63,16 @@ def known_scene(
 
 def multiple_tracer(
     stacks: list[MicrographStack], known: list[KnownObject], *, rays: int, substrate_um: float
-) -> Callable[[int, Instrument, dict[str, float]], np.ndarray]:
+) -> Callable[[int, Instrument, dict[str, float], int], np.ndarray]:
     """Return what traces the multiple scattering of a scan of a known object, see `calibration.known_shape.Trace`.
 
     The albedo of the own pixel is not divided out.
     """
 
-    def trace(number: int, instrument: Instrument, numbers: dict[str, float]) -> np.ndarray:
+    def trace(number: int, instrument: Instrument, numbers: dict[str, float], thrift: int) -> np.ndarray:
         stack = stacks[number]
         scene = known_scene(known[number], numbers, instrument, stack.x, stack.y, substrate_um=substrate_um)
-        found = simulate(scene, rays=rays, seed=number + 1, maps=False).only()
+        found = simulate(scene, rays=max(min(rays, LEAST_RAYS), rays // thrift), seed=number + 1, maps=False).only()
         assert found.by_order is not None and found.n_rays is not None  # simulated
         return (found.by_order[1:].sum(0) / found.n_rays).reshape(stack.shape)
 

@@ -11,6 +11,7 @@ import helio_jax as hx
 from helio_jax.calibration.known_model import ScanModel, no_multiple
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.unknowns import OBJECT, PLATE
+from helio_jax.forward.known_shapes import Ball
 from helio_jax.workflows.known_scene import known_scene
 from tests.derivatives import taylor_remainders
 
@@ -100,3 +101,36 @@ def test_derivatives_of_all_unknowns(bshem, case):
             direction = jnp.zeros(len(at)).at[number].set(step)
             first, second = taylor_remainders(function, jnp.asarray(at), direction, (0.1, 0.01))
             assert second < 0.03 * first or first < 1e-12, (case, number)
+
+
+@pytest.mark.parametrize("height", [300.0, 650.0, 1000.0, 1040.0])
+@pytest.mark.parametrize("slope", [0.0, 0.3, 0.577, 1.0])
+def test_covered_points_are_moved_to_the_outline(height, slope):
+    """Points that the ball covers come to lie just outside of it, as a continuous function of their place.
+
+    A jump trapped the fit: any step of the object cost as much as one pixel that is masked on one side only. Catches
+    centres that do not lie between the foot and the contour of grazing beams. No chance is involved.
+    """
+    ball = Ball(jnp.asarray(1000.0), jnp.asarray(height))
+    shift = slope * jnp.array([math.cos(0.3), math.sin(0.3)])
+    angle, share = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False), np.linspace(0.5, 1.2, 30)[:, None]
+    with jax.enable_x64(True):
+        depth, steep = height - 1000.0, slope**2
+        both = depth**2 < steep * (1000.0**2 - depth**2)
+        center = (-depth / steep if both else max(depth, 0.0)) * np.asarray(shift)
+        ways = 1000.0 * share * np.array([np.cos(angle), np.sin(angle)])[:, None]
+        x, y = (jnp.asarray(center[i] + ways[i]) for i in (0, 1))
+
+        def is_on(x, y):
+            return np.asarray(ball.parts(x, y, shift, 0.0)[0].share) > 0.5
+
+        moved = ball._beside(x, y, shift)
+        on = is_on(x, y)
+        assert on.any() and not on.all()
+        assert not is_on(*moved).any()
+        inside = [m - 1e-3 * (m - c) for m, c in zip(moved, center, strict=True)]
+        assert is_on(*inside)[on].all()
+        stay = ~on & ~is_on(*[c + (v - c) / (1.0 + 1e-5) for v, c in zip((x, y), center, strict=True)])
+        assert all(np.array_equal(np.asarray(m)[stay], np.asarray(v)[stay]) for m, v in zip(moved, (x, y), strict=True))
+        steps = np.hypot(*[np.diff(np.asarray(m), axis=1) for m in moved])
+        assert steps[0].max() < 60.0  # 720 angles about an outline of up to 2.5 mm from its centre

@@ -10,6 +10,7 @@ from helio_jax.scene.scattering import (
     BackscatteringLaw,
     BroadSpecularLaw,
     CosineLaw,
+    CosinePowerLaw,
     CosineSpecularLaw,
     DebyeWaller,
     DiffractionLaw,
@@ -38,6 +39,7 @@ LAWS = {
     "backscattering": BackscatteringLaw(sigma_deg=40.0, albedo=0.8),
     "cosine_specular": CosineSpecularLaw(),
     "rough_diffuse": RoughDiffuseLaw(roughness=0.6),
+    "power": CosinePowerLaw(exponent=0.7),
     "diffraction": DiffractionLaw(**SQUARE, max_order=(3, 3), peak_sigma=0.08, diffuse_fraction=0.1),
     "attenuated": BroadSpecularLaw(sigma_deg=30.0, debye_waller=COLD),
     "mixture": MixtureLaw(

@@ -76,12 +76,12 @@ def test_a_law_is_added_by_the_recipe(tmp_path):
     The new kind is in the reference, a scene takes it, and the recipe's own test of draws and density passes.
     """
     follow("A scattering law", LAW, tmp_path)
-    run_test(tmp_path, "tests/physics/test_laws.py", "cosine_power")
+    run_test(tmp_path, "tests/physics/test_laws.py", "lommel_seeliger")
     script = """
 import sys; sys.path.insert(0, "docs")
 import helio_jax as hx, reference
-assert 'kind = "cosine_power"' in reference.scene_keys()
-law = {"material.m": {"kind": "cosine_power", "exponent": 9.0}, "sample": {"kind": "flat", "material": "m"}}
+assert 'kind = "lommel_seeliger"' in reference.scene_keys()
+law = {"material.m": {"kind": "lommel_seeliger"}, "sample": {"kind": "flat", "material": "m"}}
 assert hx.load_scene("step", law).material["m"].terms()[0].share == 1.0
 """
     run(tmp_path, "-c", script)
