@@ -163,6 +163,9 @@ calibration/          background, gain, drift and noise; instruments by known sh
   known_objects       objects of known shape as a user states them
   unknowns            what is unknown in an instrument and a scan; priors
   known_model         detection probability of a known object's scan (JAX)
+  known_scan          one scan of a known object: data, unknowns
+  known_start         where on the raster the object lies
+  common_errors       errors that scan lines or tiles of pixels share
   known_shape         the fit of an instrument to known shapes
   shared_background   background of a campaign: joined from calibrated scans, predicted for another one
   known_report        table, chi-square by region, verdict, instrument with covariance

@@ -8,7 +8,7 @@ residuals (`common_errors`). Weights, multiple scattering, and on which part of 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,7 +17,6 @@ from helio_jax.arrays import pitch, robust_std
 from helio_jax.calibration.common_errors import Groups, common_std, group_means, scan_lines, tiles, whitened
 from helio_jax.calibration.known_model import (
     Multiple,
-    ScanModel,
     Seen,
     expand_multiple,
     fitted,
@@ -28,17 +27,18 @@ from helio_jax.calibration.known_model import (
     see,
 )
 from helio_jax.calibration.known_objects import KnownObject
-from helio_jax.calibration.noise_model import estimate_noise, find_spikes
-from helio_jax.calibration.unknowns import (
-    Columns,
-    KnownShapeSettings,
-    Unknown,
-    instrument_unknowns,
-    object_unknowns,
-    readout_columns,
+from helio_jax.calibration.known_scan import (
+    KnownScan,
+    Layout,
+    expected_counts,
+    linear_start,
+    prepare_scan,
+    stride_for,
+    thinned,
 )
+from helio_jax.calibration.known_start import started
+from helio_jax.calibration.unknowns import KnownShapeSettings, instrument_unknowns
 from helio_jax.errors import GuardError, SceneError
-from helio_jax.forward.optics import Optics, Raster
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
@@ -58,109 +58,20 @@ NEAR, ERROR_ROUNDS = 1.0, 3
 """Errors of the model are estimated once no unknown changes by more standard deviations in a round: before, misfit is
 that of the unknowns. They are held after so many rounds: estimated from residuals that they have shaped they wander."""
 RADIOSITY_PIXELS = 25, 25, 61
-"""Pixels along the longer side of the raster on which multiple scattering is derived, about: in the
-first rounds and all later ones. On a coarse raster they are wrong about an object's foot, where it is strongest."""
+"""Pixels along the longer side of the raster on which multiple scattering is derived, about: in the first rounds and
+all later ones. On a coarse raster the derivatives are wrong about an object's foot, where they are largest."""
 STALE, OLD = 8.0, 0.5
 """Changes of an unknown [standard deviations] after which the derivatives of the multiple scattering are computed anew,
 and after which it is traced anew."""
 THRIFT = 8
 """So many times fewer paths are traced while the unknowns still move far."""
-SPIKE = 6.0
-"""A pixel that differs from all its neighbours by so many standard deviations is left out."""
+FIRST_PIXELS = 61
+"""Pixels along the longer side of the thinned raster on which the unknowns are first fitted."""
 _STEPS, _FTOL = 30, (1e-4, 1e-6)
 """Steps of a round, and relative change of the cost at which it ends: far off, and near."""
-_SEARCH_PIXELS, _FIRST_PIXELS = 31, 61
-"""Pixels along the longer side of the thinned raster on which the object is searched, and the unknowns are first
-fitted."""
-_SEARCH_REACH, _SEARCH_SIDES = 0.45, (7, 5, 5, 5)
-"""First search: reach over the width of the image, points along each axis."""
 Trace = Callable[[int, Instrument, dict[str, float], int], np.ndarray]
 """Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, the numbers of the object by
 their names [um, rad], how many times fewer paths will do. The substrate's albedo is at most 1, so is the object's."""
-
-
-@dataclass(frozen=True)
-class KnownScan:
-    """One scan of a known object: data, model and unknowns of its own.
-
-    Attributes:
-        name: of the scan.
-        counts, sigma: as read, and their standard deviations [detector, y, x].
-        is_used: which are fitted [detector, y, x].
-        model: of the detection probability.
-        known: the object.
-        own: its unknowns, as `unknowns.OBJECT`.
-        columns: linear unknowns of the read-out.
-        signal: about that of the substrate, in counts [detector].
-        slow_axis: of the raster.
-        stage: stage position (x, y, height) of the raster's middle [3], um; None: unknown.
-        half_width: of the raster in x and y [2], um.
-        dwell: dwell time per pixel [s], or None; `unit`: of the counts.
-    """
-
-    name: str
-    counts: np.ndarray
-    sigma: np.ndarray
-    is_used: np.ndarray
-    model: ScanModel
-    known: KnownObject
-    own: list[Unknown]
-    columns: Columns
-    signal: np.ndarray
-    slow_axis: int
-    stage: np.ndarray | None
-    half_width: np.ndarray
-    dwell: float | None
-    unit: str
-
-    @property
-    def n_linear(self) -> int:
-        """Gain and other linear unknowns of one detector."""
-        return 1 + len(self.columns.names)
-
-    def linear_priors(self, gain: np.ndarray, settings: KnownShapeSettings) -> np.ndarray:
-        """Compute the prior standard deviations of the linear unknowns [detector, column]."""
-        return np.concatenate(
-            [settings.gain * np.abs(gain)[:, None], self.signal[:, None] * self.columns.priors[None]], 1
-        )
-
-
-def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShapeSettings) -> KnownScan:
-    """Make a scan ready for the fit: noise, spikes, unknowns.
-
-    Raises:
-        SceneError: the stack is a list of positions, or in units of the beam already.
-    """
-    if stack.positions is not None:
-        raise SceneError(f"{stack.name}: a calibration needs a raster, this scan is a list of positions")
-    if stack.n_rays is not None and stack.calibration is not None:
-        raise SceneError(f"{stack.name}: this scan is calibrated already: give the imported file itself")
-    spread = estimate_noise(stack).variance(stack.counts) if stack.noise == "measured" else stack.variance
-    if spread is None:
-        raise SceneError(f"{stack.name}: the variance of the counts is unknown: import the scan anew")
-    spread = np.maximum(spread, 1e-12 * np.nanmax(np.abs(stack.counts)) ** 2)
-    used = stack.is_observed & ~find_spikes(stack, spread, SPIKE)
-    counts = np.where(stack.is_observed, stack.counts, 0.0)
-    reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
-    low, high = np.nanquantile(np.where(used, counts, np.nan).reshape(len(counts), -1), [0.01, 0.6], axis=1)
-    slow = 0 if stack.fast_axis == "x" else 1
-    middle = np.array([0.5 * (axis[0] + axis[-1]) for axis in (stack.x, stack.y)] + [0.0])
-    return KnownScan(
-        stack.name,
-        counts,
-        np.sqrt(spread),
-        used,
-        ScanModel(Optics.of(stack.instrument), Raster.of(stack), known.kind),
-        known,
-        object_unknowns(known, reach, settings),
-        readout_columns(stack.x, stack.y, slow, settings),
-        high - low,
-        slow,
-        None if stack.stage_position is None else stack.stage_position + middle,
-        0.5 * np.array([np.ptp(stack.x), np.ptp(stack.y)]),
-        stack.dwell,
-        stack.unit,
-    )
 
 
 @dataclass(frozen=True)
@@ -211,108 +122,6 @@ class KnownFit:
     is_converged: bool
 
 
-class _Layout:
-    """Where each unknown of each scan stands in the vector of free unknowns."""
-
-    def __init__(self, shared: list[Unknown], scans: list[KnownScan]) -> None:
-        n = len(shared)
-        self.all = [shared + scan.own for scan in scans]
-        free_shared = [i for i, u in enumerate(shared) if u.prior > 0.0]
-        self.n_shared = len(free_shared)
-        self.unknowns = [shared[i] for i in free_shared]
-        self.scan_of = [-1] * self.n_shared
-        self.free: list[np.ndarray] = []
-        self.place: list[np.ndarray] = []
-        for number, scan in enumerate(scans):
-            own = [i for i, u in enumerate(scan.own) if u.prior > 0.0]
-            start = len(self.unknowns)
-            self.free.append(np.array(free_shared + [n + i for i in own]))
-            self.place.append(np.array([*range(self.n_shared), *range(start, start + len(own))]))
-            self.unknowns += [scan.own[i] for i in own]
-            self.scan_of += [number] * len(own)
-        self.scale = np.array([u.prior * u.factor for u in self.unknowns])
-        self.start = [
-            np.array([0.0 if i < n else u.stated * u.factor for i, u in enumerate(unknowns)]) for unknowns in self.all
-        ]
-
-    def of_scan(self, number: int, x: np.ndarray) -> np.ndarray:
-        """Compute the unknowns of one scan, um and rad, of free ones in prior standard deviations."""
-        out = self.start[number].copy()
-        place = self.place[number]
-        out[self.free[number]] += (self.scale * x)[place]
-        return out
-
-
-def _linear_start(scan: KnownScan, model: np.ndarray, inverse: np.ndarray, settings: KnownShapeSettings) -> np.ndarray:
-    """Solve for gain and the other columns at a given probability [detector, y, x]: [detector, column]."""
-    out = []
-    for k, image in enumerate(model):
-        design = np.concatenate([image[None], scan.columns.modes]).reshape(scan.n_linear, -1) * inverse[k].ravel()
-        gain = scan.signal[k] / max(float(np.median(image)), 1e-12)
-        weak = np.diag(1.0 / np.concatenate([[3.0 * gain], 10.0 * scan.signal[k] * scan.columns.priors]) ** 2)
-        out.append(np.linalg.solve(design @ design.T + weak, design @ (scan.counts[k] * inverse[k]).ravel()))
-    return np.array(out)
-
-
-def _expected(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndarray:
-    return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)
-
-
-def _find_place(
-    scan: KnownScan,
-    base: np.ndarray,
-    multiple: Multiple,
-    reach: np.ndarray,
-    settings: KnownShapeSettings,
-) -> tuple[np.ndarray, float]:
-    """Find where the object lies by a search about the place in `base`, read-out fitted, all else of `base` held.
-
-    Args:
-        scan: the data.
-        base: unknowns of the scan.
-        multiple: multiple scattering.
-        reach: of the search along x and y, um; 0: not searched.
-        settings: priors of the read-out.
-
-    Returns:
-        The place (x, y) [um], and the misfit there.
-    """
-    inverse = np.where(scan.is_used, 1.0 / scan.sigma, 0.0)
-    index = len(base) - len(scan.own)
-
-    def misfit(place: np.ndarray) -> float:
-        at = base.copy()
-        at[index : index + 2] = place
-        image = probability(scan.model, at, multiple)
-        residual = (scan.counts - _expected(scan, _linear_start(scan, image, inverse, settings), image)) * inverse
-        scale = 3.0 * float(robust_std(residual[scan.is_used]))
-        return float(np.sum(np.log1p((residual / scale) ** 2)) + residual.size * 2.0 * np.log(scale))
-
-    place = base[index : index + 2].copy()
-    best = misfit(place)
-    for stage, side in enumerate(_SEARCH_SIDES):
-        steps, width = np.linspace(-1.0, 1.0, side), reach * 0.4**stage
-        grid = [place + width * [a, b] for a in steps for b in (steps if width[1] else [0.0])]
-        found = [misfit(p) for p in grid]
-        i = int(np.argmin(found))
-        if found[i] < best:
-            best, place = found[i], grid[i]
-    return place, best
-
-
-def _stride(scan: KnownScan, pixels: int) -> int:
-    """Return which rows and columns leave about so many pixels along the longer side: every how manyth."""
-    return max(1, round(max(scan.model.raster.shape) / pixels))
-
-
-def _thinned(scan: KnownScan, stride: int) -> KnownScan:
-    """Keep every `stride`-th row and column of a scan."""
-    thin = (slice(None), slice(None, None, stride), slice(None, None, stride))
-    columns = scan.columns._replace(modes=scan.columns.modes[thin])
-    images = {name: getattr(scan, name)[thin] for name in ("counts", "sigma", "is_used")}
-    return replace(scan, **images, columns=columns, model=scan.model.thinned(stride))
-
-
 class _Fit:
     """State of one fit; `fit_known_shapes` runs it."""
 
@@ -322,7 +131,7 @@ class _Fit:
         self.stated, self.scans, self.settings, self.trace = stated, scans, settings, trace
         self.is_first = False  # whether another fit, of all pixels, follows
         self.rounds_before = 0  # of such a first fit: their outline and their radiosity are coarse
-        self.layout = _Layout(instrument_unknowns(stated, settings), scans)
+        self.layout = Layout(instrument_unknowns(stated, settings), scans)
         self.x = np.zeros(len(self.layout.unknowns))
         self.line_groups = [scan_lines(s.model.raster.shape, s.slow_axis) for s in scans]
         self.lines = [np.zeros(len(s.counts)) for s in scans]
@@ -344,7 +153,7 @@ class _Fit:
         self.is_beside = [np.zeros(s.counts.shape[1:], bool) for s in scans]  # pixels too close to an outline [y, x]
         self.member: list[np.ndarray] = [np.zeros(0)] * len(scans)
         self.linear = [
-            _linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
+            linear_start(s, p, np.where(s.is_used, 1.0 / s.sigma, 0.0), settings)
             for s, p in zip(scans, start, strict=True)
         ]
         self.mean = [a.copy() for a in self.linear]
@@ -393,7 +202,7 @@ class _Fit:
         for i, scan in enumerate(self.scans):
             image, outline = self.image(i, x)
             inverse = self.inverse(i)
-            misfit = (_expected(scan, linear[i], image) - scan.counts) * inverse
+            misfit = (expected_counts(scan, linear[i], image) - scan.counts) * inverse
             out.append(self.whitened(i, misfit, inverse).ravel())
             outlines.append((outline * self.outlined[i]).ravel())
         return np.concatenate([*out, *outlines, z])
@@ -445,10 +254,10 @@ class _Fit:
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
                 mean = np.sum(np.exp(log_share)[:, None] * value, 0)
-                self.linear[i] = _linear_start(scan, mean, inverse, self.settings)
+                self.linear[i] = linear_start(scan, mean, inverse, self.settings)
             self.member[i] = _membership(scan, used, self.linear[i], value, log_share, self.settings)
             image = np.sum(self.member[i][:, None] * value, 0)
-            misfit = np.where(self.used[i], scan.counts - _expected(scan, self.linear[i], image), np.nan)
+            misfit = np.where(self.used[i], scan.counts - expected_counts(scan, self.linear[i], image), np.nan)
             scale = max(1.0, float(robust_std(misfit / scan.sigma)))
             self.weights[i] = np.nan_to_num(
                 cauchy_weight(misfit / scan.sigma, self.settings.robust_limit * scale), nan=0.0
@@ -529,7 +338,7 @@ def _membership(
     limit = settings.robust_limit
     loss = np.zeros(log_share.shape)
     for m, image in enumerate(value):
-        residual = (scan.counts - _expected(scan, linear, image)) / scan.sigma
+        residual = (scan.counts - expected_counts(scan, linear, image)) / scan.sigma
         loss[m] = np.sum(np.where(used, limit**2 * np.log1p((residual / limit) ** 2), 0.0), 0)
     weight = log_share - 0.5 * loss
     weight = np.exp(weight - weight.max(0))
@@ -541,24 +350,6 @@ def _tiles_of(seen: Seen) -> Groups:
     where = np.nonzero(seen.is_object)
     across = max((int(np.ptp(w)) + 1 for w in where if w.size), default=0)
     return tiles(seen.is_object, max(TILE, round(across / TILES_ACROSS)))
-
-
-def _started(
-    stated: Instrument, scan: KnownScan, settings: KnownShapeSettings, stack_reach: float
-) -> tuple[KnownScan, float]:
-    """Put the object where a search finds it; of several shapes take the best."""
-    found = []
-    for known in scan.known.starts():
-        trial = replace(scan, known=known, own=object_unknowns(known, stack_reach, settings))
-        layout = _Layout(instrument_unknowns(stated, settings), [trial])
-        coarse = _thinned(trial, _stride(trial, _SEARCH_PIXELS))
-        base, is_ball = layout.start[0], known.kind == "ball"
-        reach = 2.0 * _SEARCH_REACH * stack_reach * np.array([1.0, float(is_ball)])
-        nothing = no_multiple(coarse.model, base, layout.free[0])
-        place, misfit = _find_place(coarse, base, nothing, reach, settings)
-        own = [u._replace(stated=float(p)) for u, p in zip(trial.own[:2], place, strict=True)] + trial.own[2:]
-        found.append((replace(trial, own=own), misfit))
-    return min(found, key=lambda entry: entry[1])
 
 
 def fit_known_shapes(
@@ -598,13 +389,13 @@ def fit_known_shapes(
     for i, (scan, stack) in enumerate(zip(scans, stacks, strict=True)):
         if scan.known.kind != "flat":
             reach = 0.5 * float(max(np.ptp(stack.x), np.ptp(stack.y)))
-            scans[i], _ = _started(stated, scan, settings, reach)
+            scans[i], _ = started(stated, scan, settings, reach)
     fit, rounds, is_converged = _Fit(stated, scans, settings, trace), 0, False
-    strides = [_stride(scan, _FIRST_PIXELS) for scan in scans]
+    strides = [stride_for(scan, FIRST_PIXELS) for scan in scans]
     if max(strides) > 1:
-        first = [_thinned(scan, stride) for scan, stride in zip(scans, strides, strict=True)]
-        thinned = trace and (lambda i, *about: trace(i, *about)[:, :: strides[i], :: strides[i]])
-        coarse = _Fit(stated, first, settings, thinned)
+        first = [thinned(scan, stride) for scan, stride in zip(scans, strides, strict=True)]
+        thin_trace = trace and (lambda i, *about: trace(i, *about)[:, :: strides[i], :: strides[i]])
+        coarse = _Fit(stated, first, settings, thin_trace)
         coarse.is_first = True
         rounds, _ = _run(coarse, settings.max_rounds, rounds, report)
         fit.start_at(coarse)
@@ -674,7 +465,7 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     residuals, expected, seen = [], [], []
     for i, scan in enumerate(fit.scans):
         at = fit.layout.of_scan(i, fit.x)
-        expected.append(_expected(scan, fit.linear[i], fit.image(i, fit.x)[0]))
+        expected.append(expected_counts(scan, fit.linear[i], fit.image(i, fit.x)[0]))
         residuals.append(np.where(fit.used[i], (scan.counts - expected[-1]) / scan.sigma, np.nan))
         seen.append(see(scan.model, at))
     return KnownFit(

@@ -9,7 +9,8 @@ from helio_jax.calibration.common_errors import common_std, group_means, scan_li
 from helio_jax.calibration.known_model import see
 from helio_jax.calibration.known_objects import KnownObject, Stated
 from helio_jax.calibration.known_report import calibrated_instrument, table
-from helio_jax.calibration.known_shape import OUTLINE, _Fit, fit_known_shapes, prepare_scan
+from helio_jax.calibration.known_scan import prepare_scan
+from helio_jax.calibration.known_shape import OUTLINE, _Fit, fit_known_shapes
 from helio_jax.calibration.unknowns import OBJECT, KnownShapeSettings
 from helio_jax.errors import SceneError
 from helio_jax.formats.toml import write_calibrated
