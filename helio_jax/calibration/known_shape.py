@@ -54,9 +54,9 @@ TILES_ACROSS = 6
 """Tiles across an object within which the model's error is the same, if each of them has `TILE` pixels or more."""
 CONVERGED = 0.1
 """The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
-NEAR, ERROR_ROUNDS = 1.0, 3
-"""Errors of the model are estimated once no unknown changes by more standard deviations in a round: before, misfit is
-that of the unknowns. They are held after so many rounds: estimated from residuals that they have shaped they wander."""
+NEAR = 1.0
+"""Errors of the model are estimated when no unknown changes by more standard deviations in a round: before, misfit is
+that of the unknowns. Then they are held: estimated again from residuals that they have shaped, they only grow."""
 RADIOSITY_PIXELS = 25, 25, 61
 """Pixels along the longer side of the raster on which multiple scattering is derived, about: in the first rounds and
 all later ones. On a coarse raster the derivatives are wrong about an object's foot, where they are largest."""
@@ -138,7 +138,7 @@ class _Fit:
         self.tiles = [_tiles_of(see(s.model, self.layout.of_scan(i, self.x))) for i, s in enumerate(scans)]
         self.model_error = [np.zeros((len(s.counts), 2)) for s in scans]  # of substrate and object [detector, part]
         self.is_near = False  # whether misfit is the model's error, no longer that of the unknowns
-        self.error_rounds = 0
+        self.is_error_known = False  # whether the errors of lines and tiles are held
         self.multiple: list[Multiple] = [
             no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
         ]
@@ -264,11 +264,11 @@ class _Fit:
             )
             if number > 0:
                 self._estimate_common_errors(i, seen, np.nan_to_num(misfit))
-        self.error_rounds += self.is_near
+        self.is_error_known = self.is_near
 
     def _estimate_common_errors(self, i: int, seen: Seen, misfit: np.ndarray) -> None:
         """Estimate the errors of scan lines, and of tiles without them, from a misfit [detector, y, x], counts."""
-        if self.error_rounds >= ERROR_ROUNDS:
+        if self.is_error_known:
             return
         weight, lines = self.inverse(i) ** 2, self.line_groups[i]
         mean, total = group_means(misfit, weight, lines)
