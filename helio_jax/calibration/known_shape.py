@@ -44,10 +44,11 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
 
 OUTLINE = 0.6, 0.3, 0.15
-"""Scale of the logistic function by which a pixel changes from object to substrate, over the pitch: in the first rounds
-and all later ones. A wide outline finds the object from farther away, a narrow one places it better. Data of a pixel
-that is closer to an outline than this are left out: its masks and its multiple scattering change too fast with the
-object's place for a linear step, and differ between the parts. They still tell on which part it lies."""
+"""Scale of the logistic function by which a pixel changes from object to substrate, over the pitch of a raster of at
+most `FIRST_PIXELS` pixels a side: in the first rounds and all later ones. A wide outline finds the object from farther
+away, a narrow one places it better. Data of a pixel that is closer to an outline than this are left out: its masks and
+its multiple scattering change too fast with the object's place for a linear step, and differ between the parts. They
+still tell on which part it lies."""
 TILE = 6
 """Side of the tiles [pixels] within which residuals may be correlated."""
 TILES_ACROSS = 6
@@ -144,7 +145,7 @@ class _Fit:
         ]
         self.expanded_at = [np.full(len(self.x), np.inf) for _ in scans]
         self.traced_at = [np.full(len(self.x), np.inf) for _ in scans]  # with all paths
-        self.width = [OUTLINE[0] * pitch(s.model.raster.y) for s in scans]
+        self.width = [OUTLINE[0] * _outline_pitch(s) for s in scans]
         self.deviation = np.ones(len(self.x))
         self.weights = [np.ones(s.counts.shape) for s in scans]
         self.used = [s.is_used for s in scans]
@@ -241,7 +242,7 @@ class _Fit:
             own, seen = scan.model.object_of(at), see(scan.model, at)
             if scan.known.kind != "flat":
                 self.multiple[i] = self._scattered_again(number, i, at, seen, instrument)
-            step = pitch(scan.model.raster.y)
+            step = _outline_pitch(scan)
             self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * step
             used = scan.is_used & ~_ring(scan, own, seen, self.settings)
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
@@ -310,6 +311,11 @@ class _Fit:
             rotation=float(plate[3]),
             incidence=float(plate[5]),
         )
+
+
+def _outline_pitch(scan: KnownScan) -> float:
+    """Return the pitch that the outline's scale refers to [um]; at a finer one the fit would creep, not step."""
+    return stride_for(scan, FIRST_PIXELS) * pitch(scan.model.raster.y)
 
 
 def _ring(scan: KnownScan, own: dict[str, float], seen: Seen, settings: KnownShapeSettings) -> np.ndarray:
