@@ -59,7 +59,8 @@ def excess_slope_errors(errors: np.ndarray, chi_square: np.ndarray, expected: fl
         expected: chi-square of a right map.
     """
     share = np.maximum(1.0 - expected / np.maximum(chi_square, 1e-12), 0.0)
-    return np.sqrt(uniform_filter(errors**2, 3, mode="nearest") * share)
+    mean = np.maximum(uniform_filter(errors**2, 3, mode="nearest"), 0.0)  # its running sums leave rounding errors
+    return np.sqrt(mean * share)
 
 
 def accumulated(
