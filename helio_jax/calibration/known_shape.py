@@ -162,13 +162,9 @@ class _Fit:
         self.offsets = np.cumsum([len(self.x), *(a.size for a in self.linear)])
 
     def start_at(self, first: "_Fit") -> None:
-        """Begin where a fit of fewer pixels has ended, as near."""
+        """Begin where a fit of fewer pixels has ended."""
         self.x, self.linear, self.deviation = first.x, first.linear, first.deviation
-        self.weights = [
-            w if w.shape == s.counts.shape else np.ones(s.counts.shape)
-            for w, s in zip(first.weights, self.scans, strict=True)
-        ]
-        self.is_near, self.rounds_before = True, max(len(OUTLINE), len(RADIOSITY_PIXELS))
+        self.is_near, self.rounds_before = first.is_near, max(len(OUTLINE), len(RADIOSITY_PIXELS))
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """Split whitened unknowns into those of the geometry, and the linear ones of the scans [detector, column]."""
@@ -398,15 +394,14 @@ def fit_known_shapes(
             scans[i], _ = started(stated, scan, settings, reach)
     fit, rounds, is_converged = _Fit(stated, scans, settings, trace), 0, False
     strides = [stride_for(scan, FIRST_PIXELS) for scan in scans]
-    if max(strides) > 1:
+    if max(strides) > 1 and settings.max_rounds > 1:
         first = [thinned(scan, stride) for scan, stride in zip(scans, strides, strict=True)]
         thin_trace = trace and (lambda i, *about: trace(i, *about)[:, :: strides[i], :: strides[i]])
         coarse = _Fit(stated, first, settings, thin_trace)
         coarse.is_first = True
-        rounds, _ = _run(coarse, settings.max_rounds, rounds, report)
+        rounds, _ = _run(coarse, settings.max_rounds // 2, rounds, report)
         fit.start_at(coarse)
-    if rounds < settings.max_rounds:
-        rounds, is_converged = _run(fit, settings.max_rounds, rounds, report)
+    rounds, is_converged = _run(fit, settings.max_rounds, rounds, report)
     return _result(fit, rounds, is_converged)
 
 
@@ -438,10 +433,9 @@ def _run(fit: _Fit, max_rounds: int, done: int, report: Callable[[int, int, str]
         is_at_minimum = number > 1 and solved.status > 0
         if is_at_minimum and fit.is_near and change < CONVERGED:
             return done + number + 1, True
-        if is_at_minimum and change < NEAR:
-            if fit.is_first:
-                return done + number + 1, False
-            fit.is_near = True
+        fit.is_near |= is_at_minimum and change < NEAR
+        if fit.is_near and fit.is_first:
+            return done + number + 1, False
     return max_rounds, False
 
 

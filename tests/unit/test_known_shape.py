@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from helio_jax.calibration.common_errors import common_std, group_means, scan_lines, tiles, whitened
-from helio_jax.calibration.known_model import see
+from helio_jax.calibration.known_model import no_multiple, probability, see
 from helio_jax.calibration.known_objects import KnownObject, Stated
 from helio_jax.calibration.known_report import calibrated_instrument, table
-from helio_jax.calibration.known_scan import prepare_scan
+from helio_jax.calibration.known_scan import Layout, prepare_scan
 from helio_jax.calibration.known_shape import OUTLINE, _Fit, fit_known_shapes
-from helio_jax.calibration.unknowns import OBJECT, KnownShapeSettings
+from helio_jax.calibration.unknowns import OBJECT, KnownShapeSettings, instrument_unknowns
 from helio_jax.errors import SceneError
 from helio_jax.formats.toml import write_calibrated
 from helio_jax.forward.optics import Optics
@@ -131,6 +131,36 @@ def test_data_beside_the_outline_are_left_out(bshem):
     assert left_out[reached(0.9 * scale)].all() and reached(0.9 * scale).sum() > 5
     assert not left_out[~reached(1.2 * scale)].any()
     assert fit.outlined[0].all()
+
+
+def modelled_ball(bshem, axis) -> MicrographStack:
+    """Make a scan of a ball by the model of the fit itself, without multiple scattering, with noise."""
+    counts = np.full((3, axis.size, axis.size), 5000.0)
+    stack = MicrographStack(counts, axis, axis, bshem, variance=np.full(counts.shape, 3600.0), noise="poisson")
+    scan = prepare_scan(stack, KnownObject.parse("ball radius=1000 height=680"), KnownShapeSettings(rays=0))
+    layout = Layout(instrument_unknowns(bshem, KnownShapeSettings()), [scan])
+    at = layout.of_scan(0, np.zeros(len(layout.unknowns)))
+    image = probability(scan.model, at, no_multiple(scan.model, at, layout.free[0]))
+    noise = np.random.default_rng(8).normal(0.0, 60.0, counts.shape)
+    return stack.replace(counts=counts + 3000.0 * image / np.median(image) + noise)
+
+
+@pytest.mark.parametrize("max_rounds", [1, 2, 3])
+def test_few_rounds_end_on_all_pixels(bshem, monkeypatch, max_rounds):
+    """A large raster is first fitted on few pixels; what comes out is of all of them, however few the rounds.
+
+    Catches a first fit that takes all rounds, and one that counts as converged.
+    """
+    monkeypatch.setattr("helio_jax.calibration.known_shape.FIRST_PIXELS", 13)
+    axis = np.linspace(-1400.0, 1400.0, 25)
+    scan = modelled_ball(bshem, axis)
+    done = []
+    settings = KnownShapeSettings(rays=0, max_rounds=max_rounds, drift=0.0, pedestal=0.0)
+    known = [KnownObject.parse("ball radius=1000 height=680")]
+    found = fit_known_shapes([scan], known, settings, report=lambda number, total, note: done.append((number, note)))
+    assert found.rounds == len(done) == max_rounds and not found.is_converged
+    assert found.residuals[0].shape == (3, 25, 25) and np.isfinite(found.values).all()
+    assert [note for _, note in done].count("all pixels") == (max_rounds > 1)
 
 
 @pytest.fixture(scope="module")
