@@ -178,8 +178,8 @@ def fit(bshem):
     noise = np.random.default_rng(3).normal(0.0, 60.0, image.shape)
     variance = np.full(image.shape, 3600.0)
     stack = MicrographStack(signal + 5000.0 + noise, AXIS, AXIS, bshem, variance=variance, noise="poisson")
-    settings = KnownShapeSettings(max_rounds=5, drift=0.0, pedestal=0.0)
-    trace = multiple_tracer([stack], [known], rays=64, substrate_um=8000.0)
+    settings = KnownShapeSettings(max_rounds=8, drift=0.0, pedestal=0.0)
+    trace = multiple_tracer([stack], [known], rays=512, substrate_um=8000.0)
     return fit_known_shapes([stack], [known], settings, trace=trace)
 
 
