@@ -73,6 +73,8 @@ def whitened(weighted: np.ndarray, inverse: np.ndarray, std: np.ndarray, groups:
         std: standard deviation L of the groups' errors [detector, group].
         groups: of the pixels.
     """
+    if not np.any(std):
+        return weighted
     size = groups.total(inverse**2)
     c = (1.0 - 1.0 / np.sqrt(1.0 + std**2 * size)) / np.maximum(size, 1e-300)
     return weighted - inverse * groups.spread(c * groups.total(weighted * inverse))

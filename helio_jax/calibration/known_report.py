@@ -130,7 +130,8 @@ def verdict(fit: KnownFit) -> list[str]:
         named = "; ".join(f"{share:.1%} for {name}" for share, name in sorted(errors, reverse=True)[:3] if share > 0.0)
         out.append(
             f"the object differs from the model by more than noise, tile by tile ({named}, of the substrate's signal): "
-            "dust, its shape or its scattering law; the standard deviations allow for it"
+            "dust, its shape or its scattering law; the standard deviations allow for errors that differ from tile to "
+            "tile, not for wider ones"
         )
     if fit.inflation > INFLATED:
         out.append(

@@ -133,7 +133,7 @@ class Layout:
 
 
 def stride_for(scan: KnownScan, pixels: int) -> int:
-    """Return which rows and columns leave about so many pixels along the longer side: every how manyth."""
+    """Return the stride of rows and columns that leaves about so many pixels along the longer side."""
     return max(1, round(max(scan.model.raster.shape) / pixels))
 
 
@@ -157,4 +157,5 @@ def linear_start(scan: KnownScan, model: np.ndarray, inverse: np.ndarray, settin
 
 
 def expected_counts(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """Compute the readings [detector, y, x] of linear unknowns [detector, column] at probabilities [detector, y, x]."""
     return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)

@@ -39,6 +39,7 @@ from helio_jax.calibration.known_scan import (
 from helio_jax.calibration.known_start import started
 from helio_jax.calibration.unknowns import KnownShapeSettings, instrument_unknowns
 from helio_jax.errors import GuardError, SceneError
+from helio_jax.forward.optics import Raster
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
@@ -70,9 +71,10 @@ FIRST_PIXELS = 61
 """Pixels along the longer side of the thinned raster on which the unknowns are first fitted."""
 _STEPS, _FTOL = 30, (1e-4, 1e-6)
 """Steps of a round, and relative change of the cost at which it ends: far off, and near."""
-Trace = Callable[[int, Instrument, dict[str, float], int], np.ndarray]
+Trace = Callable[[int, Instrument, dict[str, float], Raster, int], np.ndarray]
 """Traces the multiple scattering of a scan [detector, y, x]: its number, the instrument, the numbers of the object by
-their names [um, rad], how many times fewer paths will do. The substrate's albedo is at most 1, so is the object's."""
+their names [um, rad], the raster, how many times fewer paths will do. The substrate's albedo is at most 1, so is the
+object's."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,7 @@ class _Fit:
         self, stated: Instrument, scans: list[KnownScan], settings: KnownShapeSettings, trace: Trace | None
     ) -> None:
         self.stated, self.scans, self.settings, self.trace = stated, scans, settings, trace
-        self.is_first = False  # whether another fit, of all pixels, follows
-        self.rounds_before = 0  # of such a first fit: their outline and their radiosity are coarse
+        self.rounds_before = 0  # of a fit of fewer pixels: their outline and their radiosity are coarse
         self.layout = Layout(instrument_unknowns(stated, settings), scans)
         self.x = np.zeros(len(self.layout.unknowns))
         self.line_groups = [scan_lines(s.model.raster.shape, s.slow_axis) for s in scans]
@@ -259,21 +260,19 @@ class _Fit:
             self.weights[i] = np.nan_to_num(
                 cauchy_weight(misfit / scan.sigma, self.settings.robust_limit * scale), nan=0.0
             )
-            if number > 0:
+            if number > 0 and not self.is_error_known:
                 self._estimate_common_errors(i, seen, np.nan_to_num(misfit))
         self.is_error_known = self.is_near
 
     def _estimate_common_errors(self, i: int, seen: Seen, misfit: np.ndarray) -> None:
         """Estimate the errors of scan lines, and of tiles without them, from a misfit [detector, y, x], counts."""
-        if self.is_error_known:
-            return
         weight, lines = self.inverse(i) ** 2, self.line_groups[i]
         mean, total = group_means(misfit, weight, lines)
         self.lines[i] = common_std(mean, total)
-        variance = self.lines[i][:, None] ** 2
-        share = variance * total / (1.0 + variance * total)  # of the mean that is the line's own
         if not self.is_near:
             return
+        variance = self.lines[i][:, None] ** 2
+        share = variance * total / (1.0 + variance * total)  # of the mean that is the line's own
         self.tiles[i] = _tiles_of(seen)
         mean, total = group_means(misfit - lines.spread(share * mean), weight, self.tiles[i])
         self.model_error[i] = np.stack([common_std(mean[:, p::2], total[:, p::2], is_sure=True) for p in (0, 1)], 1)
@@ -287,7 +286,8 @@ class _Fit:
             own = {name: float(v) for name, v in scan.model.object_of(at).items()}
             bright = np.exp(np.maximum(0.0, own["log albedo ratio"]))  # the tracer's brighter surface has the albedo 1
             albedo = np.where(seen.is_object, np.exp(own["log albedo ratio"]), 1.0) / bright
-            traced = self.trace(i, instrument, own, 1 if self.is_near else THRIFT) / albedo * bright
+            thrift = 1 if self.is_near else THRIFT
+            traced = self.trace(i, instrument, own, scan.model.raster, thrift) / albedo * bright
             self.traced_at[i] = self.x if self.is_near else self.traced_at[i]
         moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
         if traced is not None and number >= len(RADIOSITY_PIXELS) and np.max(moved) < STALE:
@@ -396,17 +396,17 @@ def fit_known_shapes(
     strides = [stride_for(scan, FIRST_PIXELS) for scan in scans]
     if max(strides) > 1 and settings.max_rounds > 1:
         first = [thinned(scan, stride) for scan, stride in zip(scans, strides, strict=True)]
-        thin_trace = trace and (lambda i, *about: trace(i, *about)[:, :: strides[i], :: strides[i]])
-        coarse = _Fit(stated, first, settings, thin_trace)
-        coarse.is_first = True
-        rounds, _ = _run(coarse, settings.max_rounds // 2, rounds, report)
+        coarse = _Fit(stated, first, settings, trace)
+        rounds, _ = _run(coarse, settings.max_rounds // 2, rounds, report, until_near=True)
         fit.start_at(coarse)
     rounds, is_converged = _run(fit, settings.max_rounds, rounds, report)
     return _result(fit, rounds, is_converged)
 
 
-def _run(fit: _Fit, max_rounds: int, done: int, report: Callable[[int, int, str], None]) -> tuple[int, bool]:
-    """Run the rounds of a fit; one on a thinned raster (`_Fit.is_first`) ends when it is near.
+def _run(
+    fit: _Fit, max_rounds: int, done: int, report: Callable[[int, int, str], None], *, until_near: bool = False
+) -> tuple[int, bool]:
+    """Run the rounds of a fit until it has converged, or until it is near.
 
     Returns:
         Rounds so far, `done` of them before, and whether the fit has converged.
@@ -434,7 +434,7 @@ def _run(fit: _Fit, max_rounds: int, done: int, report: Callable[[int, int, str]
         if is_at_minimum and fit.is_near and change < CONVERGED:
             return done + number + 1, True
         fit.is_near |= is_at_minimum and change < NEAR
-        if fit.is_near and fit.is_first:
+        if fit.is_near and until_near:
             return done + number + 1, False
     return max_rounds, False
 

@@ -121,18 +121,18 @@ class Ball(eqx.Module):
         lies on the line between them, half = 0, so that the moved point is continuous.
         """
         depth, steep = self.height - self.radius, shift @ shift
-        square, foot = 1.0 + steep, self.radius**2 - depth**2
+        square, foot_square = 1.0 + steep, self.radius**2 - depth**2
         half = x * shift[0] + y * shift[1] + depth
-        has_both = depth**2 < steep * foot
+        has_both = depth**2 < steep * foot_square
         scale = jnp.where(has_both, -depth / jnp.where(has_both, steep, 1.0), jnp.maximum(depth, 0.0))
         start = jnp.where(has_both, 0.0, scale * steep + depth)  # `half` at the centre
         center = [scale * shift[i] for i in (0, 1)]
         way = [x - center[0], y - center[1]]
         rise, first = jnp.where(half > 0.0, half - start, 0.0), jnp.where(half > 0.0, start, 0.0)
-        # half^2 = square * (x^2 + y^2 - foot) at the outline, half = 0 at the foot: quadratic in the share of the way
+        # half^2 = square * (x^2 + y^2 - foot^2) at the outline, half = 0 at the foot: quadratic in the share of the way
         a = square * jnp.maximum(way[0] ** 2 + way[1] ** 2, _NEAR * self.radius**2) - rise**2
         b = first * rise - square * (center[0] * way[0] + center[1] * way[1])
-        c = jnp.maximum(square * (foot - center[0] ** 2 - center[1] ** 2) + first**2, _NEAR * self.radius**2)
+        c = jnp.maximum(square * (foot_square - center[0] ** 2 - center[1] ** 2) + first**2, _NEAR * self.radius**2)
         away = jnp.maximum((1.0 + _NEAR) * (b + jnp.sqrt(b**2 + a * c)) / a, 1.0)
         return center[0] + away * way[0], center[1] + away * way[1]
 

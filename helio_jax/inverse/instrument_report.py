@@ -138,5 +138,5 @@ def describe_law(fit: Fit, posterior: Posterior) -> dict[str, Any]:
     of_law = [i for i, name in enumerate(posterior.names) if kind_of(name) == "law"]
     assert prior is not None
     probability = cosine_probability(prior, whitened, posterior.instrument_covariance[np.ix_(of_law, of_law)])
-    kind = fit.problem.settings.law if fit.problem.settings.has_own_law else "power"
+    kind = fit.problem.settings.law_of_fit(is_stated=True)  # only the stated one needs no name
     return {"kind": kind, "cosine_probability": probability, "is_cosine": probability > LEAST_PROBABILITY}

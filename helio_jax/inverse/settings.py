@@ -112,6 +112,10 @@ class RefineSettings(Settings):
         """Number of paths of a prediction in a search and in the test of a fit."""
         return max(self.paths(n_pixels) // SEARCH_THRIFT, 1000)
 
+    def law_of_fit(self, is_stated: bool) -> str:
+        """Name the law that a fit takes; `is_stated`: whether the instrument file has a table [law]."""
+        return self.law if self.law != "as_stated" else "power" if is_stated else "cosine"
+
     @property
     def has_own_law(self) -> bool:
         """Whether these settings name a law with unknown numbers."""

@@ -42,7 +42,7 @@ def calibrate_known(
     known = [KnownObject.parse(text) for text in shapes] * (len(stacks) if len(shapes) == 1 else 1)
     chosen = (settings or KnownShapeSettings()).changed(**changes)
     rays = min(chosen.rays_of(stack.counts[0].size) for stack in stacks)
-    trace = multiple_tracer(list(stacks), known, rays=rays, substrate_um=chosen.substrate_um) if rays else None
+    trace = multiple_tracer(known, rays=rays, substrate_um=chosen.substrate_um) if rays else None
     return fit_known_shapes(list(stacks), known, chosen, trace=trace, report=report or (lambda *_: None))
 
 

@@ -267,15 +267,13 @@ class _Reconstructing:
 def _law_warnings(stack: MicrographStack, settings: ReconstructSettings) -> list[str]:
     """List where heights assume another scattering law than that of the sample or of the instrument file."""
     refine, stated, out = settings.refine, stack.instrument.law, []
-    assumed = refine.law if settings.method == "refine" and refine.has_own_law else "cosine"
-    if stated is not None and refine.law == "as_stated":
-        if settings.method == "refine":
-            assumed = "power"
-        else:
-            out.append(
-                f"{settings.method} assumes the cosine law, the instrument states cos^{1.0 + stated.exponent:.2f}: "
-                "steep slopes are off; refine takes it into account"
-            )
+    is_fit = settings.method == "refine"
+    assumed = refine.law_of_fit(stated is not None) if is_fit else "cosine"
+    if stated is not None and refine.law == "as_stated" and not is_fit:
+        out.append(
+            f"{settings.method} assumes the cosine law, the instrument states cos^{1.0 + stated.exponent:.2f}: "
+            "steep slopes are off; refine takes it into account"
+        )
     others = [f"{name} ({kind})" for name, kind in stack.materials.items() if kind not in ("cosine", assumed)]
     if others:
         out.append(f"NOT the {assumed.replace('_', ' ')} law, which heights assume, holds for {', '.join(others)}")

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from helio_jax.calibration.known_objects import KnownObject
+from helio_jax.calibration.unknowns import RAYS
+from helio_jax.forward.optics import Raster
 from helio_jax.instrument import Instrument
-from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.pipeline import simulate
 from helio_jax.workflows.scene_file import SceneFile
 
 _GROUND, _OBJECT = "substrate", "object"
-LEAST_RAYS = 64
-"""Paths per pixel of a trace that may have fewer: the noise of fewer is misfit that the unknowns would explain."""
 
 
 def known_scene(
@@ -62,18 +61,20 @@ def known_scene(
 
 
 def multiple_tracer(
-    stacks: list[MicrographStack], known: list[KnownObject], *, rays: int, substrate_um: float
-) -> Callable[[int, Instrument, dict[str, float], int], np.ndarray]:
+    known: list[KnownObject], *, rays: int, substrate_um: float
+) -> Callable[[int, Instrument, dict[str, float], Raster, int], np.ndarray]:
     """Return what traces the multiple scattering of a scan of a known object, see `calibration.known_shape.Trace`.
 
     The albedo of the own pixel is not divided out.
     """
 
-    def trace(number: int, instrument: Instrument, numbers: dict[str, float], thrift: int) -> np.ndarray:
-        stack = stacks[number]
-        scene = known_scene(known[number], numbers, instrument, stack.x, stack.y, substrate_um=substrate_um)
-        found = simulate(scene, rays=max(min(rays, LEAST_RAYS), rays // thrift), seed=number + 1, maps=False).only()
+    def trace(
+        number: int, instrument: Instrument, numbers: dict[str, float], raster: Raster, thrift: int
+    ) -> np.ndarray:
+        scene = known_scene(known[number], numbers, instrument, raster.x, raster.y, substrate_um=substrate_um)
+        fewer = max(min(rays, RAYS[0]), rays // thrift)  # the noise of still fewer is misfit to be explained
+        found = simulate(scene, rays=fewer, seed=number + 1, maps=False).only()
         assert found.by_order is not None and found.n_rays is not None  # simulated
-        return (found.by_order[1:].sum(0) / found.n_rays).reshape(stack.shape)
+        return (found.by_order[1:].sum(0) / found.n_rays).reshape(-1, *raster.shape)
 
     return trace

@@ -179,7 +179,7 @@ def fit(bshem):
     variance = np.full(image.shape, 3600.0)
     stack = MicrographStack(signal + 5000.0 + noise, AXIS, AXIS, bshem, variance=variance, noise="poisson")
     settings = KnownShapeSettings(max_rounds=8, drift=0.0, pedestal=0.0)
-    trace = multiple_tracer([stack], [known], rays=512, substrate_um=8000.0)
+    trace = multiple_tracer([known], rays=512, substrate_um=8000.0)
     return fit_known_shapes([stack], [known], settings, trace=trace)
 
 
