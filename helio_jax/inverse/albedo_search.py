@@ -1,5 +1,7 @@
 """The patches of a measurement: those of its photometric solution, corrected for masks and multiple scattering."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from helio_jax.errors import PredictionError
@@ -16,6 +18,22 @@ from helio_jax.micrograph import MicrographStack
 
 CORRECTIONS = 2
 """How often masks and multiple scattering are predicted: the first time with the albedo that they change."""
+
+
+class AlbedoSearch(NamedTuple):
+    """What a photometric solution with an albedo of its own in every pixel shows.
+
+    Attributes:
+        patches: of other albedo.
+        height: of the solution [y, x], um.
+        solution: albedo and normals.
+        is_corrected: whether masks and multiple scattering could be predicted and were subtracted.
+    """
+
+    patches: AlbedoPatches
+    height: np.ndarray
+    solution: PhotometricSolution
+    is_corrected: bool = True
 
 
 def albedo_std(solution: PhotometricSolution, variance: np.ndarray, phi: np.ndarray) -> np.ndarray:
@@ -40,6 +58,17 @@ def albedo_std(solution: PhotometricSolution, variance: np.ndarray, phi: np.ndar
 
 def search_albedo_patches(stack: MicrographStack, settings: ReconstructSettings, predict: Predict) -> AlbedoPatches:
     """Find the patches of other albedo in micrographs; none where masks and multiple scattering are not predictable."""
+    return search_albedo(stack, settings, predict).patches
+
+
+def search_albedo(stack: MicrographStack, settings: ReconstructSettings, predict: Predict) -> AlbedoSearch:
+    """Solve for heights and the albedo of every pixel, and find the patches of other albedo.
+
+    Args:
+        stack: micrographs.
+        settings: of the reconstruction.
+        predict: predicts masks and multiple scattering.
+    """
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     signal, variance = signal_of(stack)
     height, solution = solve_nearfield(signal, variance, optics, raster, settings, settings.rounds)
@@ -50,7 +79,7 @@ def search_albedo_patches(stack: MicrographStack, settings: ReconstructSettings,
         try:
             found = predict(near, solution.normals, **patches.known)
         except PredictionError:
-            return AlbedoPatches.none(height.shape)
+            return AlbedoSearch(AlbedoPatches.none(height.shape), height, solution, False)
         multiple = settings.refine.multiple_error * found.multiple if stack.is_without_multiple else found.multiple
         phi = form_factor(optics, near)
         rest = unmodelled_signal(solution, phi, phi, Corrections(found.masked, multiple))
@@ -60,4 +89,4 @@ def search_albedo_patches(stack: MicrographStack, settings: ReconstructSettings,
         std = albedo_std(solution, spread, form_factor(optics, limited(height, optics)))
         with np.errstate(invalid="ignore", divide="ignore"):
             patches = find_albedo_patches(np.log(solution.albedo), std, border)
-    return patches
+    return AlbedoSearch(patches, height, solution)

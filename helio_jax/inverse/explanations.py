@@ -1,8 +1,9 @@
 """Competing explanations of one stack's micrographs, each fitted; the one that explains them best is kept.
 
 The first is the photometric solution, with regions at the levels of the steps that mask bands show. Where the data
-contradict its fit, objects on a flat substrate are tried, and then patches of another albedo. A level that explains the
-images about as well as the one that is kept is undecided.
+contradict its fit, objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can
+explain nearly any images: there, patches are tried first, and also where the fit strains the instrument far beyond what
+is stated. A level that explains the images about as well as the one that is kept is undecided.
 """
 
 from collections.abc import Callable
@@ -14,27 +15,25 @@ import jax
 import numpy as np
 
 from helio_jax.errors import PredictionError, SceneError
-from helio_jax.forward.form_factor import form_factor
-from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.optics import Raster
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.inverse.albedo_patches import AlbedoPatches
-from helio_jax.inverse.albedo_search import search_albedo_patches
+from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit
-from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
-from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of, solve_known_albedo
+from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.measured_steps import walls_of
-from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.objects import find_objects
+from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo, with_backtracking
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square, squares
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.state import FitState, Predict, linearised_in_normal, prediction_std
+from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.verdict import local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
@@ -46,12 +45,14 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
+INSTRUMENT = "log_gain", "offset", "log_multiple", "law", "distance", "tilt", "aim"
+"""Parameters whose prior is what is known of the instrument."""
+STRAIN = 5.0
+"""The instrument is strained where its pulls' chi-square exceeds its mean by this many of its standard deviations."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
 HELD = 1e-4
 """Gains and offsets that are held have this share of their prior standard deviation."""
-MAX_BACKTRACKS = 3
-"""How often a starting surface is smoothed when masks and multiple scattering cannot be predicted for it."""
 
 
 class Explanation(NamedTuple):
@@ -88,30 +89,35 @@ def explain(
     report: Report | None,
     start: np.ndarray | None = None,
 ) -> Explanation:
-    """Fit the heights, and other explanations where the data contradict the fit; arguments as `reconstruct_stack`.
+    """Fit the heights, and other explanations where the data or what is known of the instrument contradict the fit.
 
-    Another explanation is kept where the data that are expected of it explain the micrographs better by `GAIN`, and
-    contradict it in fewer pixels (`LESS_CONTRADICTED`).
+    Another explanation is kept where it explains the micrographs and the instrument together better by `GAIN`, and
+    where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as they did before
+    (`MIN_CONTRADICTED`). Arguments as `reconstruct_stack`.
     """
     fits = _Fits(stack, settings, make_predict, report)
     none = AlbedoPatches.none(stack.shape[1:])
     if start is None:
-        best, others = fits.from_steps(none), (fits.from_pits, fits.from_objects, fits.from_albedo_patches)
+        best, others = fits.from_steps(none), [fits.from_pits, fits.from_objects]
     else:
-        best, others = fits.from_heights(start, none), (fits.from_albedo_patches,)
+        best, others = fits.from_heights(start, none), []
+    others.insert(0 if best.fit.problem.is_instrument_unknown else len(others), fits.from_albedo_patches)
     for other in others:
         if best.fit.is_interrupted:
             break
         try:
             residuals = fits.residuals(best.fit)
-            if fits.contradicted(residuals) < MIN_CONTRADICTED:
-                break
+            share = fits.contradicted(residuals)
+            is_contradicted = share >= MIN_CONTRADICTED
+            may_be_patches = other == fits.from_albedo_patches and is_strained(best.fit.parameters)
+            if not is_contradicted and not may_be_patches:
+                continue
             found = other(best, residuals)
             if found is None:
                 continue
             rest = fits.residuals(found.fit)
-            is_less = fits.contradicted(rest) < LESS_CONTRADICTED * fits.contradicted(residuals)
-            if is_less and improvement(residuals, rest) > GAIN:
+            is_less = fits.contradicted(rest) < (LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED)
+            if is_less and improvement(residuals, rest) + relief_of_strain(best.fit, found.fit) > GAIN:
                 best = found
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
@@ -235,14 +241,34 @@ class _Fits:
 
     def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
         """Fit once; arguments as those of `fitted`."""
-        fit, _ = _with_backtracking(
+        fit, _ = with_backtracking(
             lambda start: fit_heights(self.pose(start, *known), start, self.predict, self.report), surface, smoothed
         )
         return fit
 
+    @cached_property
+    def albedo_search(self) -> AlbedoSearch:
+        """The photometric solution with an albedo of its own in every pixel, and the patches that it shows."""
+        return search_albedo(self.stack, self.settings, self.predict_start)
+
     def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
         """Find the photometric solution that a fit starts from, and a smoother one."""
-        return _start(self.stack, self.settings, patches, self.predict_start)
+        known, smoothed = start_of_known_albedo(self.stack, self.settings, patches, self.predict_start)
+        if not self.pose(known, patches).is_instrument_unknown or not self.albedo_search.is_corrected:
+            return known, smoothed
+        free = start_of_free_albedo(self.stack, self.albedo_search.height, self.albedo_search.solution)
+        return (free if self._begins_better(free, known, patches) else known), smoothed
+
+    def _begins_better(self, surface: Surface, other: Surface, patches: AlbedoPatches) -> bool:
+        """Whether a short fit from a surface explains the data better than one from another."""
+        try:
+            misfit = self.short_fit(surface, patches)[0]
+        except PredictionError:
+            return False
+        try:
+            return misfit < self.short_fit(other, patches)[0]
+        except PredictionError:
+            return True
 
     @cached_property
     def plain_start(self) -> tuple[Surface, Surface]:
@@ -285,7 +311,7 @@ class _Fits:
         smoothed = Surface(*np.zeros((3, *height.shape)))
         return Explanation(self.fitted(start, smoothed, patches), np.zeros(height.shape, bool))
 
-    def from_objects(self, best: Explanation, _: np.ndarray) -> Explanation | None:
+    def from_objects(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
         if self.settings.border != "flat" or not self.settings.refine.objects or best.n_steps:
             return None
@@ -304,7 +330,7 @@ class _Fits:
         fit = self.fitted(start, smoothed, none, objects.number)
         return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
 
-    def from_pits(self, best: Explanation, _: np.ndarray) -> Explanation | None:
+    def from_pits(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from pits with flat floors in a flat substrate; None where there are none."""
         if self.settings.border != "flat" or not self.settings.refine.objects:
             return None
@@ -322,12 +348,13 @@ class _Fits:
         fit = self.fitted(start, self.plain_start[1], none, pits.number)
         return Explanation(fit, np.zeros(shape, bool), pits.number, "pits in")
 
-    def from_albedo_patches(self, best: Explanation, residuals: np.ndarray) -> Explanation | None:
+    def from_albedo_patches(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""
         if not self.settings.refine.albedo_patches:
             return None
-        found = search_albedo_patches(self.stack, self.settings, self.predict_start)
-        patches = found.keeping(found.unexplained(squares(residuals).mean(0)))
+        patches = self.albedo_search.patches
+        if not is_strained(best.fit.parameters):
+            patches = patches.keeping(patches.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
         if best.number is None:
@@ -341,6 +368,26 @@ def improvement(residuals: np.ndarray, others: np.ndarray) -> float:
     return half_chi_square(residuals) - half_chi_square(others)
 
 
+def instrument_pulls(parameters: Parameters) -> np.ndarray:
+    """Pulls of all unknowns but the surface, its albedo, drift and scan lines, in prior standard deviations [number].
+
+    They are independent and normal under the prior.
+    """
+    return np.concatenate([np.ravel(getattr(parameters, name)) for name in INSTRUMENT])
+
+
+def is_strained(parameters: Parameters) -> bool:
+    """Whether a fit moves the instrument farther than is stated, by more than chance (`STRAIN`)."""
+    pulls = instrument_pulls(parameters)
+    return float(np.sum(pulls**2)) > pulls.size + STRAIN * np.sqrt(2.0 * pulls.size)
+
+
+def relief_of_strain(fit: Fit, other: Fit) -> float:
+    """Compute by how much less another fit moves the instrument, in half chi-square."""
+    squares_of = (float(np.sum(instrument_pulls(f.parameters) ** 2)) for f in (fit, other))
+    return 0.5 * (next(squares_of) - next(squares_of))
+
+
 def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:
     """Hold gains and offsets at what is stated."""
     held = {"gain_std": HELD * settings.refine.gain_std, "offset_std": HELD * settings.refine.offset_std}
@@ -350,31 +397,6 @@ def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:
 def readout_as_stated(parameters: Parameters) -> Parameters:
     """Set gains and offsets to what is stated."""
     return parameters.replaced(log_gain=0.0 * parameters.log_gain, offset=0.0 * parameters.offset)
-
-
-def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
-    """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
-    signal, variance = (f / patches.albedo**n for n, f in enumerate(signal_of(stack), 1))
-    optics, raster = Optics.of(stack.instrument), Raster.of(stack)
-    corrections = predict(surface.height, normals, **patches.known)
-    sigma = prediction_std(corrections, normals, settings.refine)
-    masked, multiple = linearised_in_normal(corrections, normals)
-    visible = form_factor(optics, surface.height) - masked
-    spread = variance + sigma**2
-    (a, b), _ = solve_known_albedo(signal - multiple, spread, visible, normals, stack.instrument.beam_shift)
-    weight = np.ones(stack.shape[1:])
-    height = integrate_slopes(a, b, raster.dx, raster.dy, "weighted", weight)
-    return Surface(limited(level(height, settings, weight), optics), a, b)
-
-
-def _with_backtracking(work: Callable[[Surface], Any], surface: Surface, smoothed: Surface) -> tuple[Any, Surface]:
-    """Run `work` on a surface; on PredictionError, halve the step towards a smoothed surface (`MAX_BACKTRACKS`)."""
-    for _ in range(MAX_BACKTRACKS):
-        try:
-            return work(surface), surface
-        except PredictionError:
-            surface = jax.tree.map(lambda rough, smooth: 0.5 * (rough + smooth), surface, smoothed)
-    return work(surface), surface
 
 
 def scan_order(stack: MicrographStack) -> ScanOrder:
@@ -417,24 +439,3 @@ def labelled(regions: list[Region]) -> np.ndarray:
     for number, region in enumerate(regions, 1):
         out[region.inside] = number
     return out
-
-
-def _start(
-    stack: MicrographStack, settings: ReconstructSettings, patches: AlbedoPatches, predict: "Predict"
-) -> tuple[Surface, Surface]:
-    """Find the photometric solution that the fit starts from, and a smoother one."""
-    optics, raster, shift = Optics.of(stack.instrument), Raster.of(stack), stack.instrument.beam_shift
-    height, solution = solve_nearfield(*signal_of(stack), optics, raster, settings, settings.rounds)
-
-    def correct(surface: Surface) -> Surface:
-        return _corrected(stack, settings, patches, surface, surface.normals(shift), predict)
-
-    smoothed = Surface(*np.zeros((3, *height.shape)))
-    try:
-        near = Surface(limited(height, optics), *np.zeros((2, *height.shape)))
-        start = _corrected(stack, settings, patches, near, solution.normals, predict)
-    except PredictionError:
-        start = correct(smoothed)
-    for _ in range(settings.refine.photometric_rounds - 1):
-        start, smoothed = _with_backtracking(correct, start, smoothed)
-    return start, smoothed

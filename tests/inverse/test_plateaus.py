@@ -7,9 +7,9 @@ from scipy.ndimage import gaussian_filter
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse import explanations as solve
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
+from helio_jax.inverse.photometric_start import with_backtracking
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_height
@@ -193,10 +193,10 @@ def test_a_start_too_rough_to_predict_is_smoothed():
         return surface.height.max()
 
     rough, smooth = (Surface(*np.full((3, *SHAPE), value)) for value in (9.0, 1.0))
-    found, surface = solve._with_backtracking(lambda surface: work(surface, 4.0), rough, smooth)
+    found, surface = with_backtracking(lambda surface: work(surface, 4.0), rough, smooth)
     assert found == surface.height.max() == 3.0
     with pytest.raises(PredictionError):
-        solve._with_backtracking(lambda surface: work(surface, 1.5), rough, smooth)
+        with_backtracking(lambda surface: work(surface, 1.5), rough, smooth)
 
 
 @pytest.mark.slow
