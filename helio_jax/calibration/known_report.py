@@ -153,7 +153,8 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     """Return the fitted instrument with the covariance of what is unknown of it.
 
     [uncertainty] holds the standard deviations without their correlations: of the plate's motion, of the distance, and
-    of the directions of the apertures that follow, the largest of all.
+    of the directions of the apertures that follow, the largest of all. The next sample is tilted otherwise: its tilt is
+    as uncertain as these scans' was before.
     """
     n = fit.n_shared
     std = dict(zip(fit.names[:n], fit.stds[:n].tolist(), strict=True))
@@ -168,6 +169,7 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     directions = np.diag(geometry_covariance(fit.instrument, covariance))[1:].reshape(-1, 2)
     polar, azimuth = np.degrees(np.sqrt(directions.max(0))).tolist()
     stated = fit.stated.uncertainty
+    tilts = [float(std) for name, std in zip(fit.names, fit.priors, strict=True) if name.startswith("tilt")]
     found = {
         "plate_shift_um": max(std.get("plate shift x", 0.0), std.get("plate shift y", 0.0)),
         "plate_scale": std.get("plate scale", 0.0),
@@ -176,7 +178,7 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
         "incidence_deg": std.get("incidence", 0.0),
         "polar_deg": min(polar, 30.0),
         "azimuth_deg": min(azimuth, 30.0),
-        "tilt_deg": stated.tilt_deg,
+        "tilt_deg": max([stated.tilt_deg, *tilts]),
     }
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
     signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)

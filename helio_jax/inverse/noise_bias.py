@@ -17,15 +17,15 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.state import FitState
-from helio_jax.inverse.steps import expected, step
+from helio_jax.inverse.steps import expected, levelled, step
 
 
 def noise_bias(problem: FitProblem, state: FitState, n_pairs: int) -> tuple[Surface, Parameters]:
     """Compute the mean change of surface and parameters when a fit's own expected data are fitted with noise.
 
     Noise comes in pairs of opposite sign, so that all of its odd powers cancel. It is drawn by a generator that the
-    data seed: the same each time, another for other data. The instrument of the simulated data is at its prior means,
-    so that the pull of the priors is not taken for bias.
+    data seed: the same each time, another for other data. The instrument of the simulated data is at its prior means
+    and the substrate level, so that the pull of the priors is not taken for bias.
 
     Args:
         problem: the data.
@@ -36,7 +36,8 @@ def noise_bias(problem: FitProblem, state: FitState, n_pairs: int) -> tuple[Surf
         antithetic draws: Hammersley and Morton, Proc. Camb. Phil. Soc. 52 (1956) 449.
     """
     s, is_observed = problem.settings, problem.is_observed
-    truth = replace(state, parameters=problem.prior_means().replaced(patch=state.parameters.patch))
+    means = problem.prior_means().replaced(patch=state.parameters.patch)
+    truth = replace(state, surface=levelled(problem, state), parameters=means)
     clean = expected(problem, truth, is_noisy=False)
     truth = replace(truth, residuals=np.zeros(clean.shape))
     rng = np.random.default_rng(zlib.crc32(problem.data.tobytes()))

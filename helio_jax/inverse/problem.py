@@ -259,6 +259,11 @@ class FitProblem:
         law = self.law_at(parameters)
         return {} if law is None else {"law": law}
 
+    def known_tilt(self, parameters: Parameters) -> dict[str, tuple[float, float]]:
+        """Keywords by which a prediction is given the substrate's slopes; none where it is known to be level."""
+        slopes = self.priors.tilt * np.asarray(parameters.tilt)
+        return {"tilt": (float(slopes[0]), float(slopes[1]))} if slopes.size else {}
+
     @property
     def is_instrument_unknown(self) -> bool:
         """Whether more is unknown of the instrument than gains and offsets: drift or geometry."""

@@ -77,7 +77,11 @@ NAMES = tuple(Parameters.__dataclass_fields__)
 
 
 class Unknowns(eqx.Module):
-    """Whitened heights and slopes [y, x], and the parameters."""
+    """Whitened heights above the substrate, which may be tilted, whitened slopes [y, x], and the parameters.
+
+    Heights above a level plane would follow the tilt only together, against the prior of the border in every pixel:
+    conjugate gradients would hardly move it.
+    """
 
     height: Any
     slope_x: Any
@@ -292,9 +296,16 @@ def albedo_of_patches(log_albedo: Any, std: Any, patches: Any) -> jax.Array:
     return jnp.exp(jnp.tensordot(std * log_albedo, patches, 1))
 
 
+def substrate_plane(parameters: Parameters, fixed: FixedTerms) -> Any:
+    """Compute the heights of the substrate, which may be tilted [y, x], um; 0 where its tilt is known to be none."""
+    if not parameters.tilt.size:
+        return 0.0
+    return jnp.tensordot(fixed.priors.tilt * parameters.tilt, fixed.position, 1)
+
+
 def surface_of(unknowns: Unknowns, fixed: FixedTerms) -> Surface:
     """Compute heights and slopes of whitened unknowns."""
-    height = idctn(unknowns.height * fixed.whitening, norm="ortho")
+    height = idctn(unknowns.height * fixed.whitening, norm="ortho") + substrate_plane(unknowns.parameters, fixed)
     base_x = one_sided(jnp.diff(height, axis=1) / fixed.dx, fixed.edges.joined_x, 1)
     base_y = one_sided(jnp.diff(height, axis=0) / fixed.dy, fixed.edges.joined_y, 0)
     return Surface(
@@ -467,10 +478,7 @@ def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) 
 
 def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
     """Compute the heights above the substrate, which may be tilted, by their prior weight [y, x]."""
-    height = surface.height
-    if parameters.tilt.size:
-        height = height - jnp.tensordot(fixed.priors.tilt * parameters.tilt, fixed.position, 1)
-    return height * fixed.border
+    return (surface.height - substrate_plane(parameters, fixed)) * fixed.border
 
 
 def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:

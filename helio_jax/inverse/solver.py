@@ -147,11 +147,11 @@ def whitened_parameters(
     data, and by far more than one pixel's height: as they are, conjugate gradients would take many steps for them
     alone. The level takes part 1 or 0 times; a flat border holds it. So do the parameters of the instrument.
     """
-    surface = surface_of(start, fixed)
     flat, restore = free_parameters(start.parameters)
 
     def misfit(values):
         parameters = restore(values[:-1])
+        surface = surface_of(Unknowns(start.height, start.slope_x, start.slope_y, parameters), fixed)
         raised = Surface(surface.height + is_level_free * values[-1], surface.slope_x, surface.slope_y)
         parts = data_residuals(raised, parameters, fixed), border_residuals(raised, parameters, fixed)
         return jnp.concatenate([part.ravel() for part in parts])

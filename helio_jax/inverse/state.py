@@ -29,8 +29,8 @@ LEAST_RATIO = 0.5
 """Least ratio of the multiple scattering after and before such a step that is believed: a smaller one is noise."""
 Predict = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and by
-their names the albedo [y, x] where it is not 1, and the law where it is not the cosine law. The corrections are per
-albedo of the own pixel."""
+their names the albedo [y, x] where it is not 1, the law where it is not the cosine law, and the slopes of the substrate
+along x and y where it may be tilted. The corrections are per albedo of the own pixel."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def predict_corrections(problem: FitProblem, state: FitState, predict: Predict) 
 def _predicted(problem: FitProblem, state: FitState, predict: Predict, p: Parameters) -> Corrections:
     surface, is_geometry_known = state.surface, not p.distance.size and not p.aim.size
     instrument = () if is_geometry_known else (problem.fitted_instrument(p),)
-    known = problem.patches_at(p).known | problem.known_law(p)
+    known = problem.patches_at(p).known | problem.known_law(p) | problem.known_tilt(p)
     return predict(surface.height, surface.normals(problem.shift), *instrument, **known)
 
 

@@ -5,6 +5,8 @@ of the solid. A sample is an open sheet: neighbouring faces share their vertices
 the outer border of the substrate is open.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from helio_jax.arrays import WALL_PITCHES
@@ -138,6 +140,7 @@ def surface_body(
     *,
     level: float | None = None,
     beam_shift: tuple[float, float] = (0.0, 0.0),
+    tilt: tuple[float, float] = (0.0, 0.0),
 ) -> Body:
     """Triangulate points on a grid, with a substrate around them, for height maps and reconstructions.
 
@@ -149,8 +152,9 @@ def surface_body(
     Args:
         x, y, z: sample-frame positions [y, x], um; finite; x increases with the column and y with the row.
         reach: half the side of the square substrate about the z axis; None: no substrate [um].
-        level: height of the substrate; default: the median height of the border [um].
+        level: height of the substrate on the z axis; default: the median height of the border above it [um].
         beam_shift: `Instrument.beam_shift` of a beam-frame grid.
+        tilt: slopes of the substrate along x and y.
 
     Returns:
         A sheet whose only open edges are the outer border of the substrate, or of the grid.
@@ -158,6 +162,10 @@ def surface_body(
     Raises:
         SceneError: fewer than 2 x 2 points, or the substrate ends inside the grid.
     """
+    if any(tilt):
+        body = surface_body(x, y, z - tilt[0] * x - tilt[1] * y, reach, level=level, beam_shift=beam_shift)
+        at = body.vertices
+        return replace(body, vertices=np.column_stack([at[:, :2], at[:, 2] + at[:, :2] @ np.asarray(tilt)]))
     if z.ndim != 2 or min(z.shape) < 2:
         raise SceneError(f"a surface needs at least 2 x 2 points, got {z.shape}: enlarge the raster")
     points = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float64)

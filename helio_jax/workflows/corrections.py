@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -70,10 +70,10 @@ def make_predictor(
     neither `n_rays` nor `seed` and knows of the occluded side only the sheet along the beam.
 
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
-    with a `flat` border by the flat z = 0, with a `free` one in both ways of `scene/border.py` (in radiosity by the
-    flat in either case). Their mean is expected, and half their difference is one more unknown of the fit.
-    `masks_by` rays, masks are traced on the mesh instead of computed by the horizon march, for a test of the result
-    that shares neither with the fit.
+    with a `flat` border by the flat z = 0, tilted if a prediction is given its slopes (in radiosity never); with a
+    `free` one in both ways of `scene/border.py` (in radiosity by the flat, too). Their mean is expected, and half their
+    difference is one more unknown of the fit. `masks_by` rays, masks are traced on the mesh instead of computed by the
+    horizon march, for a test of the result that shares neither with the fit.
 
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. All of the sample scatters by
     the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law. Radiosity knows
@@ -110,8 +110,10 @@ def make_predictor(
         *,
         albedo: np.ndarray | None = None,
         law: Law | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
     ) -> Corrections:
         optics, rasters = prepared(instrument.model_dump_json())
+        rasters = [(replace(raster, tilt=tilt), of_beam) for raster, of_beam in rasters]
         surface = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2])
         if multiple == "radiosity":
             plan = plan_radiosity(height, normals, optics, Raster.of(stack), substrate_um=2.0 * rasters[0][0].reach)
@@ -278,7 +280,9 @@ class _Raster:
         x, y: positions on the raster [y, x], um.
         lift: how far off the surface the points are put, um.
         reach: half the side of the square that the surroundings fill, um.
-        has_flat_surroundings: whether they are the flat z = 0; else the substrate, to which the border is continued.
+        has_flat_surroundings: whether they are flat, z = 0 in the middle of the raster; else the border is continued
+            to the substrate.
+        tilt: slopes of flat surroundings along x and y of the raster.
     """
 
     instrument: Instrument
@@ -288,6 +292,15 @@ class _Raster:
     lift: float
     reach: float
     has_flat_surroundings: bool
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def flat_surroundings(self) -> dict[str, Any]:
+        """How `surface_body` makes them: what a raster sees at one place lies beside it where it is raised."""
+        along = 1.0 - sum(slope * shift for slope, shift in zip(self.tilt, self.view_shift, strict=True))
+        tilt = self.tilt[0] / along, self.tilt[1] / along
+        level = -tilt[0] * float(np.mean(self.x)) - tilt[1] * float(np.mean(self.y))
+        return {"reach": self.reach, "level": level, "beam_shift": self.view_shift, "tilt": tilt}
 
     @property
     def continuations(self) -> tuple[str, ...]:
@@ -303,7 +316,7 @@ class _Raster:
         seen = at = self.surface(self.x, self.y, height)
         behind = occluded_vertices(*at, normals, shift, share)
         has_walls = has_level_rims(height, normals, self.is_occluded(height, normals))
-        substrate = {"reach": self.reach, "level": 0.0, "beam_shift": shift}
+        substrate = self.flat_surroundings
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
             if way == "mirrored":

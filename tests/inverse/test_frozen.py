@@ -117,7 +117,7 @@ def predictor_of(stack: MicrographStack, n_rays: int, substrate_um: float | None
     A facet has the more of it the more it leans and the lower it lies; a tenth of that is open to the unseen side.
     """
 
-    def predict(height, normals, instrument: Instrument = stack.instrument, *, albedo=None, law=None) -> Corrections:
+    def predict(height, normals, instrument: Instrument = stack.instrument, **_: Any) -> Corrections:
         surface, optics = Surface(height, *slopes_of_normal(normals, instrument.beam_shift)[:2]), Optics.of(instrument)
         masked = masking_corrections(surface, optics, Raster.of(stack)).masked
         depth = 1.0 - (height - np.mean(height)) / instrument.sample_distance
