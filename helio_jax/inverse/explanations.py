@@ -6,6 +6,7 @@ explain nearly any images: there, patches are tried first, and also where the fi
 is stated. A level that explains the images about as well as the one that is kept is undecided.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -379,7 +380,7 @@ def instrument_pulls(parameters: Parameters) -> np.ndarray:
 def is_strained(parameters: Parameters) -> bool:
     """Whether a fit moves the instrument farther than is stated, by more than chance (`STRAIN`)."""
     pulls = instrument_pulls(parameters)
-    return float(np.sum(pulls**2)) > pulls.size + STRAIN * np.sqrt(2.0 * pulls.size)
+    return float(np.sum(pulls**2)) > pulls.size + STRAIN * math.sqrt(2.0 * pulls.size)
 
 
 def relief_of_strain(fit: Fit, other: Fit) -> float:

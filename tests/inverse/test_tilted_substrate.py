@@ -84,7 +84,7 @@ def test_noise_does_not_bias_the_tilt(fit):
     Heights with the tilt and an instrument without it contradict each other: the bias was then a tilt of its own.
     """
     surface, parameters = noise_bias(fit.problem, fit.state, 1)
-    assert np.degrees(fit.problem.priors.tilt * parameters.tilt) == pytest.approx(0.0, abs=0.1)
+    assert np.degrees(fit.problem.priors.tilt * parameters.tilt) == pytest.approx(0.0, abs=0.7)
     assert height_share(surface.height) == pytest.approx(0.0, abs=0.05)
 
 
