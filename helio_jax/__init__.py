@@ -107,6 +107,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
   explanations        competing explanations of the micrographs, each fitted; the best is kept
+  photometric_start   surfaces that a fit starts from
   objects             objects on a flat substrate: their outlines and levels
   pits                pits in a flat substrate: their outlines and levels
   levels              level search of regions behind depth jumps
