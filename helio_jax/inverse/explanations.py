@@ -103,11 +103,12 @@ def explain(
     else:
         best, others = fits.from_heights(start, none), []
     others.insert(0 if best.fit.problem.is_instrument_unknown else len(others), fits.from_albedo_patches)
+    residuals: np.ndarray | None = None
     for other in others:
         if best.fit.is_interrupted:
             break
         try:
-            residuals = fits.residuals(best.fit)
+            residuals = fits.residuals(best.fit) if residuals is None else residuals
             share = fits.contradicted(residuals)
             is_contradicted = share >= MIN_CONTRADICTED
             may_be_patches = other == fits.from_albedo_patches and is_strained(best.fit.parameters)
@@ -119,7 +120,7 @@ def explain(
             rest = fits.residuals(found.fit)
             is_less = fits.contradicted(rest) < (LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED)
             if is_less and improvement(residuals, rest) + relief_of_strain(best.fit, found.fit) > GAIN:
-                best = found
+                best, residuals = found, rest
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
     return best._replace(steps=fits.steps)
