@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT))
 
 import helio_jax as hx  # noqa: E402
 from benchmarks import rows  # noqa: E402
+from benchmarks.fit import sphere  # noqa: E402
 from helio_jax.formats.hdf5 import read_stack  # noqa: E402
 
 INSIDE, PASSES, SOFT = 0.8, 4, 20.0
@@ -51,9 +52,9 @@ def best_sphere(rec: hx.Reconstruction) -> Sphere:
     frame[n:-n, n:-n] = False
     z = rec.height - np.median(rec.height[frame])
     x, y = x - z * shift[0], y - z * shift[1]
-    top = z > 0.8 * z.max()
-    at, foot = np.array([x[top].mean(), y[top].mean(), 0.0, z.max()]), np.inf
-    at[2:] = z.max() - (radius := 0.5 * (np.sum(z > 0.5 * z.max()) ** 0.5) * np.ptp(rec.raster_x) / len(z)), radius
+    top, foot = z > 0.8 * z.max(), np.inf
+    radius = 0.5 * np.sqrt(np.sum(z > 0.5 * z.max())) * np.ptp(rec.raster_x) / len(z)
+    at = np.array([x[top].mean(), y[top].mean(), z.max() - radius, radius])
     for _ in range(PASSES):
         used = (np.hypot(x - at[0], y - at[1]) < INSIDE * foot) & (z > LOWEST * z.max())
 
@@ -76,35 +77,27 @@ def every(stack: hx.MicrographStack, n: int) -> hx.MicrographStack:
     return stack.replace(**changes)
 
 
-def simulated(size: int, rays: int) -> hx.MicrographStack:
-    """Trace the scene sphere_a on a small raster."""
-    scene = hx.load_scene("sphere_a")
-    width = scene.scan.nx * scene.scan.pixel_size_um  # type: ignore[union-attr]  # the shipped scene has a raster
-    scan = scene.scan.model_copy(update={"nx": size, "ny": size, "pixel_size_um": width / size})
-    return hx.simulate(scene.model_copy(update={"scan": scan}), rays=rays, maps=False).only()
-
-
 def judged(stack: hx.MicrographStack, method: str, radius: float, outline: tuple[float, float]) -> list[rows.Row]:
     """Reconstruct by a method and print what its sphere is like; `outline`: height by it and its error, um."""
     begin = time.time()
     rec = hx.reconstruct(stack, method)
-    seconds, sphere = time.time() - begin, best_sphere(rec)
+    seconds, ball = time.time() - begin, best_sphere(rec)
     highest = np.unravel_index(np.argmax(np.where(rec.is_valid, rec.height, -np.inf)), rec.height.shape)
     std = np.nan if rec.height_std is None else float(rec.height_std[highest])
-    off = sphere.height - outline[0]
-    share = sphere.radius / radius - 1.0
+    off = ball.height - outline[0]
+    share = ball.radius / radius - 1.0
     out = [
-        rows.row("5", f"{method}: deviation from its sphere", f"{sphere.form:.1f} um", "12 um", sphere.form <= FORM_UM),
+        rows.row("5", f"{method}: deviation from its sphere", f"{ball.form:.1f} um", "12 um", ball.form <= FORM_UM),
         rows.row(
-            "5", f"{method}: radius", f"{sphere.radius:.0f} um ({share:+.1%})", "within 3 %", abs(share) <= RADIUS_SHARE
+            "5", f"{method}: radius", f"{ball.radius:.0f} um ({share:+.1%})", "within 3 %", abs(share) <= RADIUS_SHARE
         ),
         rows.row(
-            "5", f"{method}: height", f"{sphere.height:.0f} +- {std:.0f} um, outline {outline[0]:.0f}",
+            "5", f"{method}: height", f"{ball.height:.0f} +- {std:.0f} um, outline {outline[0]:.0f}",
             "within 2 s.d.", bool(abs(off) <= 2.0 * np.hypot(std, outline[1])),
         ),
         rows.row(
-            "5", f"{method}: standard deviation of the height", f"{std / sphere.height:.1%}", "6 %",
-            bool(std <= STD_SHARE * sphere.height),
+            "5", f"{method}: standard deviation of the height", f"{std / ball.height:.1%}", "6 %",
+            bool(std <= STD_SHARE * ball.height),
         ),
         rows.row("5", f"{method}: valid pixels", f"{rec.is_valid.mean():.0%}", "-", None),
         rows.row("5", f"{method}: time", f"{seconds:.0f} s", "-", None),
@@ -123,10 +116,10 @@ def main() -> None:
     parser.add_argument("--radius", type=float, default=1000.0, help="of the ball [um]")
     parser.add_argument("--outline", type=float, default=681.0, help="height by its outline, known to 5 um [um]")
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
-    parser.add_argument("--tiny", action="store_true", help="few pixels and rays, nearfield only")
+    parser.add_argument("--tiny", action="store_true", help="few pixels, nearfield only")
     args = parser.parse_args()
     if args.stack is None:
-        stack, outline = simulated(*((21, 200) if args.tiny else (61, 4000))), (720.0, 1.0)
+        stack, outline = sphere(21 if args.tiny else 61), (720.0, 1.0)
     else:
         stack, outline = every(read_stack(args.stack), args.every), (args.outline, 5.0)
     methods = ["nearfield"] if args.tiny else args.methods.split(",")

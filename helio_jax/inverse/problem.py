@@ -261,7 +261,7 @@ class FitProblem:
 
     def known_tilt(self, parameters: Parameters) -> dict[str, tuple[float, float]]:
         """Keywords by which a prediction is given the substrate's slopes; none where it is known to be level."""
-        slopes = self.priors.tilt * np.asarray(parameters.tilt)
+        slopes = self.tilt_std * np.asarray(parameters.tilt)
         return {"tilt": (float(slopes[0]), float(slopes[1]))} if slopes.size else {}
 
     @property

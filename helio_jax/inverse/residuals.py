@@ -296,16 +296,21 @@ def albedo_of_patches(log_albedo: Any, std: Any, patches: Any) -> jax.Array:
     return jnp.exp(jnp.tensordot(std * log_albedo, patches, 1))
 
 
-def substrate_plane(parameters: Parameters, fixed: FixedTerms) -> Any:
-    """Compute the heights of the substrate, which may be tilted [y, x], um; 0 where its tilt is known to be none."""
-    if not parameters.tilt.size:
-        return 0.0
-    return jnp.tensordot(fixed.priors.tilt * parameters.tilt, fixed.position, 1)
+def substrate_plane(parameters: Parameters, tilt_std: Any, position: Any) -> Any:
+    """Compute the heights of the substrate [y, x], um, from its tilt; 0 where that is known to be none. NumPy or JAX.
+
+    Args:
+        parameters: of the fit.
+        tilt_std: prior standard deviation of the tilt.
+        position: (x, y) about the middle of the raster [2, y, x], um.
+    """
+    return sum(tilt_std * tilt * along for tilt, along in zip(parameters.tilt, position, strict=False))
 
 
 def surface_of(unknowns: Unknowns, fixed: FixedTerms) -> Surface:
     """Compute heights and slopes of whitened unknowns."""
-    height = idctn(unknowns.height * fixed.whitening, norm="ortho") + substrate_plane(unknowns.parameters, fixed)
+    height = idctn(unknowns.height * fixed.whitening, norm="ortho")
+    height = height + substrate_plane(unknowns.parameters, fixed.priors.tilt, fixed.position)
     base_x = one_sided(jnp.diff(height, axis=1) / fixed.dx, fixed.edges.joined_x, 1)
     base_y = one_sided(jnp.diff(height, axis=0) / fixed.dy, fixed.edges.joined_y, 0)
     return Surface(
@@ -478,7 +483,7 @@ def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) 
 
 def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:
     """Compute the heights above the substrate, which may be tilted, by their prior weight [y, x]."""
-    return (surface.height - substrate_plane(parameters, fixed)) * fixed.border
+    return (surface.height - substrate_plane(parameters, fixed.priors.tilt, fixed.position)) * fixed.border
 
 
 def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:

@@ -25,11 +25,11 @@ from helio_jax.inverse.residuals import (
     FixedTerms,
     FormFactors,
     LawResponse,
-    Parameters,
     Unknowns,
     expected_data,
     moved_optics,
     second_order_noise_bias,
+    substrate_plane,
     surface_of,
 )
 from helio_jax.inverse.solver import Solution, solve, whitened_parameters
@@ -191,8 +191,9 @@ def freeze(
     free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))
     whitening = _whitening(problem.raster.shape, dx, dy, noise)
+    plane = substrate_plane(state.parameters, problem.tilt_std, problem.position)
     unknowns = Unknowns(
-        dctn(height - substrate_plane(problem, state.parameters), norm="ortho") / whitening,
+        dctn(height - plane, norm="ortho") / whitening,
         (slope_x - one_sided(np.diff(height, axis=1) / dx, along_x.joined, 1)) / scale_x,
         (slope_y - one_sided(np.diff(height, axis=0) / dy, along_y.joined, 0)) / scale_y,
         state.parameters,
@@ -281,18 +282,13 @@ def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndar
         return np.where(problem.is_observed, np.asarray(_expected(unknowns, fixed)), 0.0)
 
 
-def substrate_plane(problem: FitProblem, parameters: Parameters) -> np.ndarray:
-    """Compute the heights of the substrate, which may be tilted [y, x], um."""
-    tilt = problem.priors.tilt * np.asarray(parameters.tilt)
-    return np.tensordot(tilt, problem.position, 1) if tilt.size else np.zeros(problem.raster.shape)
-
-
 def levelled(problem: FitProblem, state: FitState) -> Surface:
     """Compute the surface above the substrate, which may be tilted."""
-    s, tilt = state.surface, problem.priors.tilt * state.parameters.tilt
+    s, tilt = state.surface, problem.tilt_std * state.parameters.tilt
     if not tilt.size:
         return s
-    return Surface(s.height - substrate_plane(problem, state.parameters), s.slope_x - tilt[0], s.slope_y - tilt[1])
+    plane = substrate_plane(state.parameters, problem.tilt_std, problem.position)
+    return Surface(s.height - plane, s.slope_x - tilt[0], s.slope_y - tilt[1])
 
 
 def model_share(problem: FitProblem, state: FitState) -> np.ndarray:

@@ -296,7 +296,7 @@ class _Raster:
 
     @property
     def flat_surroundings(self) -> dict[str, Any]:
-        """How `surface_body` makes them: what a raster sees at one place lies beside it where it is raised."""
+        """Arguments of `surface_body` for flat surroundings: slopes and level in the sample frame, not the beam's."""
         along = 1.0 - sum(slope * shift for slope, shift in zip(self.tilt, self.view_shift, strict=True))
         tilt = self.tilt[0] / along, self.tilt[1] / along
         level = -tilt[0] * float(np.mean(self.x)) - tilt[1] * float(np.mean(self.y))
