@@ -141,7 +141,7 @@ class Plate(Settings):
 
 
 class Uncertainty(Settings):
-    """Prior standard deviations of the geometry in a fit; 0: known exactly."""
+    """Prior standard deviations of the geometry, and of what the model lacks, in a fit; 0: known exactly."""
 
     sample_distance_um: float = Field(default=0.0, ge=0.0, le=1e5)
     """Of the distance from the plate to the substrate [um]."""
@@ -161,10 +161,13 @@ class Uncertainty(Settings):
     incidence_deg: float = Field(default=0.0, ge=0.0, le=20.0)
     """Of the beam's incidence: fitted by `helio calibrate --known`; elsewhere taken as stated, and its effect added to
     the error bars of heights, by `refine` only for scans of one beam [deg]."""
+    discrepancy: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Of what the model lacks, such as the law of the scattering or the shape of the apertures: an error that varies
+    slowly over each detector's image, over its median signal; measured by `helio calibrate --known`."""
 
     @property
     def is_stated(self) -> bool:
-        """Whether anything of the geometry is uncertain."""
+        """Whether anything is uncertain."""
         return any(self.model_dump().values())
 
 

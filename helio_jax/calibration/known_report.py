@@ -1,5 +1,6 @@
 """What a fit to known shapes tells, for people and files: table, chi-square by region, verdict. Pure NumPy."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,6 +102,11 @@ def robust_chi_square(fit: KnownFit) -> float:
     return float(robust_std(np.concatenate([r.ravel() for r in fit.residuals]))) ** 2
 
 
+def error_shares(fit: KnownFit) -> list[float]:
+    """Compute the errors of the model on the object's tiles, over the substrate's signal, of all scans' detectors."""
+    return [row["model_error"]["object"] / row["substrate_signal"] for row in readout_rows(fit)]
+
+
 ON_TWINS = (
     "on ten simulated scans the errors were 1.0 to 1.2 times the standard deviations stated (root mean square; for "
     "single parameters up to 2.0 times); what a real scan has and these lack is in no standard deviation"
@@ -123,8 +129,8 @@ def verdict(fit: KnownFit) -> list[str]:
             + (f", largest on the {places}" if places else "")
         )
     errors = [
-        (row["model_error"]["object"] / row["substrate_signal"], f"{row['detector']!r} in {row['scan']}")
-        for row in readout_rows(fit)
+        (share, f"{row['detector']!r} in {row['scan']}")
+        for share, row in zip(error_shares(fit), readout_rows(fit), strict=True)
     ]
     if max(errors)[0] > 0.0:
         named = "; ".join(f"{share:.1%} for {name}" for share, name in sorted(errors, reverse=True)[:3] if share > 0.0)
@@ -154,7 +160,8 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
 
     [uncertainty] holds the standard deviations without their correlations: of the plate's motion, of the distance, and
     of the directions of the apertures that follow, the largest of all. The next sample is tilted otherwise: its tilt is
-    as uncertain as these scans' was before.
+    as uncertain as these scans' was before. What the model lacked on these objects, root mean square over detectors and
+    scans, it is taken to lack on others, too (`Uncertainty.discrepancy`).
     """
     n = fit.n_shared
     std = dict(zip(fit.names[:n], fit.stds[:n].tolist(), strict=True))
@@ -179,6 +186,7 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
         "polar_deg": min(polar, 30.0),
         "azimuth_deg": min(azimuth, 30.0),
         "tilt_deg": max([stated.tilt_deg, *tilts]),
+        "discrepancy": math.sqrt(np.mean(np.square(error_shares(fit)))),
     }
     uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
     signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)

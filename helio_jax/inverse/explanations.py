@@ -23,8 +23,8 @@ from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit
-from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, search_levels
+from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit, without_noise_bias
+from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, grown, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.measured_steps import walls_of
@@ -37,7 +37,7 @@ from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_records import Steps
-from helio_jax.inverse.verdict import local_chi_square, residuals_of_state
+from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
 
@@ -47,8 +47,8 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
-INSTRUMENT = "log_gain", "offset", "log_multiple", "law", "distance", "tilt", "aim"
-"""Parameters whose prior is what is known of the instrument."""
+INSTRUMENT = "log_gain", "offset", "log_multiple", "discrepancy", "law", "distance", "tilt", "aim"
+"""Parameters whose prior is what is known of the instrument and the model."""
 STRAIN = 5.0
 """The instrument is strained where its pulls' chi-square exceeds its mean by this many of its standard deviations."""
 MAX_LEVEL_SLOPE = 0.3
@@ -127,7 +127,8 @@ def explain(
                 best, residuals = found, rest
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
-    return best._replace(steps=fits.steps)
+    fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
+    return best._replace(fit=fit, steps=fits.steps)
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,9 @@ class _Fits:
 
     def contradicted(self, residuals: np.ndarray) -> float:
         """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit."""
-        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT))
+        chi_square = local_chi_square(residuals, self.stack.is_observed)
+        right = expected_chi_square(self.stack, self.stack.instrument, chi_square)
+        return float(np.mean(chi_square > CHI_SQUARE_LIMIT * right))
 
     @property
     def weighs_instrument(self) -> bool:
@@ -263,7 +266,15 @@ class _Fits:
         fit, _ = with_backtracking(
             lambda start: fit_heights(self.pose(start, *known), start, self.predict, self.report), surface, smoothed
         )
-        return fit
+        return without_noise_bias(fit, self.report) if self.subtracts_bias_at_once else fit
+
+    @property
+    def subtracts_bias_at_once(self) -> bool:
+        """Whether the bias by noise is subtracted from every fit, not from the one that is kept alone.
+
+        With a free border it depends on the gains, which are held in a part of the fits.
+        """
+        return self.settings.border == "free"
 
     @cached_property
     def albedo_search(self) -> AlbedoSearch:
@@ -295,7 +306,7 @@ class _Fits:
         start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
-        if steps := measured_regions(self.steps, start):
+        if steps := measured_regions(self.steps):
             raster = Raster.of(self.stack)
             try:
                 found = search_levels(
@@ -418,20 +429,24 @@ def scan_order(stack: MicrographStack) -> ScanOrder:
     return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
 
 
-def measured_regions(found: Steps | None, start: Surface) -> list[Region]:
+def measured_regions(found: Steps | None) -> list[Region]:
     """List the patches between measured steps, the largest first.
 
-    Steps are measured from the substrate, which the start puts at any height where the border is free.
+    A measured level is tried above the patch around it: a surface with a free border may bend so far that the
+    substrate elsewhere is no reference.
     """
     if found is None:
         return []
-    substrate = float(np.median(start.height[found.patch == 0]))
-    return [
-        Region(found.patch == p.number, p.level_um, p.level_std_um, substrate)
-        if p.is_determined
-        else Region(found.patch == p.number)
-        for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels)
-    ]
+    by_number = {p.number: p for p in found.patches}
+    out = []
+    for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels):
+        inside = found.patch == p.number
+        beside = found.patch[grown(inside, SKIRT) & ~inside]
+        around = by_number[int(np.bincount(beside).argmax())]
+        is_measured = p.is_determined and around.is_determined
+        known = (p.level_um, p.level_std_um, p.level_um - around.level_um) if is_measured else ()
+        out.append(Region(inside, *known))
+    return out
 
 
 def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:

@@ -33,6 +33,8 @@ from helio_jax.robust import cauchy_weight
 
 GEOMETRY = "distance", "tilt", "aim"
 """Parameters that show an incomplete model where they come out farther off than stated: error bars are inflated."""
+MODEL = ("discrepancy",)
+"""The same, apart from the few numbers of the geometry."""
 GAINS, MIN_BIRGE_RATIO = ("log_gain", "offset"), 2.0
 """The same, but only for Birge ratios above this one: gains usually differ by chance."""
 
@@ -144,8 +146,8 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
 
 
 def inflated(posterior: Posterior, state: FitState) -> Posterior:
-    """Inflate the error bars where a state's instrument contradicts what is stated."""
-    found = posterior.inflated(state.parameters, GEOMETRY)
+    """Inflate the error bars where a state's instrument, or what the model lacks, contradicts what is stated."""
+    found = posterior.inflated(state.parameters, GEOMETRY).inflated(state.parameters, MODEL)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO)
 
 
@@ -238,15 +240,33 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             extrapolation = aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-    if problem.is_biased_by_noise and s.bias_pairs and not is_interrupted:
-        try:
-            if report:
-                report(len(changes) - 1, s.max_rounds, f"{said}; simulating the bias by noise")
-            state = subtract_bias(problem, state, *noise_bias(problem, state, s.bias_pairs))
-        except KeyboardInterrupt:
-            is_interrupted = True
     remaining = remaining_error(changes, extrapolation) * last_change
-    return _finish(problem, state, changes, is_interrupted, remaining, found.status)
+    return Fit(
+        problem=problem,
+        **_shown(problem, state),
+        **_explained(problem, state),
+        remaining=remaining,
+        posterior=None,
+        changes=tuple(changes),
+        contraction=contraction_of(changes),
+        status=f"{status_of(changes, s.tolerance_um, is_interrupted)}; {found.status}",
+        is_interrupted=is_interrupted,
+    )
+
+
+def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
+    """Subtract the bias by noise from a fit where it matters; `report`: called before that."""
+    problem, n_pairs = fit.problem, fit.problem.settings.bias_pairs
+    if fit.is_interrupted or not n_pairs or not problem.is_biased_by_noise:
+        return fit
+    try:
+        if report:
+            report(len(fit.changes) - 1, problem.settings.max_rounds, "simulating the bias by noise")
+        state = subtract_bias(problem, fit.state, *noise_bias(problem, fit.state, n_pairs))
+    except KeyboardInterrupt:
+        changes = list(fit.changes)
+        return replace(fit, is_interrupted=True, status=status_of(changes, problem.settings.tolerance_um, True))
+    return replace(fit, **_shown(problem, state), **_explained(problem, state))
 
 
 def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
@@ -296,29 +316,14 @@ def _occlusion_edges(problem: FitProblem, state: FitState) -> tuple[np.ndarray, 
     return find_occlusion_edges(*known, 1), find_occlusion_edges(*known, 0)
 
 
-def _finish(
-    problem: FitProblem,
-    state: FitState,
-    changes: list[float],
-    is_interrupted: bool,
-    remaining: np.ndarray,
-    optimiser: str,
-) -> Fit:
+def _explained(problem: FitProblem, state: FitState) -> dict[str, Any]:
+    """Compute the fields of a `Fit` that say how a state explains the data, and where it has depth jumps."""
     s = problem.settings
-    limit, cut = s.robust_limits[-1], s.jump_limits[-1]
-    edges_x, edges_y = edges_of(problem, state.surface, cut)
-    return Fit(
-        problem=problem,
-        **_shown(problem, state),
-        residuals=state.residuals,
-        weight=cauchy_weight(state.residuals, limit),
-        model_share=model_share(problem, state),
-        joined_x=edges_x.joined,
-        joined_y=edges_y.joined,
-        remaining=remaining,
-        posterior=None,
-        changes=tuple(changes),
-        contraction=contraction_of(changes),
-        status=f"{status_of(changes, s.tolerance_um, is_interrupted)}; {optimiser}",
-        is_interrupted=is_interrupted,
-    )
+    edges_x, edges_y = edges_of(problem, state.surface, s.jump_limits[-1])
+    return {
+        "residuals": state.residuals,
+        "weight": cauchy_weight(state.residuals, s.robust_limits[-1]),
+        "model_share": model_share(problem, state),
+        "joined_x": edges_x.joined,
+        "joined_y": edges_y.joined,
+    }

@@ -13,7 +13,7 @@ from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.law_prior import cosine_probability, numbers_of
 from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import LawPrior
+from helio_jax.inverse.residuals import LawPrior, mode_weights
 
 WEAK = 0.5
 """A combination is weak when the data leave more than this share of its prior standard deviation."""
@@ -86,19 +86,23 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     prior standard deviation: `share` is what they leave, `of` the largest terms of the (unit) combination. `inflation`:
     Birge ratio by which all error bars are enlarged. `common_mode_um`: largest common-mode error that was added for an
     instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, where one was fitted.
+    `discrepancy`: what the model was found to lack, detector -> [root mean square, stated standard deviation], over the
+    median signal, where the instrument states any; its modes are in neither list.
     """
     posterior = fit.posterior
     if posterior is None:
         return {}
     detectors = fit.instrument.detector_names
-    matrix, units = units_of(fit.problem, posterior.names)
+    listed = [i for i, name in enumerate(posterior.names) if kind_of(name) != "discrepancy"]
+    names = tuple(posterior.names[i] for i in listed)
+    matrix, units = units_of(fit.problem, names)
     law = fit.problem.priors.law
-    flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])
-    covariance, prior = posterior.instrument_covariance, np.linalg.norm(matrix, axis=1)
+    flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])[listed]
+    covariance, prior = posterior.instrument_covariance[np.ix_(listed, listed)], np.linalg.norm(matrix, axis=1)
     means = iter(number.mean for number in numbers_of(law))
-    mean = np.array([next(means) if kind_of(name) == "law" else 0.0 for name in posterior.names])
+    mean = np.array([next(means) if kind_of(name) == "law" else 0.0 for name in names])
     found = zip(
-        posterior.names,
+        names,
         mean + matrix @ flat,
         np.sqrt(np.diag(matrix @ covariance @ matrix.T)),
         prior,
@@ -119,12 +123,15 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
             break
         combination = relative @ vector[:, i]
         terms = np.argsort(-np.abs(combination))[:_MAX_TERMS]
-        of = {
-            plain_name(posterior.names[determined[t]], detectors, law): round(float(combination[t]), 3) for t in terms
-        }
+        of = {plain_name(names[determined[t]], detectors, law): round(float(combination[t]), 3) for t in terms}
         weak.append({"share": float(np.sqrt(size[i])), "of": of})
     common = 0.0 if posterior.common_modes is None else float(np.sqrt((posterior.common_modes**2).sum(0)).max())
     found = {"values": values, "weak": weak, "inflation": posterior.inflation, "common_mode_um": common}
+    if fit.parameters.discrepancy.size:
+        std = fit.problem.discrepancy_std
+        modes = fit.parameters.discrepancy
+        size = std * np.sqrt(np.sum((modes * mode_weights(modes.shape[-1])) ** 2, (1, 2)))
+        found["discrepancy"] = {name: [float(rms), std] for name, rms in zip(detectors, size, strict=True)}
     return found if law is None else found | {"law": describe_law(fit, posterior)}
 
 

@@ -114,18 +114,18 @@ class Region:
         inside: its pixels [y, x].
         height: measured height above the substrate, um; None: not known.
         std: standard deviation of that, um.
-        substrate: height of the substrate in the surface that is searched, um.
+        step: measured height above the surface around the region, um; None: not known.
     """
 
     inside: np.ndarray
     height: float | None = None
     std: float = 0.0
-    substrate: float = 0.0
+    step: float | None = None
 
     def heights(self, surroundings: float, pitch: tuple[float, float], max_width: float) -> list[float]:
         """Choose the heights to be tried, um; arguments as in `search_levels`."""
-        if self.height is not None:
-            return [self.substrate + self.height]
+        if self.step is not None:
+            return [surroundings + self.step]
         room = np.pad(self.inside, 1, mode="edge")
         width = min(2.0 * float(np.max(np.asarray(distance_transform_edt(room, sampling=pitch)))), max_width)
         return [surroundings + sign * width * share for share in sorted(_LEVELS) for sign in (-1.0, 1.0)]

@@ -136,7 +136,7 @@ def with_path_error(
     """Widen the error bars of a tested map by `path_error`, as a common-mode error, and flag what then floats."""
     if rec.height_samples is None or rec.chi_square is None:
         return rec
-    expected = expected_chi_square(stack, rec, rec.chi_square)
+    expected = expected_chi_square(stack, rec.instrument, rec.chi_square)
     error = path_error(rec, misfit, Raster.of(stack), expected, settings, anchors)
     samples = add_common_modes(rec.height_samples, [error], SEED)
     std = np.sqrt(np.mean(samples**2, axis=0))

@@ -187,7 +187,7 @@ def photometric_heights(
         failure = failure or f"{_UNPREDICTED}: {error}"
     if misfit is not None:
         assert rec.chi_square is not None
-        expected = expected_chi_square(stack, rec, rec.chi_square)
+        expected = expected_chi_square(stack, rec.instrument, rec.chi_square)
         modes.append(path_error(rec, misfit, Raster.of(stack), expected, settings))
     if not modes:
         return rec.replace(warnings=(*rec.warnings, f"no error bars: {failure}"))

@@ -41,6 +41,7 @@ class FitProblem:
         signal, variance: data in units of the beam [detector, y, x], NaN where not observed.
         optics: as stated.
         tilt_std: prior standard deviation of the substrate's tilt, about each of x and y [rad].
+        discrepancy_std: prior standard deviation of what the model lacks, over the median signal.
         geometry: prior of distance and directions.
         raster: beam positions.
         reconstruct_settings: of the fit (`settings`), and what is known of the border.
@@ -66,6 +67,7 @@ class FitProblem:
     variance: np.ndarray
     optics: Optics
     tilt_std: float
+    discrepancy_std: float
     geometry: GeometryPrior
     raster: Raster
     reconstruct_settings: ReconstructSettings
@@ -124,8 +126,8 @@ class FitProblem:
         median = np.array([np.median(d) if d.size else 1.0 for d in observed])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
-            signal, variance, optics, math.radians(stated.tilt_deg), geometry, raster, settings, order, is_held,
-            is_free and not is_held, 0.0, anchors or Anchors.none(shape),
+            signal, variance, optics, math.radians(stated.tilt_deg), stated.discrepancy, geometry, raster, settings,
+            order, is_held, is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
             patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))),
             noise_share, walls, given,
@@ -211,6 +213,7 @@ class FitProblem:
             "multiple": s.multiple_error,
             "albedo": s.albedo_std,
             "drift": s.drift_std * median,
+            "discrepancy": self.discrepancy_std * median,
             "lines": s.line_std * median,
             "geometry": self.geometry_prior.factor()[np.ix_(free, free)],
             "tilt": self.tilt_std,
@@ -231,6 +234,7 @@ class FitProblem:
             "surroundings": 1 if self.reconstruct_settings.border == "free" else 0,
             "albedo": (n, n),
             "drift": (k, self.drift_modes.shape[1]),
+            "discrepancy": (k, s.discrepancy_modes, s.discrepancy_modes) if self.discrepancy_std else 0,
             "lines": (k, lines),
             "law": len(numbers_of(self.law_prior)),
             "distance": 1 if s.geometry and self.distance_std else 0,

@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.fft import idctn
 
@@ -38,6 +39,7 @@ class Parameters(eqx.Module):
         surroundings: how the sample goes on beyond a free border [1].
         albedo: cosine modes of the smooth albedo [mode, mode].
         drift: slow drift [detector, mode].
+        discrepancy: of what the model lacks in each detector's image, cosine modes [detector, mode, mode].
         lines: offsets of the scan lines [detector, line].
         law: numbers of the scattering law [number].
         distance: of the sample from the plate [1].
@@ -53,6 +55,7 @@ class Parameters(eqx.Module):
     surroundings: Any
     albedo: Any
     drift: Any
+    discrepancy: Any
     lines: Any
     law: Any
     distance: Any
@@ -102,16 +105,17 @@ class LawPrior(eqx.Module):
 
 
 class Priors(eqx.Module):
-    """Prior standard deviations: relative gain; offset [detector]; scale of multiple scattering; albedo; drift and line
-    offsets [detector]; tilt [rad]; log albedo of patches. Of the geometry, a factor of the prior covariance of what is
-    unknown of distance [um] and directions [rad] (`GeometryPrior`) [parameter, parameter]. Of the law, None where it is
-    the cosine law."""
+    """Prior standard deviations: relative gain; offset [detector]; scale of multiple scattering; albedo; drift,
+    discrepancy and line offsets [detector]; tilt [rad]; log albedo of patches. Of the geometry, a factor of the prior
+    covariance of what is unknown of distance [um] and directions [rad] (`GeometryPrior`) [parameter, parameter]. Of the
+    law, None where it is the cosine law."""
 
     gain: Any
     offset: Any
     multiple: Any
     albedo: Any
     drift: Any
+    discrepancy: Any
     lines: Any
     law: LawPrior | None
     geometry: Any
@@ -274,6 +278,30 @@ class FixedTerms(eqx.Module):
     slow_axis: int = eqx.field(static=True, default=0)
 
 
+def smooth_images(modes: jax.Array, shape: tuple[int, ...], std: Any) -> jax.Array:
+    """Compute images [image, y, x] of cosine modes [image, mode, mode], as much in every octave of wavelengths.
+
+    The constant mode is left to the offsets. Averaged over an image, the variance of a pixel is the square of `std`
+    [image] where the modes are standard normal.
+    """
+    along_y, along_x = (_cosines(modes.shape[-1], pixels) for pixels in shape)
+    weight = mode_weights(modes.shape[-1])
+    return jnp.einsum("k,kmn,my,nx->kyx", std, modes * weight, along_y, along_x)
+
+
+def mode_weights(n: int) -> np.ndarray:
+    """Compute the standard deviations of the cosine modes of `smooth_images`, of unit sum of squares [mode, mode]."""
+    rank = np.hypot(*np.indices((n, n)))
+    rank[0, 0] = np.inf
+    return 1.0 / rank / np.sqrt(np.sum(rank**-2.0))
+
+
+def _cosines(n: int, pixels: int) -> jax.Array:
+    """Compute the first cosine modes of a line of pixels, of unit mean square [mode, pixel]."""
+    mode, pixel = jnp.arange(n)[:, None], jnp.arange(pixels) + 0.5
+    return jnp.where(mode == 0, 1.0, jnp.sqrt(2.0)) * jnp.cos(jnp.pi * mode * pixel / pixels)
+
+
 def smooth_albedo(modes: jax.Array, shape: tuple[int, ...], std: Any) -> jax.Array:
     """Compute the smooth albedo exp(sum of cosine modes); the constant mode is left to the gains. No modes: 1."""
     n = modes.shape[0]
@@ -374,6 +402,8 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     if parameters.patch.size:  # the first scattering of every order is by the own pixel
         signal = albedo_of_patches(parameters.patch, p.patch, fixed.patches) * signal
     read = readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)
+    if parameters.discrepancy.size:
+        read = read + smooth_images(parameters.discrepancy, surface.height.shape, p.discrepancy)
     # a higher point's data stand elsewhere in an oblique beam's image: linear within about a pixel
     return read - fixed.parallax * jnp.clip(surface.height - fixed.parallax_height, -fixed.dx, fixed.dx)
 

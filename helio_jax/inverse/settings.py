@@ -55,6 +55,9 @@ class RefineSettings(Settings):
     """Prior standard deviation of the smooth relative albedo; 0: the albedo is constant."""
     albedo_modes: int = Field(default=6, ge=1, le=64)
     """Cosine modes of the albedo per axis."""
+    discrepancy_modes: int = Field(default=6, ge=2, le=32)
+    """Cosine modes per axis of what the model lacks in each detector's image, where the instrument's [uncertainty]
+    states a `discrepancy`."""
     patch_albedo_std: float = Field(default=0.3, gt=0.0, le=2.0)
     """Prior standard deviation of the log albedo of patches, objects of other albedo than the substrate's."""
     albedo_patches: bool = True

@@ -18,6 +18,7 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import surface_of_heights
+from helio_jax.instrument import Instrument
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.quality import squares
@@ -168,12 +169,12 @@ def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -
     return np.nan_to_num(difference / np.hypot(std, edge_std(problem.signal, problem.variance)))
 
 
-def expected_chi_square(stack: MicrographStack, rec: Reconstruction, chi_square: np.ndarray) -> float:
+def expected_chi_square(stack: MicrographStack, instrument: Instrument, chi_square: np.ndarray) -> float:
     """Compute the chi-square of a right map: 1, or the median where misfit common to the image is not the map's.
 
     It is that of the instrument or of the calibration, where the one is uncertain or the other had to be made.
     """
-    is_uncertain = rec.instrument.uncertainty.is_stated or stack.calibration is not None
+    is_uncertain = instrument.uncertainty.is_stated or stack.calibration is not None
     return max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
 
 
@@ -195,7 +196,9 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
         said = "contradicts the data: no micrographs can be traced on a height map so rough or steep"
         return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
-    is_worse = (rec.reason == 0) & (chi_square > CHI_SQUARE_LIMIT * expected_chi_square(stack, rec, chi_square))
+    is_worse = (rec.reason == 0) & (
+        chi_square > CHI_SQUARE_LIMIT * expected_chi_square(stack, rec.instrument, chi_square)
+    )
     reason = np.where(is_worse, _CONTRADICTED, rec.reason)
     names, square = stack.instrument.detector_names, np.where(stack.is_observed, squares(found), 0.0)
     by_detector = square.sum((1, 2)) / np.maximum(stack.is_observed.sum((1, 2)), 1)

@@ -64,7 +64,7 @@ def stated(bshem):
 @pytest.fixture(scope="module")
 def unknown(bshem):
     """All of the instrument is unknown, as with measured data."""
-    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
+    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0, discrepancy=0.02)
     return make_problem(
         bshem.model_copy(update={"uncertainty": sure}), drift_std=0.2, line_std=0.02, law="power", law_std=0.1
     )
@@ -74,7 +74,7 @@ def unknown(bshem):
 def turned(bshem):
     """Aligned scans with a free border: each drifts in its own time, corrections follow the relief."""
     time = np.random.default_rng(5).uniform(-1.0, 1.0, (3, *SHAPE))
-    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0)
+    sure = Uncertainty(sample_distance_um=100.0, tilt_deg=1.0, polar_deg=3.0, azimuth_deg=2.0, discrepancy=0.02)
     about = {
         "order": ScanOrder(1, time),
         "border": "free",

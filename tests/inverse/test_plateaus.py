@@ -51,10 +51,10 @@ def test_anchors_hold_the_level_of_a_region():
     assert anchors.padded(4).weight.shape == (4, *SHAPE) and not anchors.padded(4).weight[1:].any()
 
 
-def test_a_measured_step_is_tried_above_the_substrate_of_the_start():
-    """Where the border is free the substrate is at any height. Rejects steps taken for heights above 0."""
+def test_a_measured_step_is_tried_above_the_surface_around():
+    """Where the border is free that is at any height. Rejects steps taken for heights above 0."""
     ground = Surface(np.full(SHAPE, 70.0), *np.zeros((2, *SHAPE)))
-    region = Region(INSIDE, height=20.0, std=0.3, substrate=70.0)
+    region = Region(INSIDE, height=20.0, std=0.3, step=20.0)
     assert region.heights(70.0, (10.0, 10.0), 500.0) == [90.0]
     found = search_levels(
         [region],
@@ -179,7 +179,7 @@ def test_a_measured_height_is_taken():
         return 1e4 * (tried[-1] > -1.0)
 
     ground = Surface(*np.zeros((3, *SHAPE)))
-    region = Region(INSIDE, -33.0, 1.0)
+    region = Region(INSIDE, -33.0, 1.0, -33.0)
     found = search_levels([region], ground, (10.0, 10.0), 500.0, misfit, lambda s: (misfit(s), s))
     assert found.moved == [0] and set(tried) == {0.0, -33.0}
 
