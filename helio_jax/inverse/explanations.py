@@ -51,6 +51,8 @@ INSTRUMENT = "log_gain", "offset", "log_multiple", "discrepancy", "law", "distan
 """Parameters whose prior is what is known of the instrument and the model."""
 STRAIN = 5.0
 """The instrument is strained where its pulls' chi-square exceeds its mean by this many of its standard deviations."""
+HOPELESS = 2.0
+"""Pits are given up where they leave so many times the misfit of an unknown instrument's best fit."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
 HELD = 1e-4
@@ -352,7 +354,9 @@ class _Fits:
         )
         if objects is None:
             return None
-        start = self.short_fit(objects.surface(relief), none)[1]
+        start = self.promising(objects.surface(relief), best)
+        if start is None:
+            return None
         fit = self.fitted(start, smoothed, none, objects.number)
         return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
 
@@ -366,13 +370,28 @@ class _Fits:
             (raster.dy, raster.dx),
             self.stack.instrument.beam_shift,
             self.say,
+            HOPELESS * half_chi_square(residuals) if best.fit.problem.is_instrument_unknown else math.inf,
         )
         pits = search.find((shape[0], shape[1]))
         if pits is None:
             return None
-        start = self.short_fit(pits.surface, none)[1]
+        start = self.promising(pits.surface, best)
+        if start is None:
+            return None
         fit = self.fitted(start, self.plain_start[1], none, pits.number)
         return Explanation(fit, np.zeros(shape, bool), pits.number, "pits in")
+
+    def promising(self, surface: Surface, best: Explanation) -> Surface | None:
+        """Fit shortly from a surface without patches; None where the surface of the best explanation does better so.
+
+        Only where the instrument is unknown, whose fits take minutes: there, fits bend the instrument, which a short
+        fit holds as stated, so that a right explanation does better after a short one.
+        """
+        misfit, start = self.short_fit(surface, AlbedoPatches.none(self.stack.shape[1:]))
+        problem = best.fit.problem
+        if problem.is_instrument_unknown and misfit > self.short_fit(best.fit.state.surface, problem.patches)[0]:
+            return None
+        return start
 
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit with the albedos of patches that a fit does not explain; None where there are none."""
@@ -443,9 +462,8 @@ def measured_regions(found: Steps | None) -> list[Region]:
         inside = found.patch == p.number
         beside = found.patch[grown(inside, SKIRT) & ~inside]
         around = by_number[int(np.bincount(beside).argmax())]
-        is_measured = p.is_determined and around.is_determined
-        known = (p.level_um, p.level_std_um, p.level_um - around.level_um) if is_measured else ()
-        out.append(Region(inside, *known))
+        step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
+        out.append(Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside))
     return out
 
 

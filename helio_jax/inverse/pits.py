@@ -55,15 +55,17 @@ class PitSearch:
         pitch: dy, dx, um.
         beam_shift: `Instrument.beam_shift`.
         report: called with what is tried next.
+        hopeless: misfit above which no more pits are looked for once the largest one is sunk.
     """
 
     residuals: Callable[[Surface], np.ndarray]
     pitch: tuple[float, float]
     beam_shift: tuple[float, float]
     report: Callable[[str], None] = lambda said: None
+    hopeless: float = np.inf
 
     def find(self, shape: tuple[int, int]) -> Pits | None:
-        """Find the pits of an image; None where a flat substrate explains it, or no pit does better."""
+        """Find the pits of an image; None where there is none, or where the search is hopeless."""
         flat = Surface(*np.zeros((3, *shape)))
         pits = Pits(flat, np.zeros(shape, int), self.misfit(flat))
         places = [(inside, 0.0) for inside in self.outlines(flat, np.ones(shape, bool))]
@@ -76,6 +78,8 @@ class PitSearch:
                 pits = deeper
                 inner = self.outlines(pits.surface, floor_of(pits.surface, inside))
                 places = [(within, level) for within in inner] + places
+            if pits.misfit > self.hopeless:
+                return None
         return pits if pits.number.any() else None
 
     def misfit(self, surface: Surface) -> float:

@@ -41,6 +41,23 @@ def test_no_pit_where_the_substrate_explains_all():
     assert found((0.0, 0.0))[1] is None
 
 
+def test_a_hopeless_search_ends_with_the_largest_pit():
+    """Where a floor leaves more than `hopeless`, the inner pit is not looked for, and there are no pits at all."""
+    tried = []
+
+    def residuals(surface):
+        tried.append(surface.height.min())
+        return (0.9 + np.abs(surface.height + 80.0 * OUTER + 60.0 * INNER) / 30.0)[None]
+
+    counts = []
+    for hopeless in (np.inf, 100.0):
+        pits = PitSearch(residuals, (PITCH, PITCH), (0.0, 0.0), hopeless=hopeless).find(SHAPE)
+        assert (pits is None) == (hopeless == 100.0)
+        counts.append(len(tried))
+        tried.clear()
+    assert counts[1] < 0.7 * counts[0], counts
+
+
 def test_outlines_need_several_pixels():
     """Single pixels, however wrong, are noise; a block of 4 x 5 is a region, to the pixel."""
     wrong = np.zeros((2, *SHAPE))

@@ -1,5 +1,7 @@
 """Levels of regions: put to the level a made-up misfit asks for, a real trench."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ from scipy.ndimage import gaussian_filter
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.explanations import measured_regions
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
 from helio_jax.inverse.photometric_start import with_backtracking
+from helio_jax.inverse.step_records import Patch
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_height
@@ -65,6 +69,22 @@ def test_a_measured_step_is_tried_above_the_surface_around():
         lambda s: (misfit(s), s),
     )
     assert found.moved == [0] and found.surface.height[INSIDE].mean() == pytest.approx(90.0, abs=2.0)
+
+
+def test_a_measured_level_is_above_the_patch_around_it():
+    """A level of 150 um on one of 100 um is a step of 50 um; on one that is not known it is none.
+
+    Rejects steps that count from the substrate elsewhere, which a surface with a free border may put at any height.
+    """
+    patch = np.zeros(SHAPE, int)
+    patch[4:-4, 4:-4], patch[10:-10, 10:-10] = 1, 2
+
+    def regions(*levels):
+        patches = [Patch(n, 100 - n, level, 1.0, 1, False, 0.0) for n, level in enumerate(levels)]
+        return measured_regions(SimpleNamespace(patches=patches, patch=patch))
+
+    assert [(r.height, r.step) for r in regions(0.0, 100.0, 150.0)] == [(100.0, 100.0), (150.0, 50.0)]
+    assert [(r.height, r.step) for r in regions(0.0, np.nan, 150.0)] == [(None, None), (150.0, None)]
 
 
 @pytest.mark.parametrize("best", [-130.0, 45.0])

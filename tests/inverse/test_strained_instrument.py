@@ -13,8 +13,9 @@ import helio_jax as hx
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.unknowns import OBJECT
 from helio_jax.instrument import Uncertainty
-from helio_jax.inverse.explanations import INSTRUMENT, STRAIN, is_strained, relief_of_strain
+from helio_jax.inverse.explanations import INSTRUMENT, STRAIN, _Fits, is_strained, relief_of_strain
 from helio_jax.inverse.residuals import NAMES, Parameters
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import Calibration
 from helio_jax.workflows.known_scene import known_scene
 
@@ -39,6 +40,19 @@ def test_strain_is_chi_square_of_the_pulls():
         assert is_strained(parameters_with(aim=np.full((3, 2), factor * limit), **rest)) is is_far
     far, near = (SimpleNamespace(parameters=parameters_with(offset=np.full(3, pull))) for pull in (4.0, 1.0))
     assert relief_of_strain(far, near) == pytest.approx(0.5 * 3 * (16.0 - 1.0))
+
+
+@pytest.mark.parametrize(("is_unknown", "is_fitted"), [(False, True), (True, False)])
+def test_what_begins_worse_is_not_fitted(monkeypatch, is_unknown, is_fitted):
+    """Where the instrument is unknown, and a short fit from the surface of the best explanation does better."""
+    shape = (4, 4)
+    low, high = (hx.Surface(np.full(shape, h), *np.zeros((2, *shape))) for h in (0.0, 9.0))
+    monkeypatch.setattr(_Fits, "short_fit", lambda self, surface, patches: (100.0 + surface.height.max(), surface))
+    problem = SimpleNamespace(is_instrument_unknown=is_unknown, patches=None)
+    best = SimpleNamespace(fit=SimpleNamespace(problem=problem, state=SimpleNamespace(surface=low)))
+    fits = _Fits(SimpleNamespace(shape=(3, *shape)), ReconstructSettings(), None, None)
+    assert (fits.promising(high, best) is high) is is_fitted
+    assert fits.promising(low, best) is low
 
 
 @pytest.fixture(scope="module")
