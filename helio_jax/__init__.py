@@ -106,6 +106,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_bilateral bilateral normal integration
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
+  strain              how far a fit moves the instrument from what is stated
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   photometric_start   surfaces that a fit starts from
   objects             objects on a flat substrate: their outlines and levels
@@ -126,7 +127,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   low_steps           heights of steps whose bands are shorter than a pixel
   dash_steps          such steps as records
   step_records        records of steps, bands and patches
-  measured_steps      what measured steps are for a fit: walls between pixels, known differences of heights
+  measured_steps      what measured steps are for a fit: walls between pixels, known levels and differences of heights
+  parameters          unknowns of the fit that are not the surface, their priors, what they stand for
   law_prior           what is unknown of the scattering law; its test against the cosine law
   residuals           residuals of the fit as a function of its unknowns
   problem             FitProblem: data, priors, all that is constant in a fit

@@ -29,9 +29,10 @@ from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.correlated_errors import EdgeError, averaged_std
 from helio_jax.inverse.edges import NOISE_FLOOR, around, kink_size, trapezoid_gap
 from helio_jax.inverse.fisher import pose_experiment
+from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import block_derivatives, tilts_of
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import SLOPE_STD, Edges, FixedTerms, Parameters, Unknowns, second_order_noise_bias
+from helio_jax.inverse.residuals import SLOPE_STD, Edges, FixedTerms, Unknowns, second_order_noise_bias
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import masked_moves
 from helio_jax.inverse.steps import NOISY, edges_of, expand_form_factors, freeze, steepness

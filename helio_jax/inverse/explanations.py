@@ -24,19 +24,20 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit, without_noise_bias
-from helio_jax.inverse.levels import GAIN, SKIRT, Region, covered, grown, search_levels
+from helio_jax.inverse.levels import GAIN, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
-from helio_jax.inverse.measured_steps import walls_of
+from helio_jax.inverse.measured_steps import labelled, level_anchors, measured_regions, walls_of
 from helio_jax.inverse.objects import find_objects
+from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo, with_backtracking
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square, squares
-from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_records import Steps
+from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
@@ -47,14 +48,8 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
-INSTRUMENT = "log_gain", "offset", "log_multiple", "discrepancy", "law", "distance", "tilt", "aim"
-"""Parameters whose prior is what is known of the instrument and the model."""
-STRAIN = 5.0
-"""The instrument is strained where its pulls' chi-square exceeds its mean by this many of its standard deviations."""
 HOPELESS = 2.0
 """Pits are given up where they leave so many times the misfit of an unknown instrument's best fit."""
-MAX_LEVEL_SLOPE = 0.3
-"""Steeper pixels of a region do not count for its level: they are its wall."""
 HELD = 1e-4
 """Gains and offsets that are held have this share of their prior standard deviation."""
 
@@ -124,7 +119,7 @@ def explain(
             is_less = fits.contradicted(rest) < (LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED)
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
-                gained += relief_of_strain(best.fit, found.fit)
+                gained += relief_of_strain(best.fit.parameters, found.fit.parameters)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
         except PredictionError as e:
@@ -413,25 +408,6 @@ def improvement(residuals: np.ndarray, others: np.ndarray) -> float:
     return half_chi_square(residuals) - half_chi_square(others)
 
 
-def instrument_pulls(parameters: Parameters) -> np.ndarray:
-    """Pulls of all unknowns but the surface, its albedo, drift and scan lines, in prior standard deviations [number].
-
-    They are independent and normal under the prior.
-    """
-    return np.concatenate([np.ravel(getattr(parameters, name)) for name in INSTRUMENT])
-
-
-def is_strained(parameters: Parameters) -> bool:
-    """Whether a fit moves the instrument farther than is stated, by more than chance (`STRAIN`)."""
-    pulls = instrument_pulls(parameters)
-    return float(np.sum(pulls**2)) > pulls.size + STRAIN * math.sqrt(2.0 * pulls.size)
-
-
-def relief_of_strain(fit: Fit, other: Fit) -> float:
-    """Compute by how much less another fit moves the instrument, in half chi-square."""
-    return 0.5 * float(np.sum(instrument_pulls(fit.parameters) ** 2) - np.sum(instrument_pulls(other.parameters) ** 2))
-
-
 def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:
     """Hold gains and offsets at what is stated."""
     held = {"gain_std": HELD * settings.refine.gain_std, "offset_std": HELD * settings.refine.offset_std}
@@ -446,43 +422,3 @@ def readout_as_stated(parameters: Parameters) -> Parameters:
 def scan_order(stack: MicrographStack) -> ScanOrder:
     """Order in which a stack's pixels were recorded."""
     return ScanOrder(0 if stack.fast_axis == "x" else 1, stack.scan_time)
-
-
-def measured_regions(found: Steps | None) -> list[Region]:
-    """List the patches between measured steps, the largest first.
-
-    A measured level is tried above the patch around it: a surface with a free border may bend so far that the
-    substrate elsewhere is no reference.
-    """
-    if found is None:
-        return []
-    by_number = {p.number: p for p in found.patches}
-    out = []
-    for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels):
-        inside = found.patch == p.number
-        beside = found.patch[grown(inside, SKIRT) & ~inside]
-        around = by_number[int(np.bincount(beside).argmax())]
-        step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
-        out.append(Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside))
-    return out
-
-
-def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:
-    """Anchor the regions whose heights are measured, where the surface is level in them.
-
-    Args:
-        labels: 1, 2, ... in the regions [y, x].
-        regions: that were moved, in this order.
-        surface: with the regions at their levels.
-    """
-    is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
-    known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
-    return Anchors.of_levels(labels, known, is_level, SKIRT)
-
-
-def labelled(regions: list[Region]) -> np.ndarray:
-    """Number the pixels of regions 1, 2, ... [y, x]; 0 outside of all."""
-    out = np.zeros(regions[0].inside.shape, int)
-    for number, region in enumerate(regions, 1):
-        out[region.inside] = number
-    return out

@@ -21,10 +21,11 @@ from helio_jax.inverse.convergence import aitken, contraction_of, remaining_erro
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
+from helio_jax.inverse.parameters import Parameters, smooth_albedo
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
-from helio_jax.inverse.residuals import FixedTerms, Parameters, Unknowns, data_by_incidence, smooth_albedo
+from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step

@@ -13,8 +13,8 @@ from helio_jax.forward.optics import Raster
 from helio_jax.inverse.explanations import scan_order
 from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.linear import parallax_of, signal_of
+from helio_jax.inverse.parameters import NAMES, Parameters
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import NAMES, Parameters
 from helio_jax.inverse.state import FitState, Predict, update_corrections
 from helio_jax.inverse.steps import expected
 from helio_jax.micrograph import MicrographStack

@@ -11,9 +11,9 @@ import numpy as np
 
 from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.law_prior import cosine_probability, numbers_of
+from helio_jax.inverse.parameters import LawPrior, mode_weights
 from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import LawPrior, mode_weights
 
 WEAK = 0.5
 """A combination is weak when the data leave more than this share of its prior standard deviation."""

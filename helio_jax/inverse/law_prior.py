@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError
 from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw
-from helio_jax.inverse.residuals import LawPrior
+from helio_jax.inverse.parameters import LawPrior
 from helio_jax.inverse.settings import RefineSettings
 
 LEAST_IMAGES = 5

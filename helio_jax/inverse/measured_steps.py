@@ -1,4 +1,4 @@
-"""Steps that mask bands show (`mask_steps`): edges of the raster that they cut, and sums of heights that they measure.
+"""What mask bands tell a fit (`mask_steps`): edges of the raster that walls cut, levels, and sums of heights.
 
 A band's length tells the height of an upper edge above the lower surface at the band's far end, whatever gain and law
 are; a fit, which holds its masks fixed in every iteration, learns little of it.
@@ -12,6 +12,7 @@ from helio_jax.forward.optics import Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.forward.surface import along as along_axis
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.levels import SKIRT, Region, grown
 from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.mask_patches import COMMON_STD
 from helio_jax.inverse.mask_steps import CERTAIN_WALL
@@ -23,6 +24,8 @@ BEYOND = 2.6
 """Pixels that show the lower surface: so far beyond the far end of the longest band [pixels]."""
 MIN_PIXELS = 3
 """Fewer pixels show no height."""
+MAX_LEVEL_SLOPE = 0.3
+"""Steeper pixels of a region do not count for its level: they are its wall."""
 PLACES = -0.3, 0.0, 0.3
 """Places of an edge that are allowed for: a pixel between them may be on either side; it is joined to none [pixels]."""
 
@@ -127,3 +130,43 @@ def _beside(step: Step, raster: Raster) -> tuple[np.ndarray, np.ndarray, float]:
 def _edge(step: Step) -> Edge:
     """Return the upper edge of a step."""
     return Edge(np.array(step.start), np.array(step.end), ())
+
+
+def measured_regions(found: Steps | None) -> list[Region]:
+    """List the patches between measured steps, the largest first.
+
+    A measured level is tried above the patch around it: a surface with a free border may bend so far that the
+    substrate elsewhere is no reference.
+    """
+    if found is None:
+        return []
+    by_number = {p.number: p for p in found.patches}
+    out = []
+    for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels):
+        inside = found.patch == p.number
+        beside = found.patch[grown(inside, SKIRT) & ~inside]
+        around = by_number[_most_frequent(beside)]
+        step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
+        out.append(Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside))
+    return out
+
+
+def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:
+    """Anchor the regions whose heights are measured, where the surface is level in them.
+
+    Args:
+        labels: 1, 2, ... in the regions [y, x].
+        regions: that were moved, in this order.
+        surface: with the regions at their levels.
+    """
+    is_level = np.hypot(surface.slope_x, surface.slope_y) < MAX_LEVEL_SLOPE
+    known = {i: (r.height, r.std) for i, r in enumerate(regions, 1) if r.height is not None}
+    return Anchors.of_levels(labels, known, is_level, SKIRT)
+
+
+def labelled(regions: list[Region]) -> np.ndarray:
+    """Number the pixels of regions 1, 2, ... [y, x]; 0 outside of all."""
+    out = np.zeros(regions[0].inside.shape, int)
+    for number, region in enumerate(regions, 1):
+        out[region.inside] = number
+    return out

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import Parameters
 from helio_jax.inverse.state import FitState
 from helio_jax.inverse.steps import expected, levelled, step
 

@@ -26,10 +26,10 @@ from scipy.sparse.linalg import splu
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface, along
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
+from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.residuals import (
     SLOPE_STD,
     FixedTerms,
-    Parameters,
     Unknowns,
     border_residuals,
     data_residuals,

@@ -23,8 +23,8 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.law_prior import check_law, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
+from helio_jax.inverse.parameters import LawPrior, Parameters, Priors, law_of, moves_of
 from helio_jax.inverse.quality import MIN_REGION, regions
-from helio_jax.inverse.residuals import LawPrior, Parameters, Priors, law_of, moves_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 LEVEL_STD = 0.1

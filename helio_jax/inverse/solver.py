@@ -11,15 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.residuals import (
-    FixedTerms,
-    Parameters,
-    Unknowns,
-    border_residuals,
-    data_residuals,
-    residuals,
-    surface_of,
-)
+from helio_jax.inverse.parameters import Parameters
+from helio_jax.inverse.residuals import FixedTerms, Unknowns, border_residuals, data_residuals, residuals, surface_of
 
 OF_SAMPLE = "albedo", "patch"
 """Parameters that are free even while the instrument is held."""

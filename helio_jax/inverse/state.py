@@ -18,8 +18,8 @@ from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.parameters import Parameters, moved_optics
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import Parameters, moved_optics
 from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
 from helio_jax.inverse.settings import RefineSettings
 

@@ -18,6 +18,7 @@ from helio_jax.forward.form_factor import form_factor_at
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.surface import Surface, one_sided, to_pixels
 from helio_jax.inverse.edges import AxisEdges, find_edges, smoothness_weight
+from helio_jax.inverse.parameters import moved_optics, substrate_plane
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.residuals import (
     CommonModes,
@@ -27,9 +28,7 @@ from helio_jax.inverse.residuals import (
     LawResponse,
     Unknowns,
     expected_data,
-    moved_optics,
     second_order_noise_bias,
-    substrate_plane,
     surface_of,
 )
 from helio_jax.inverse.solver import Solution, solve, whitened_parameters

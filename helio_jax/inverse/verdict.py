@@ -149,7 +149,7 @@ def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> M
     Raises:
         PredictionError: the surface is too rough or steep to be traced.
     """
-    from helio_jax.inverse.residuals import moved_optics
+    from helio_jax.inverse.parameters import moved_optics
 
     state, difference, std = _traced_state(problem, state, trace)
     optics = moved_optics(problem.optics, problem.moves(state.parameters))

@@ -13,9 +13,10 @@ from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
+from helio_jax.inverse.parameters import NAMES
 from helio_jax.inverse.posterior import linearise
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import NAMES, Unknowns, residuals, surface_of
+from helio_jax.inverse.residuals import Unknowns, residuals, surface_of
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, update_corrections
 from helio_jax.inverse.steps import freeze

@@ -15,8 +15,8 @@ from helio_jax.forward.render import Corrections
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.fit import Fit, fit_heights, with_posterior
 from helio_jax.inverse.instrument_report import describe_instrument
+from helio_jax.inverse.parameters import smooth_images
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import smooth_images
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 N, PITCH, HEIGHT, WIDTH = 31, 40.0, 160.0, 150.0

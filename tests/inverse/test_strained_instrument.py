@@ -13,9 +13,10 @@ import helio_jax as hx
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.unknowns import OBJECT
 from helio_jax.instrument import Uncertainty
-from helio_jax.inverse.explanations import INSTRUMENT, STRAIN, _Fits, is_strained, relief_of_strain
-from helio_jax.inverse.residuals import NAMES, Parameters
+from helio_jax.inverse.explanations import _Fits
+from helio_jax.inverse.parameters import NAMES, Parameters
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.strain import INSTRUMENT, STRAIN, is_strained, relief_of_strain
 from helio_jax.micrograph import Calibration
 from helio_jax.workflows.known_scene import known_scene
 
@@ -38,7 +39,7 @@ def test_strain_is_chi_square_of_the_pulls():
     assert sum(getattr(parameters_with(), name).size for name in INSTRUMENT) == n
     for factor, is_far in ((0.99, False), (1.01, True)):
         assert is_strained(parameters_with(aim=np.full((3, 2), factor * limit), **rest)) is is_far
-    far, near = (SimpleNamespace(parameters=parameters_with(offset=np.full(3, pull))) for pull in (4.0, 1.0))
+    far, near = (parameters_with(offset=np.full(3, pull)) for pull in (4.0, 1.0))
     assert relief_of_strain(far, near) == pytest.approx(0.5 * 3 * (16.0 - 1.0))
 
 

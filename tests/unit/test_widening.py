@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from helio_jax.inverse.convergence import SLOWEST, aitken, remaining_error
+from helio_jax.inverse.parameters import NAMES as FIELDS
+from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Posterior
-from helio_jax.inverse.residuals import NAMES as FIELDS
-from helio_jax.inverse.residuals import Parameters
 
 NAMES = ("log_gain[0]", "aim[0, 0]", "aim[1, 0]")
 SHAPE = (4, 5)
