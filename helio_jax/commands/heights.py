@@ -60,7 +60,7 @@ def reconstruct_files(
     """Reconstruct a height map from three or more micrographs, of one scan or of several of one sample."""
     from helio_jax import MicrographSet, write
     from helio_jax.alignment.added_scans import add_by_orientation
-    from helio_jax.figures.trust import anchor_lines, trust_lines
+    from helio_jax.figures.trust import anchor_lines, discrepancy_text, trust_lines
     from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.hdf5 import read_micrographs
     from helio_jax.workflows.heights import reconstruct, reconstruct_scans
@@ -94,6 +94,8 @@ def reconstruct_files(
         for name, factor in result.provenance.get("sensitivity", {}).items():
             print(f"  the highest point moves by {factor:+.1f} % per % of signal in {name.removeprefix('log_')}")
         _print_instrument(result.provenance.get("instrument", {}))
+        if text := discrepancy_text(result):
+            print(f"  {text}")
     if result.status.startswith("interrupted"):
         raise KeyboardInterrupt
     warn(result.trust, strict)

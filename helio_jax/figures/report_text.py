@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.figures.trust import error_sources, numbers, table
+from helio_jax.figures.trust import discrepancy_text, error_sources, numbers, table
 from helio_jax.figures.wording import share, typeset
 from helio_jax.measure.facets import Facets
 from helio_jax.micrograph import MicrographStack
@@ -78,6 +78,7 @@ def uncertainty_notes(rec: Reconstruction) -> str:
         notes.append(f"weakly determined, posterior over prior standard deviation {share(left)}: {terms}")
     common = numbers(found).get("common_mode_um", 0.0)
     notes += [f"an error common to all heights of up to {common:.3g} um is included"] if common else []
+    notes += [text] if (text := discrepancy_text(rec)) else []
     return as_list(notes) if notes else ""
 
 

@@ -85,6 +85,17 @@ def error_sources(rec: Reconstruction) -> list[tuple[str, float]]:
     return sorted(found, key=lambda item: -item[1])
 
 
+def discrepancy_text(rec: Reconstruction) -> str:
+    """Say what the model was found to lack in each detector's image (`Uncertainty.discrepancy`); "": nothing is known.
+
+    Root mean squares over the median signal.
+    """
+    found = numbers(rec.provenance, "instrument", "discrepancy")
+    stated = numbers(rec.provenance, "instrument").get("discrepancy_std", 0.0)
+    parts = ", ".join(f"{rms:.1%} ({name})" for name, rms in found.items())
+    return f"smooth errors of the model: {parts} of the signal, stated {stated:.1%}" if parts else ""
+
+
 ANCHOR_TITLES = "anchor", "stated or measured (um)", "in the map (um)", "without it (um)", "difference (s.d.)", ""
 """Of the columns of `anchor_rows`."""
 

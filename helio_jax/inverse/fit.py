@@ -34,8 +34,8 @@ from helio_jax.robust import cauchy_weight
 
 GEOMETRY = "distance", "tilt", "aim"
 """Parameters that show an incomplete model where they come out farther off than stated: error bars are inflated."""
-MODEL = ("discrepancy",)
-"""The same, apart from the few numbers of the geometry."""
+MODEL, MIN_MODEL_RATIO = ("discrepancy",), 1.3
+"""The same, apart from the few numbers of the geometry, for Birge ratios beyond chance."""
 GAINS, MIN_BIRGE_RATIO = ("log_gain", "offset"), 2.0
 """The same, but only for Birge ratios above this one: gains usually differ by chance."""
 
@@ -148,7 +148,7 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
 
 def inflated(posterior: Posterior, state: FitState) -> Posterior:
     """Inflate the error bars where a state's instrument, or what the model lacks, contradicts what is stated."""
-    found = posterior.inflated(state.parameters, GEOMETRY).inflated(state.parameters, MODEL)
+    found = posterior.inflated(state.parameters, GEOMETRY).inflated(state.parameters, MODEL, MIN_MODEL_RATIO)
     return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO)
 
 

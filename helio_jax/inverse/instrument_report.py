@@ -86,8 +86,8 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     prior standard deviation: `share` is what they leave, `of` the largest terms of the (unit) combination. `inflation`:
     Birge ratio by which all error bars are enlarged. `common_mode_um`: largest common-mode error that was added for an
     instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, where one was fitted.
-    `discrepancy`: what the model was found to lack, detector -> [root mean square, stated standard deviation], over the
-    median signal, where the instrument states any; its modes are in neither list.
+    `discrepancy`: what the model was found to lack, detector -> root mean square over the median signal, where the
+    instrument states any, and `discrepancy_std`, that; its modes are in neither list.
     """
     posterior = fit.posterior
     if posterior is None:
@@ -131,7 +131,8 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
         std = fit.problem.discrepancy_std
         modes = fit.parameters.discrepancy
         size = std * np.sqrt(np.sum((modes * mode_weights(modes.shape[-1])) ** 2, (1, 2)))
-        found["discrepancy"] = {name: [float(rms), std] for name, rms in zip(detectors, size, strict=True)}
+        found["discrepancy"] = dict(zip(detectors, size.tolist(), strict=True))
+        found["discrepancy_std"] = std
     return found if law is None else found | {"law": describe_law(fit, posterior)}
 
 

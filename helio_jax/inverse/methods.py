@@ -139,8 +139,8 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
         )
     if fit.posterior is not None and fit.posterior.inflation > 1.0:
         found.append(
-            "the fitted instrument deviates more from the stated one than its uncertainty explains: all error bars are "
-            f"inflated by {fit.posterior.inflation:.1f}"
+            "what was fitted of instrument and model deviates more from what is stated than its uncertainty explains: "
+            f"all error bars are inflated by {fit.posterior.inflation:.1f}"
         )
     if fit.parameters.aim.size or fit.parameters.distance.size:
         found.append(GEOMETRY_WARNING)

@@ -15,7 +15,7 @@ from helio_jax.commands.app import app
 from helio_jax.figures.height_page import draw_reconstruction
 from helio_jax.figures.notebook import as_html
 from helio_jax.figures.report import write_report
-from helio_jax.figures.trust import BAD, CARE, GOOD, error_sources, limits, verdict
+from helio_jax.figures.trust import BAD, CARE, GOOD, discrepancy_text, error_sources, limits, verdict
 from helio_jax.formats.hdf5 import read, write
 from helio_jax.inverse import quality
 from helio_jax.inverse import verdict as judge
@@ -99,6 +99,17 @@ def test_what_limits_the_trust(tested):
     assert any(text.startswith("gain D1: ") for text in limits(rec))
     for strange in ({"sensitivity": [1], "instrument": "x"}, {"sensitivity": {"a": 1.0}, "instrument": {"values": 3}}):
         assert error_sources(tested.replace(provenance=strange)) == []
+
+
+def test_what_the_model_lacks_is_told(tested, tmp_path):
+    """Per detector, against what is stated, in the report, too; nothing where nothing is known."""
+    history = {"instrument": {"discrepancy": {"D1": 0.012, "D2": 0.034}, "discrepancy_std": 0.02}}
+    rec = tested.replace(provenance=history)
+    text = "smooth errors of the model: 1.2% (D1), 3.4% (D2) of the signal, stated 2.0%"
+    assert discrepancy_text(rec) == text
+    assert "smooth errors of the model" in write_report(tmp_path / "r.html", None, rec).read_text(encoding="utf-8")
+    for strange in ({}, {"instrument": "x"}, {"instrument": {"discrepancy": [1, 2]}}):
+        assert discrepancy_text(tested.replace(provenance=strange)) == ""
 
 
 def test_rule_and_warnings_stand_everywhere(tested, tmp_path):
