@@ -19,6 +19,7 @@ from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.inverse.linear import PhotometricSolution
+from helio_jax.inverse.parameters import smooth_images
 from helio_jax.inverse.samples import on_raster, thinning
 from helio_jax.inverse.settings import ReconstructSettings
 
@@ -47,8 +48,9 @@ def bootstrap_heights(
     settings: ReconstructSettings,
     solve: Solve,
     misfit: np.ndarray | None = None,
+    discrepancy: float = 0.0,
 ) -> np.ndarray:
-    """Draw the errors of a method's heights by noise, calibration and misfit [sample, y, x], um.
+    """Draw the errors of a method's heights by noise, calibration, misfit and discrepancy [sample, y, x], um.
 
     Where the border is flat, every drawn reading is scaled to the substrate's signal there, as calibration does: gains
     are not free. Of a thinned raster a pixel stands for stride^2 data, whose noise is less by the stride: heights along
@@ -63,8 +65,9 @@ def bootstrap_heights(
         solve: the method.
         misfit: systematic error of the data [detector, y, x], of unknown sign and not everywhere the same share of it;
             NaN where not observed.
+        discrepancy: smooth errors of the data, over their median (`Uncertainty.discrepancy`).
     """
-    rng = np.random.default_rng(SEED)
+    rng, smooth = np.random.default_rng(SEED), np.random.default_rng(SEED + 3)
     patches = np.random.default_rng(SEED + 2)
     shape = signal.shape[1:]
     stride = thinning(shape, MAX_PIXELS)
@@ -78,6 +81,8 @@ def bootstrap_heights(
         reading = _drawn_reading(data, np.sqrt(spread) / stride, settings, rng)
         if systematic is not None:
             reading = reading + patchy_amplitude(height.shape, patches) * systematic
+        if discrepancy:
+            reading = reading + _drawn_discrepancy(data, discrepancy, settings, smooth)
         reading = rescale_to_border(reading, data, settings) * (substrate_signal(other) / stated)[:, None, None]
         drawn.append(solve(reading, spread, other, stride) - height)
     return on_raster(np.array(drawn), shape, stride)
@@ -116,6 +121,15 @@ def _drawn_reading(
     offset = (usual * s.offset_std * rng.standard_normal(n))[:, None, None]
     gain = np.exp(s.gain_std * rng.standard_normal(n))[:, None, None]
     return gain * data + offset + noise * rng.standard_normal(data.shape)
+
+
+def _drawn_discrepancy(
+    data: np.ndarray, discrepancy: float, settings: ReconstructSettings, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw smooth errors of data [detector, y, x], as `refine` has them for unknowns."""
+    n = settings.refine.discrepancy_modes
+    std = discrepancy * np.nanmedian(data, axis=(1, 2))
+    return np.asarray(smooth_images(rng.standard_normal((len(data), n, n)), data.shape[1:], std))
 
 
 def unmodelled_signal(

@@ -193,7 +193,10 @@ def photometric_heights(
         return rec.replace(warnings=(*rec.warnings, f"no error bars: {failure}"))
     known = solver.optics, GeometryPrior.of(stack.instrument), settings
     difference = None if misfit is None else misfit.difference
-    samples = bootstrap_heights(data, solver.variance, *known, lambda *drawn: solver.solve(*drawn)[0], difference)
+    discrepancy = stack.instrument.uncertainty.discrepancy
+    samples = bootstrap_heights(
+        data, solver.variance, *known, lambda *drawn: solver.solve(*drawn)[0], difference, discrepancy
+    )
     samples = add_common_modes(samples, modes, SEED + 1)
     std = np.sqrt(np.mean(samples**2, axis=0))
     rec = rec.replace(height_samples=samples, height_std=std, warnings=(*rec.warnings, *filter(None, [failure])))

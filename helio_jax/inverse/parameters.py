@@ -97,7 +97,7 @@ class Priors(eqx.Module):
     patch: Any
 
 
-def smooth_images(modes: jax.Array, shape: tuple[int, ...], std: Any) -> jax.Array:
+def smooth_images(modes: jax.Array | np.ndarray, shape: tuple[int, ...], std: Any) -> jax.Array:
     """Compute images [image, y, x] of cosine modes [image, mode, mode], as much in every octave of wavelengths.
 
     The constant mode is left to the offsets. Averaged over an image, the variance of a pixel is the square of `std`
