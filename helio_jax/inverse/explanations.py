@@ -107,7 +107,8 @@ def explain(
             break
         try:
             residuals = fits.residuals(best.fit) if residuals is None else residuals
-            share = fits.contradicted(residuals, residuals)
+            right = fits.right_chi_square(residuals)
+            share = fits.contradicted(residuals, right)
             is_contradicted = share >= MIN_CONTRADICTED
             may_be_patches = other == fits.from_albedo_patches and fits.is_strained(best.fit)
             if not is_contradicted and not may_be_patches:
@@ -117,7 +118,7 @@ def explain(
                 continue
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
-            is_less = fits.contradicted(rest, residuals) < most
+            is_less = fits.contradicted(rest, right) < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
                 gained += relief_of_strain(best.fit.parameters, found.fit.parameters)
@@ -211,14 +212,14 @@ class _Fits:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
 
-    def contradicted(self, residuals: np.ndarray, best: np.ndarray) -> float:
-        """Compute the share of the pixels in which residuals contradict a fit.
+    def right_chi_square(self, residuals: np.ndarray) -> float:
+        """Compute the chi-square of a right fit from the residuals of the best one so far [detector, y, x]."""
+        chi_square = local_chi_square(residuals, self.stack.is_observed)
+        return expected_chi_square(self.stack, self.stack.instrument, chi_square)
 
-        `best`: residuals of the best fit so far, which tell the chi-square of a right one [detector, y, x].
-        """
-        chi_square, usual = (local_chi_square(r, self.stack.is_observed) for r in (residuals, best))
-        right = expected_chi_square(self.stack, self.stack.instrument, usual)
-        return float(np.mean(chi_square > CHI_SQUARE_LIMIT * right))
+    def contradicted(self, residuals: np.ndarray, right: float) -> float:
+        """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit; `right`: see above."""
+        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT * right))
 
     @property
     def weighs_instrument(self) -> bool:

@@ -22,7 +22,7 @@ from helio_jax.forward.render import (
 from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.fit import posterior_at
-from helio_jax.inverse.instrument_report import plain_name, units_of
+from helio_jax.inverse.instrument_report import listed_one_by_one, plain_name, units_of
 from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
@@ -86,12 +86,14 @@ def fisher(
         height, optics, raster, dose, background, uncertainty, settings, corrections, albedo
     )
     posterior = posterior_at(problem, with_responses(problem, state), n_samples)
-    matrix, units = units_of(problem, posterior.names)
-    deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance @ matrix.T))
+    listed = listed_one_by_one(posterior.names)
+    names = tuple(posterior.names[i] for i in listed)
+    matrix, units = units_of(problem, names)
+    deviation = np.sqrt(np.diag(matrix @ posterior.instrument_covariance[np.ix_(listed, listed)] @ matrix.T))
     numbers, priors = tuple(map(str, range(optics.n_detectors))), np.linalg.norm(matrix, axis=1)
     parameters = {
         plain_name(name, numbers, problem.priors.law): (float(std), float(prior), unit)
-        for name, std, prior, unit in zip(posterior.names, deviation, priors, units, strict=True)
+        for name, std, prior, unit in zip(names, deviation, priors, units, strict=True)
         if prior > 0.0
     }
     return Information(posterior.height_std, parameters, posterior)

@@ -59,6 +59,11 @@ def kind_of(name: str) -> str:
     return head if head != "aim" else ("polar", "azimuth")[int(index.rstrip("]").split(",")[1])]
 
 
+def listed_one_by_one(names: tuple[str, ...]) -> list[int]:
+    """Return the places of the parameters that say something alone: the modes of the discrepancy do not."""
+    return [i for i, name in enumerate(names) if kind_of(name) != "discrepancy"]
+
+
 def plain_name(name: str, detectors: tuple[str, ...], law: LawPrior | None = None) -> str:
     """Make the name that is shown: "polar forward" for "aim[0, 0]"; `law`: whose numbers the names may be of."""
     _, _, index = name.partition("[")
@@ -93,7 +98,7 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     if posterior is None:
         return {}
     detectors = fit.instrument.detector_names
-    listed = [i for i, name in enumerate(posterior.names) if kind_of(name) != "discrepancy"]
+    listed = listed_one_by_one(posterior.names)
     names = tuple(posterior.names[i] for i in listed)
     matrix, units = units_of(fit.problem, names)
     law = fit.problem.priors.law
@@ -128,8 +133,7 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     common = 0.0 if posterior.common_modes is None else float(np.sqrt((posterior.common_modes**2).sum(0)).max())
     found = {"values": values, "weak": weak, "inflation": posterior.inflation, "common_mode_um": common}
     if fit.parameters.discrepancy.size:
-        std = fit.problem.discrepancy_std
-        modes = fit.parameters.discrepancy
+        std, modes = fit.problem.discrepancy_std, fit.parameters.discrepancy
         size = std * np.sqrt(np.sum((modes * mode_weights(modes.shape[-1])) ** 2, (1, 2)))
         found["discrepancy"] = dict(zip(detectors, size.tolist(), strict=True))
         found["discrepancy_std"] = std

@@ -103,9 +103,8 @@ def smooth_images(modes: jax.Array | np.ndarray, shape: tuple[int, ...], std: An
     The constant mode is left to the offsets. Averaged over an image, the variance of a pixel is the square of `std`
     [image] where the modes are standard normal.
     """
-    along_y, along_x = (_cosines(modes.shape[-1], pixels) for pixels in shape)
-    weight = mode_weights(modes.shape[-1])
-    return jnp.einsum("k,kmn,my,nx->kyx", std, modes * weight, along_y, along_x)
+    scale = jnp.asarray(std)[:, None, None] * np.sqrt(shape[0] * shape[1]) * mode_weights(modes.shape[-1])
+    return _from_spectrum(modes * scale, shape)
 
 
 def mode_weights(n: int) -> np.ndarray:
@@ -115,21 +114,19 @@ def mode_weights(n: int) -> np.ndarray:
     return 1.0 / rank / np.sqrt(np.sum(rank**-2.0))
 
 
-def _cosines(n: int, pixels: int) -> jax.Array:
-    """Compute the first cosine modes of a line of pixels, of unit mean square [mode, pixel]."""
-    mode, pixel = jnp.arange(n)[:, None], jnp.arange(pixels) + 0.5
-    return jnp.where(mode == 0, 1.0, jnp.sqrt(2.0)) * jnp.cos(jnp.pi * mode * pixel / pixels)
-
-
 def smooth_albedo(modes: jax.Array, shape: tuple[int, ...], std: Any) -> jax.Array:
     """Compute the smooth albedo exp(sum of cosine modes); the constant mode is left to the gains. No modes: 1."""
     n = modes.shape[0]
-    if n == 0:
-        return jnp.ones(shape)
     rank = jnp.hypot(*jnp.meshgrid(jnp.arange(n), jnp.arange(n), indexing="ij"))
     scale = std * jnp.sqrt(shape[0] * shape[1]) / jnp.maximum(rank, 1.0) ** 2
-    spectrum = jnp.zeros(shape).at[:n, :n].set((modes * scale).at[0, 0].set(0.0))
-    return jnp.exp(idctn(spectrum, norm="ortho"))
+    return jnp.exp(_from_spectrum((modes * scale).at[:1, :1].set(0.0), shape))
+
+
+def _from_spectrum(modes: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Transform the first orthonormal cosine modes [..., mode, mode] to images [..., y, x]."""
+    n = modes.shape[-1]
+    spectrum = jnp.zeros((*modes.shape[:-2], *shape)).at[..., :n, :n].set(modes)
+    return idctn(spectrum, axes=(-2, -1), norm="ortho")
 
 
 def albedo_of_patches(log_albedo: Any, std: Any, patches: Any) -> jax.Array:

@@ -261,6 +261,7 @@ def step(
     free = np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
         is_mixed = problem.is_instrument_unknown or problem.is_level_free or problem.priors.law is not None
+        is_mixed = is_mixed or bool(problem.discrepancy_std)
         if (is_instrument_free and is_mixed) or start.parameters.patch.size:
             mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)), free)
         else:  # as they are, where they are held or little is unknown

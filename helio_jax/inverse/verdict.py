@@ -196,9 +196,8 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
         said = "contradicts the data: no micrographs can be traced on a height map so rough or steep"
         return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
-    is_worse = (rec.reason == 0) & (
-        chi_square > CHI_SQUARE_LIMIT * expected_chi_square(stack, rec.instrument, chi_square)
-    )
+    right = expected_chi_square(stack, rec.instrument, chi_square)
+    is_worse = (rec.reason == 0) & (chi_square > CHI_SQUARE_LIMIT * right)
     reason = np.where(is_worse, _CONTRADICTED, rec.reason)
     names, square = stack.instrument.detector_names, np.where(stack.is_observed, squares(found), 0.0)
     by_detector = square.sum((1, 2)) / np.maximum(stack.is_observed.sum((1, 2)), 1)

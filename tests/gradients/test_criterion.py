@@ -109,7 +109,7 @@ def test_agrees_with_sampled_errors(kind):
 @pytest.mark.slow
 def test_agrees_with_sampled_errors_of_an_uncertain_plate():
     """The same with distance, tilt and aperture angles unknown. Catches a nuisance that is taken for known."""
-    unknown = Uncertainty(sample_distance_um=100.0, polar_deg=2.0, azimuth_deg=1.0, tilt_deg=0.5)
+    unknown = Uncertainty(sample_distance_um=100.0, polar_deg=2.0, azimuth_deg=1.0, tilt_deg=0.5, discrepancy=0.01)
     options = {"uncertainty": unknown, "settings": ReconstructSettings(refine=RefineSettings(drift_std=0.02))}
     found = hx.fisher(sample("steep"), oblique(), RASTER, 1e5, n_samples=4000, **options)
     case = pose_case(sample("steep"), oblique(), RASTER, 1e5, **options)

@@ -129,6 +129,18 @@ def test_error_bars_of_photometric_methods_contain_it():
     assert np.abs(drawn[1]).max() < 1e-4
 
 
+def test_an_experiment_knows_less_of_the_heights(bshem):
+    """`hx.fisher` counts it; its modes are not listed. Rejects names that several modes share."""
+    known = {"dose": 1e6, "corrections": "none", "n_samples": 200}
+    optics = hx.Optics.of(bshem)
+    without, found = (
+        hx.fisher(hill().height, optics, RASTER, uncertainty=Uncertainty(tilt_deg=1.0, discrepancy=d), **known)
+        for d in (0.0, DISCREPANCY)
+    )
+    assert found.height_std.mean() > 1.5 * without.height_std.mean()
+    assert found.parameters.keys() == without.parameters.keys()
+
+
 def test_it_is_reported(bshem):
     """The error found is within a factor of 1.5 of the true one; its modes are not listed one by one."""
     fit = fitted(bshem, 0, DISCREPANCY)
