@@ -26,6 +26,9 @@ MIN_PIXELS = 3
 """Fewer pixels show no height."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
+LEAST_SHARE = 0.005
+"""Smaller patches, in shares of the image, are tried at no levels but measured ones: a search takes as long for them as
+for others, and they are mostly no patches."""
 PLACES = -0.3, 0.0, 0.3
 """Places of an edge that are allowed for: a pixel between them may be on either side; it is joined to none [pixels]."""
 
@@ -143,6 +146,8 @@ def measured_regions(found: Steps | None) -> list[Region]:
     by_number = {p.number: p for p in found.patches}
     out = []
     for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels):
+        if not p.is_determined and p.pixels < LEAST_SHARE * found.patch.size:
+            continue
         inside = found.patch == p.number
         beside = found.patch[grown(inside, SKIRT) & ~inside]
         around = by_number[_most_frequent(beside)]

@@ -71,23 +71,43 @@ def with_upright_walls(grid: Grid, behind: Grid, beam_shift: tuple[float, float]
         beam_shift: `Instrument.beam_shift` of the grid.
 
     Returns:
-        Both refined [3 y - 2, 3 x - 2], and the number of the pixel to which every point belongs. Without walls: the
-        grids as they are.
+        Both refined (`refined_grid`), without lines of points between rows or columns that are joined alike; and the
+        number of the pixel to which every point belongs. Without walls: the grids as they are.
+    """
+    x, y, z = grid
+    walls = wall_links(x + beam_shift[0] * z, y + beam_shift[1] * z, z)
+    if not any(w.any() for w in walls):
+        return grid, behind, np.arange(z.size).reshape(z.shape)
+    fine, moved, number = refined_grid(grid, behind, beam_shift, *walls)
+    lines = np.ix_(_needed(*walls), _needed(walls[1].T, walls[0].T))
+    fine, moved = ((x[lines], y[lines], z[lines]) for x, y, z in (fine, moved))
+    return fine, moved, number[lines]
+
+
+def refined_grid(
+    grid: Grid, behind: Grid, beam_shift: tuple[float, float], wall_x: np.ndarray, wall_y: np.ndarray
+) -> tuple[Grid, Grid, np.ndarray]:
+    """Give every pixel of a grid eight more points, of heights that walls do not join [3 y - 2, 3 x - 2].
+
+    Arguments and results as those of `with_upright_walls`, walls as from `wall_links`.
     """
     (x, y, z), (tx, ty) = grid, beam_shift
     place_x, place_y = x + tx * z, y + ty * z
-    walls = wall_links(place_x, place_y, z)
-    number = np.arange(z.size).reshape(z.shape)
-    if not any(w.any() for w in walls):
-        return grid, behind, number
-    height, is_foot = _refined_heights(z, *walls)
+    height, is_foot = _refined_heights(z, wall_x, wall_y)
     fine = _refined_places(place_x) - tx * height, _refined_places(place_y) - ty * height, height
-    owner = _inner(np.repeat(np.repeat(number, 3, 0), 3, 1))
+    owner = _inner(np.repeat(np.repeat(np.arange(z.size).reshape(z.shape), 3, 0), 3, 1))
     moved_x, moved_y, moved_z = (
         new + np.where(is_foot, (end - start).ravel()[owner], 0.0)
         for new, start, end in zip(fine, grid, behind, strict=True)
     )
     return fine, (moved_x, moved_y, moved_z), owner
+
+
+def _needed(wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:
+    """Mark the lines of points that walls need: those of the pixels, and those between rows that a wall parts
+    somewhere or along which the walls between columns are others [3 y - 2]."""
+    between = wall_y.any(1) | (wall_x[1:] != wall_x[:-1]).any(1)
+    return np.append(np.column_stack([np.ones(between.size, bool), between, between]).ravel(), True)
 
 
 def _inner(field: np.ndarray) -> np.ndarray:

@@ -209,8 +209,10 @@ class Intersector:
         return out
 
     def _set_scale(self) -> None:
-        used, center, radius = self.vertices[np.unique(self.triangles)], self.spheres[:, :3], self.spheres[:, 3:]
-        corners = np.concatenate([used, center - radius, center + radius])
+        is_used = np.zeros(len(self.vertices), bool)
+        is_used[self.triangles] = True
+        center, radius = self.spheres[:, :3], self.spheres[:, 3:]
+        corners = np.concatenate([self.vertices[is_used], center - radius, center + radius])
         low, self.high = corners.min(0), corners.max(0)
         self.center = 0.5 * (low + self.high)
         self.half_size = 0.5 * float((self.high - low).max())

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 from helio_jax.scene.surfaces import surface_body
-from helio_jax.scene.wall_grid import GAP, has_level_rims, wall_links, with_upright_walls
+from helio_jax.scene.wall_grid import GAP, has_level_rims, refined_grid, wall_links, with_upright_walls
 
 PITCH = 2.0
 SHIFT = 0.3, -0.2
@@ -13,6 +14,10 @@ Y, X = (PITCH * a for a in np.mgrid[:12, :15].astype(float))
 
 def grid(z: np.ndarray):
     return X - SHIFT[0] * z, Y - SHIFT[1] * z, z
+
+
+def refined(z: np.ndarray):
+    return refined_grid(grid(z), grid(z), SHIFT, *wall_links(X, Y, z))
 
 
 def test_without_walls_nothing_changes():
@@ -38,7 +43,7 @@ def test_walls_stand_half_way():
     Rejects a ramp from point to point: its heights are between the levels.
     """
     is_high = (X > 9.0) & (Y > 5.0)
-    fine, _, number = with_upright_walls(grid(20.0 * is_high), grid(20.0 * is_high), SHIFT)
+    fine, _, number = refined(20.0 * is_high)
     x, y, z = fine
     assert z.shape == (34, 43) and set(np.unique(z)) == {0.0, 20.0}
     assert np.array_equal(z > 0.0, is_high.ravel()[number])
@@ -53,7 +58,7 @@ def test_surface_stays_closed_and_tilted_levels_plane():
     is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
     plane = 0.2 * X - 0.1 * Y
     z = plane + 18.0 * is_high
-    fine, _, number = with_upright_walls(grid(z), grid(z), SHIFT)
+    fine, _, number = refined(z)
     x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
     off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
     assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.mean(np.abs(off) > 1e-9) < 0.03
@@ -71,7 +76,7 @@ def test_wall_that_ends():
     along_x, along_y = wall_links(X, Y, -depth)
     n_walls = along_y[:, :-1] + along_y[:, 1:].astype(int) + along_x[:-1] + along_x[1:]
     assert (n_walls == 1).any() and (n_walls == 2).any()
-    z = with_upright_walls(grid(-depth), grid(-depth), SHIFT)[0][2]
+    z = refined(-depth)[0][2]
     corners = np.stack([z[i::3, j::3] for i in (1, 2) for j in (1, 2)])
     spread = np.ptp(corners, axis=0)
     assert spread[n_walls <= 1].max() < 2.0 * GAP * depth.max() < 1.0 < spread[n_walls == 2].min()
@@ -82,10 +87,26 @@ def test_foot_of_a_hidden_side_is_moved():
     z = np.where(X > 13.0, 0.0, 20.0)
     at = grid(z)
     behind = tuple(np.where(np.isclose(X, 14.0), f - 3.0, f) for f in at)
-    fine, moved, number = with_upright_walls(at, behind, SHIFT)
+    fine, moved, number = refined_grid(at, behind, SHIFT, *wall_links(X, Y, z))
     change = np.any([a != b for a, b in zip(fine, moved, strict=True)], axis=0)
     assert change.any() and np.all(np.isclose(X.ravel()[number[change]], 14.0))
     assert not change[::3, ::3].any() and np.all(fine[0][change] - moved[0][change] == pytest.approx(3.0))
+
+
+def test_lines_that_no_wall_needs_are_left_out():
+    """A block in one corner and a bump elsewhere: far fewer points, and the same surface between them.
+
+    Rejects a line that is left out although a wall ends there, or crosses it: the wall would slant.
+    """
+    z = np.where((X > 20.0) & (Y > 13.0), 30.0, 0.5 * np.exp(-0.1 * ((X - 8.0) ** 2 + (Y - 6.0) ** 2)))
+    fine, _, _ = refined(z)
+    few, _, number = with_upright_walls(grid(z), grid(z), SHIFT)
+    assert few[2].size < 0.3 * fine[2].size and set(range(z.size)) == set(number.ravel())
+    at = np.stack([few[0] + SHIFT[0] * few[2], few[1] + SHIFT[1] * few[2]], -1)
+    line_x, line_y = at[0, :, 0], at[:, 0, 1]
+    between = RegularGridInterpolator((line_y, line_x), few[2])
+    there = between(np.stack([fine[1] + SHIFT[1] * fine[2], fine[0] + SHIFT[0] * fine[2]], -1))
+    assert np.abs(there - fine[2]).max() < 0.01
 
 
 @pytest.mark.parametrize(("tilt_deg", "is_level"), [(20.0, True), (50.0, False)])
