@@ -21,10 +21,10 @@ from helio_jax.errors import GuardError
 from helio_jax.micrograph import Calibration, MicrographStack
 from helio_jax.settings import Settings
 
-_PRIORS = {"gain_std": 0.3, "offset_std": 0.3, "max_rounds": 6}
+_PRIORS = {"gain_std": 0.3, "offset_std": 0.3}
 _DRIFT_PRIORS = {"drift_std": 0.2}
 """Priors of the fit: relative standard deviation of the gain, standard deviations of background and residual drift over
-the substrate's signal, and its iterations: with an unknown instrument heights converge more slowly."""
+the substrate's signal."""
 _KNOWN_DRIFT_STD = 0.05
 """That of the drift where the background is the campaign's."""
 _FALSE_ALARM = 1e-4

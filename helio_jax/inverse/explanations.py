@@ -23,7 +23,7 @@ from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.fit import Fit, Report, fit_heights, short_fit, without_noise_bias
+from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, short_fit, without_noise_bias
 from helio_jax.inverse.levels import GAIN, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
@@ -243,8 +243,9 @@ class _Fits:
         """Fit the heights from a surface, or one nearer to a smoothed one; `known` as in `pose`.
 
         With a free border, gains and offsets have much the same effect as tilt and relief: what the model lacks moved
-        gains of a right instrument by several per cent, and tilted the heights with them. They are then held as stated,
-        and the fit with free ones is kept only if the data demand it. The error bars include them in either case.
+        gains of a right instrument by several per cent, and tilted the heights with them. They are then held as stated;
+        only where free ones improve one solve by `GAIN` they are fitted, too, and kept if that improves the fit by it.
+        The error bars include them in either case.
         """
         problem = self.pose(surface, *known)
         if self.settings.border == "flat" or problem.is_instrument_unknown:
@@ -253,11 +254,15 @@ class _Fits:
         patches, region, anchors = (*known, None, None)[:3]
         fit = self._fit(surface, smoothed, patches, region, anchors, held)
         parameters = readout_as_stated(fit.parameters)
-        fit = replace(fit, problem=problem, parameters=parameters, state=replace(fit.state, parameters=parameters))
+        as_held, state = fit.problem, replace(fit.state, parameters=parameters)
+        fit = replace(fit, problem=problem, parameters=parameters, state=state)
         if fit.is_interrupted:
             return fit
+        after, before = (after_one_solve(posed, state) for posed in (problem, as_held))
+        if improvement(before, after) < GAIN:
+            return fit
         try:
-            free = self._fit(fit.state.surface, smoothed, *known)
+            free = self._fit(state.surface, smoothed, *known)
             return free if improvement(self.residuals(fit), self.residuals(free)) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")

@@ -36,8 +36,8 @@ GEOMETRY = "distance", "tilt", "aim"
 """Parameters that show an incomplete model where they come out farther off than stated: error bars are inflated."""
 MODEL, MIN_MODEL_RATIO = ("discrepancy",), 1.3
 """The same, apart from the few numbers of the geometry, for Birge ratios beyond chance."""
-GAINS, MIN_BIRGE_RATIO = ("log_gain", "offset"), 2.0
-"""The same, but only for Birge ratios above this one: gains usually differ by chance."""
+READOUT, MIN_BIRGE_RATIO = (("log_gain", "offset"), ("log_multiple",)), 2.0
+"""The same, each group by itself, but only for Birge ratios above this one: gains usually differ by chance."""
 
 Report = Callable[[int, int, str], None]
 """Called with (iteration, iterations in all, what is known so far)."""
@@ -149,7 +149,9 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
 def inflated(posterior: Posterior, state: FitState) -> Posterior:
     """Inflate the error bars where a state's instrument, or what the model lacks, contradicts what is stated."""
     found = posterior.inflated(state.parameters, GEOMETRY).inflated(state.parameters, MODEL, MIN_MODEL_RATIO)
-    return found.inflated(state.parameters, GAINS, MIN_BIRGE_RATIO)
+    for names in READOUT:
+        found = found.inflated(state.parameters, names, MIN_BIRGE_RATIO)
+    return found
 
 
 def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
@@ -196,6 +198,12 @@ def short_fit(problem: FitProblem, surface: Surface, predict: Predict) -> tuple[
     for _ in range(s.reweightings):
         state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
     return misfit_of(problem, state, predict), state.surface
+
+
+def after_one_solve(problem: FitProblem, state: FitState) -> np.ndarray:
+    """Compute the residuals after one solve from a state, whose corrections are held [detector, y, x]."""
+    s = problem.settings
+    return step(problem, state, s.robust_limits[-1], s.jump_limits[-1], True)[0].residuals
 
 
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:

@@ -20,7 +20,7 @@ SEARCH_THRIFT = 8
 class RefineSettings(Settings):
     """The fit of the heights: table `[reconstruct.refine]`."""
 
-    max_rounds: int = Field(default=3, ge=1, le=50)
+    max_rounds: int = Field(default=8, ge=1, le=50)
     """Outer iterations: how often masks and multiple scattering are predicted on the current surface."""
     tolerance_um: float = Field(default=1.0, gt=0.0, le=1e3)
     """The fit has converged when an outer iteration changes the heights by less than this (root mean square) [um]."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,9 @@ from helio_jax.inverse.residuals import FixedTerms, Unknowns, border_residuals, 
 
 OF_SAMPLE = "albedo", "patch"
 """Parameters that are free even while the instrument is held."""
+WEAK = 1e-6
+"""Prior weight of what all heights have in common where they are whitened; nothing else keeps a change that the data do
+not show from being infinite."""
 CG_TOLERANCE = 1e-2
 """Relative residual of the normal equations at which conjugate gradients stop."""
 
@@ -130,63 +134,86 @@ def _is_free(parameters: Parameters, is_instrument_free: Any) -> jax.Array:
     return jnp.concatenate([jnp.full(n, 1.0 if name in OF_SAMPLE else is_instrument_free) for name, n in sizes])
 
 
+class CommonHeights(eqx.Module):
+    """Changes of the surface that all heights have in common, as changes of the whitened unknowns [change, y, x].
+
+    The data tell them from gains and geometry by far less than they tell single heights: by themselves, conjugate
+    gradients would take many steps for them alone.
+    """
+
+    height: Any
+    slope_x: Any
+    slope_y: Any
+
+    def moved(self, unknowns: Unknowns, amplitude: jax.Array) -> Unknowns:
+        """Move unknowns by so much of each change [change]."""
+        return Unknowns(
+            unknowns.height + jnp.tensordot(amplitude, self.height, 1),
+            unknowns.slope_x + jnp.tensordot(amplitude, self.slope_x, 1),
+            unknowns.slope_y + jnp.tensordot(amplitude, self.slope_y, 1),
+            unknowns.parameters,
+        )
+
+
 @compiled
 def whitened_parameters(
-    start: Unknowns, fixed: FixedTerms, is_level_free: np.ndarray, is_instrument_free: np.ndarray
+    start: Unknowns, fixed: FixedTerms, common: CommonHeights, is_instrument_free: np.ndarray
 ) -> jax.Array:
-    """Compute the matrix whose columns are combinations of parameters and level, each one standard deviation apart.
+    """Compute the matrix whose columns are combinations of parameters and changes that all heights have in common.
 
-    Gains, offsets, drift, angles and the level of all heights [um], the last row, have much the same effect on the
-    data, and by far more than one pixel's height: as they are, conjugate gradients would take many steps for them
-    alone. The level takes part 1 or 0 times; a flat border holds it. So do the parameters of the instrument.
+    Moved along them, the residuals change by one standard deviation each, and in ways that are orthogonal. The last
+    rows are the amplitudes of `common`; what is 0 there does not take part, nor do held parameters of the instrument.
+
+    Source: coarse space of a two-level preconditioner: Nicolaides, SIAM J. Numer. Anal. 24 (1987) 355.
     """
     flat, restore = free_parameters(start.parameters)
 
     def misfit(values):
-        parameters = restore(values[:-1])
-        surface = surface_of(Unknowns(start.height, start.slope_x, start.slope_y, parameters), fixed)
-        raised = Surface(surface.height + is_level_free * values[-1], surface.slope_x, surface.slope_y)
-        parts = data_residuals(raised, parameters, fixed), border_residuals(raised, parameters, fixed)
+        parameters = restore(values[: flat.size])
+        moved = common.moved(Unknowns(start.height, start.slope_x, start.slope_y, parameters), values[flat.size :])
+        surface = surface_of(moved, fixed)
+        parts = data_residuals(surface, parameters, fixed), border_residuals(surface, parameters, fixed)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), 1.0)
-    jacobian = jax.jacfwd(misfit)(jnp.append(flat, 0.0)) * is_free
-    prior = jnp.ones(flat.size + 1).at[-1].add(-is_level_free)
+    takes_part = jnp.any(common.height != 0.0, (1, 2)).astype(flat.dtype)
+    is_free = jnp.concatenate([_is_free(start.parameters, is_instrument_free), takes_part])
+    jacobian = jax.jacfwd(misfit)(jnp.concatenate([flat, jnp.zeros(takes_part.size)])) * is_free
+    prior = jnp.concatenate([jnp.ones(flat.size), 1.0 - (1.0 - WEAK) * takes_part])
     factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
-    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(flat.size + 1), lower=True).T
-    return mixing.at[-1].multiply(is_level_free)
+    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(is_free.size), lower=True).T
+    return is_free[:, None] * mixing
 
 
 @compiled
 def solve(
     start: Unknowns,
     fixed: FixedTerms,
+    common: CommonHeights,
     max_steps: int,
     cg_steps: int,
     mixing: jax.Array | np.ndarray,
     is_instrument_free: np.ndarray,
 ) -> Solution:
-    """Solve from `start`; the instrument, 1 or 0 times free, and the sample's albedo move along `mixing`'s columns."""
+    """Solve from `start`; parameters and what all heights have in common move along `mixing`'s columns, too.
+
+    The instrument is 1 or 0 times free.
+    """
     flat, restore = free_parameters(start.parameters)
     lines = start.parameters.lines
     seen = jnp.sum(fixed.inverse_sigma**2, 2 - fixed.slow_axis) * fixed.priors.lines[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
-    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), is_instrument_free)
-    mixing = is_free[:, None] * mixing
-    level_mode = jnp.sqrt(fixed.border.size) / fixed.whitening[0, 0]
 
     def decoded(variables: jax.Array) -> Unknowns:
         (height, slope_x, slope_y), mixed, of_lines = split(variables)
-        moved = jnp.append(flat, 0.0) + mixing @ mixed
-        parameters = restore(moved[:-1])
+        moved = mixing @ mixed
+        parameters = restore(flat + moved[: flat.size])
         if lines.size:
             parameters = parameters.replaced(lines=lines + line_scale * of_lines)
-        height = height.at[0, 0].add(moved[-1] * level_mode)
-        return Unknowns(height, slope_x, slope_y, parameters)
+        return common.moved(Unknowns(height, slope_x, slope_y, parameters), moved[flat.size :])
 
     # one vector, for every array of a tree is compiled by itself
     fields = (start.height, start.slope_x, start.slope_y)
-    variables, split = ravel_pytree((fields, jnp.zeros(flat.size + 1), jnp.zeros_like(lines)))
+    variables, split = ravel_pytree((fields, jnp.zeros(len(mixing)), jnp.zeros_like(lines)))
 
     def misfit(v: jax.Array, args: FixedTerms) -> jax.Array:
         parts = residuals(decoded(v), args)

@@ -31,7 +31,7 @@ from helio_jax.inverse.residuals import (
     second_order_noise_bias,
     surface_of,
 )
-from helio_jax.inverse.solver import Solution, solve, whitened_parameters
+from helio_jax.inverse.solver import CommonHeights, Solution, solve, whitened_parameters
 from helio_jax.inverse.state import FitState, Held
 from helio_jax.robust import cauchy_weight
 
@@ -191,12 +191,6 @@ def freeze(
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))
     whitening = _whitening(problem.raster.shape, dx, dy, noise)
     plane = substrate_plane(state.parameters, problem.tilt_std, problem.position)
-    unknowns = Unknowns(
-        dctn(height - plane, norm="ortho") / whitening,
-        (slope_x - one_sided(np.diff(height, axis=1) / dx, along_x.joined, 1)) / scale_x,
-        (slope_y - one_sided(np.diff(height, axis=0) / dy, along_y.joined, 0)) / scale_y,
-        state.parameters,
-    )
     inverse_sigma, priors = cauchy_weight(state.residuals, limit) / held.sigma, problem.priors
     anchors = problem.all_anchors.padded(MODE_BLOCK)
     fixed = FixedTerms(
@@ -229,7 +223,19 @@ def freeze(
         slow_axis=problem.order.slow_axis,
     )
     as_array = lambda a: np.asarray(a, float)  # noqa: E731
+    unknowns = Unknowns(*_whitened(state.surface, height - plane, fixed), state.parameters)
     return jax.tree.map(as_array, unknowns), jax.tree.map(as_array, fixed)
+
+
+def _whitened(surface: Surface, height: np.ndarray, fixed: FixedTerms) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whiten heights above the substrate [y, x], um, and the slopes of a surface, or a change of both."""
+    base_x = one_sided(np.diff(surface.height, axis=1) / fixed.dx, fixed.edges.joined_x, 1)
+    base_y = one_sided(np.diff(surface.height, axis=0) / fixed.dy, fixed.edges.joined_y, 0)
+    return (
+        dctn(height, norm="ortho") / fixed.whitening,
+        np.asarray(surface.slope_x - base_x) / fixed.slope_scale_x,
+        np.asarray(surface.slope_y - base_y) / fixed.slope_scale_y,
+    )
 
 
 def _common_modes(held: Held, gain: np.ndarray) -> CommonModes:
@@ -258,19 +264,29 @@ def step(
     """Solve one weighted least-squares problem from a state; arguments as those of `freeze`."""
     s = problem.settings
     start, fixed = freeze(problem, state, limit, cut, occluded)
-    free = np.asarray(float(is_instrument_free))
+    common, free = _common_heights(problem, state, fixed), np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
         is_mixed = problem.is_instrument_unknown or problem.is_level_free or problem.priors.law is not None
         is_mixed = is_mixed or bool(problem.discrepancy_std)
         if (is_instrument_free and is_mixed) or start.parameters.patch.size:
-            mixing = whitened_parameters(start, fixed, np.asarray(float(problem.is_level_free)), free)
+            mixing = whitened_parameters(start, fixed, common, free)
         else:  # as they are, where they are held or little is unknown
             n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
-            mixing = np.diag([1.0] * n + [0.0])
+            mixing = np.diag([float(is_instrument_free)] * n + [0.0] * len(common.height))
         # the switch is an array: one compilation serves both cases
-        found = jax.tree.map(np.asarray, solve(start, fixed, s.lm_steps, s.cg_steps, mixing, free))
+        found = jax.tree.map(np.asarray, solve(start, fixed, common, s.lm_steps, s.cg_steps, mixing, free))
     residuals = (found.data - problem.data) / state.held.sigma
     return replace(state, surface=found.surface, parameters=found.parameters, residuals=residuals), found
+
+
+def _common_heights(problem: FitProblem, state: FitState, fixed: FixedTerms) -> CommonHeights:
+    """Make the changes that all heights have in common: the relief's scale; with a free level, that and tilts, too."""
+    surface, none, one = levelled(problem, state), np.zeros(problem.raster.shape), np.ones(problem.raster.shape)
+    (x, y), distance = problem.position, float(problem.optics.sample_distance)
+    level = [Surface(distance * one, none, none), Surface(x, one, none), Surface(y, none, one)]
+    changes = [surface, *(level if problem.is_level_free else ())]
+    whitened = [_whitened(change, change.height, fixed) for change in changes]
+    return CommonHeights(*(np.stack(parts) for parts in zip(*whitened, strict=True)))
 
 
 def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndarray:
