@@ -132,7 +132,7 @@ def score(member: Member, truth: np.ndarray, rec: Reconstruction) -> Case:
     out["rms_valid"] = float(np.sqrt(np.mean(relative[valid] ** 2))) if valid.any() else None
     out["rms_all"] = float(np.sqrt(np.mean(relative**2)))
     centered = truth - np.median(truth)
-    if valid.sum() > 9:
+    if valid.sum() > 9 and centered[valid].any():
         slope = np.sum((centered[valid] + error[valid]) * centered[valid]) / np.sum(centered[valid] ** 2)
         out["recovered"] = float(slope)
     if std is not None:
