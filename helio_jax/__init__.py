@@ -126,6 +126,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   low_wall            signal across a low wall that may slope
   low_steps           heights of steps whose bands are shorter than a pixel
   dash_steps          such steps as records
+  shadow_steps        steps that face away from the beam, by the glow beside them
   step_records        records of steps, bands and patches
   measured_steps      what measured steps are for a fit: walls between pixels, known levels and differences of heights
   parameters          unknowns of the fit that are not the surface, their priors, what they stand for

@@ -24,7 +24,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, short_fit, without_noise_bias
-from helio_jax.inverse.levels import GAIN, covered, search_levels
+from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.measured_steps import labelled, level_anchors, measured_regions, walls_of
@@ -35,6 +35,7 @@ from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square, squares
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.shadow_steps import find_shadow_step
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
@@ -150,6 +151,14 @@ class _Fits:
             return find_steps(self.stack)
         except SceneError:
             return None
+
+    @cached_property
+    def shadowed(self) -> list[Region]:
+        """The upper side of a step that faces away from the beam, which no mask band shows: with a free border only."""
+        if self.settings.border == "flat":
+            return []
+        upper = find_shadow_step(*signal_of(self.stack), Raster.of(self.stack), self.stack.instrument.beam_shift)
+        return [] if upper is None else [Region(upper)]
 
     @cached_property
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
@@ -313,7 +322,7 @@ class _Fits:
         start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
-        if steps := measured_regions(self.steps):
+        if steps := measured_regions(self.steps) or self.shadowed:
             raster = Raster.of(self.stack)
             try:
                 found = search_levels(

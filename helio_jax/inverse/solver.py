@@ -181,7 +181,7 @@ def whitened_parameters(
     prior = jnp.concatenate([jnp.ones(flat.size), 1.0 - (1.0 - WEAK) * takes_part])
     factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
     mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(is_free.size), lower=True).T
-    return is_free[:, None] * mixing
+    return mixing.at[flat.size :].multiply(takes_part[:, None])
 
 
 @compiled
@@ -202,6 +202,8 @@ def solve(
     lines = start.parameters.lines
     seen = jnp.sum(fixed.inverse_sigma**2, 2 - fixed.slow_axis) * fixed.priors.lines[:, None] ** 2
     line_scale = is_instrument_free / jnp.sqrt(1.0 + seen)
+    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), jnp.ones(len(common.height)))
+    mixing = is_free[:, None] * mixing
 
     def decoded(variables: jax.Array) -> Unknowns:
         (height, slope_x, slope_y), mixed, of_lines = split(variables)

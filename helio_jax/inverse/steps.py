@@ -272,7 +272,7 @@ def step(
             mixing = whitened_parameters(start, fixed, common, free)
         else:  # as they are, where they are held or little is unknown
             n = sum(getattr(start.parameters, name).size for name in start.parameters.free())
-            mixing = np.diag([float(is_instrument_free)] * n + [0.0] * len(common.height))
+            mixing = np.diag([1.0] * n + [0.0] * len(common.height))
         # the switch is an array: one compilation serves both cases
         found = jax.tree.map(np.asarray, solve(start, fixed, common, s.lm_steps, s.cg_steps, mixing, free))
     residuals = (found.data - problem.data) / state.held.sigma

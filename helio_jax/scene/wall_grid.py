@@ -34,7 +34,8 @@ def wall_links(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray,
     """
     found = []
     for place, heights in ((x, z), (y.T, z.T)):
-        slope = np.pad(np.abs(np.diff(heights, axis=1)) / np.diff(place, axis=1), ((0, 0), (1, 1)))
+        with np.errstate(divide="ignore", invalid="ignore"):  # points that coincide: no wall
+            slope = np.pad(np.abs(np.diff(heights, axis=1)) / np.diff(place, axis=1), ((0, 0), (1, 1)))
         jump = slope[:, 1:-1] - np.maximum(slope[:, :-2], slope[:, 2:])
         found.append((jump > LEAST_JUMP) | (slope[:, 1:-1] > WALL_PITCHES))
     return found[0], found[1].T
