@@ -17,9 +17,14 @@ MIN_JUMP = 0.03
 """Least jump of a signal at the line, in its median."""
 SIGNIFICANT = 100.0
 """Least chi-square of the jumps of all detectors. By chance the best of 20 000 lines has 25 with three detectors."""
+UNIQUE, APART = 4.0, 4.0
+"""So many times as large must it be as on any parallel line farther than this [pixels]: waves have many crests."""
+NEAR, LEAST_NEAR = (1.5, 4.5), 0.12
+"""Pixels so far from a line [pixels] still differ by at least this share of the jump: dashes of low steps and crests of
+short waves are narrower."""
 FAR, MOST_FAR = (8.0, 14.0), 0.85
-"""Pixels so far from a line on both sides [pixels] differ by at most this share of the jump: of two facets that meet in
-a crease they differ by all of it."""
+"""Pixels so far from a line on both sides differ by at most this share of the jump: of two facets that meet in a crease
+they differ by all of it."""
 QUARTERS, MIN_SHARE = 4, 0.4
 """The jump is in all parts of a line: in each of so many at least this share of the mean one."""
 MIN_LENGTH = 0.5
@@ -38,12 +43,14 @@ _NEAR, _NEXT = 1.5, -0.5
 
 class _Line(NamedTuple):
     """A line tried: the angle of its normal [rad]; its distance from the middle of the image along that [pixels]; and
-    the jump of every detector's signal there, along the normal, with its variance [detector]."""
+    the jump of every detector's signal there, along the normal, with its variance [detector]; and the largest
+    chi-square of the lines parallel to it."""
 
     angle: float
     offset: float
     jump: np.ndarray
     variance: np.ndarray
+    rival: float
 
     @property
     def normal(self) -> np.ndarray:
@@ -82,8 +89,8 @@ def find_shadow_step(
         return max((_best_line(share, spread, place, angle) for angle in angles), key=lambda line: line.chi_square)
 
     best = best_of(best_of(way + _ANGLES).angle + _FINER)
-    is_step = best.chi_square > SIGNIFICANT and best.jump.max() > MIN_JUMP
-    if not is_step or _is_crease(best, share, place) or not _is_through(best, share, spread, place):
+    is_step = best.chi_square > max(SIGNIFICANT, UNIQUE * best.rival) and best.jump.max() > MIN_JUMP
+    if not is_step or not _is_glow(best, share, place) or not _is_through(best, share, spread, place):
         return None
     return place @ best.normal < best.offset
 
@@ -97,8 +104,10 @@ def _with_relief(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def _best_line(share: np.ndarray, spread: np.ndarray, place: np.ndarray, angle: float) -> _Line:
     """Find the line of a direction at which the signals jump most; arguments as those of `_jumps`."""
     offset, jump, variance = _jumps(share, spread, place @ np.array([np.cos(angle), np.sin(angle)]))
-    i = int(np.argmax(np.sum(jump**2 / variance, axis=0)))
-    return _Line(angle, float(offset[i]), jump[:, i], variance[:, i])
+    chi_square = np.sum(jump**2 / variance, axis=0)
+    i = int(np.argmax(chi_square))
+    rival = np.max(chi_square, where=np.abs(offset - offset[i]) > APART, initial=0.0)
+    return _Line(angle, float(offset[i]), jump[:, i], variance[:, i], float(rival))
 
 
 def _jumps(share: np.ndarray, spread: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -131,15 +140,20 @@ def _jumps(share: np.ndarray, spread: np.ndarray, u: np.ndarray) -> tuple[np.nda
     return low + first / _SHIFT, np.where(is_known, jump, 0.0), np.where(is_known, of_jump, np.inf)
 
 
-def _is_crease(line: _Line, share: np.ndarray, place: np.ndarray) -> bool:
-    """Decide whether the jump at a line is that of two facets; not if too little is seen beside it."""
-    u = place @ line.normal - line.offset
-    beyond, before = ((way * u > FAR[0]) & (way * u < FAR[1]) for way in (1.0, -1.0))
-    if not beyond.any() or not before.any():
-        return False
-    weight = line.jump / line.variance
-    far = np.nanmean(share[:, beyond], axis=1) - np.nanmean(share[:, before], axis=1)
-    return bool(weight @ far > MOST_FAR * (weight @ line.jump))
+def _is_glow(line: _Line, share: np.ndarray, place: np.ndarray) -> bool:
+    """Decide whether signals level off from the jump at a line as glow does: neither at once nor not at all."""
+    u, weight = place @ line.normal - line.offset, line.jump / line.variance
+
+    def still(low: float, high: float) -> float | None:
+        """Return the difference of strips on both sides, in that of the jump; None where one is beyond the image."""
+        beyond, before = (np.isfinite(share).all(0) & (way * u > low) & (way * u < high) for way in (1.0, -1.0))
+        if not beyond.any() or not before.any():
+            return None
+        change = share[:, beyond].mean(1) - share[:, before].mean(1)
+        return float(weight @ change / (weight @ line.jump))
+
+    near, far = still(*NEAR), still(*FAR)
+    return near is not None and near > LEAST_NEAR and (far is None or far < MOST_FAR)
 
 
 def _is_through(line: _Line, share: np.ndarray, spread: np.ndarray, place: np.ndarray) -> bool:

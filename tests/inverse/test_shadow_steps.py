@@ -49,13 +49,18 @@ def test_a_partial_mask_in_one_detector_does_not_hide_it():
 
 
 def test_what_is_no_step():
-    """A crease, a valley of slopes, rough relief, a step that ends half-way, one that faces the beam."""
+    """A crease, a valley of slopes, rough relief, short waves, dashes, a step that ends half-way, one that faces the
+    beam."""
     u = beyond(23.0, -3.0)
     tilts = np.array([0.25, -0.2, 0.1])[:, None, None]
     assert drawn(1.0 + tilts * (u > 0.0)) is None
     assert drawn(1.0 + 0.02 * tilts * np.abs(u)) is None
     relief = np.random.default_rng(3).normal(size=(N, N)) * 0.15
     assert drawn(1.0 + tilts / 0.25 * relief) is None
+    assert drawn(1.0 + 0.15 * tilts * np.sin(2.6 * u)) is None
+    waves = np.sin(2.6 * PLACE[..., 0]) + np.sin(2.5 * PLACE[..., 1])
+    assert drawn(1.0 + 0.3 * tilts * waves) is None
+    assert drawn(1.0 + tilts * ((u > 0.0) & (u < 1.0))) is None
     assert drawn(np.where(PLACE[..., 1] > 0.0, glow(u), 1.0)) is None
     assert drawn(glow(beyond(180.0, 4.0))) is None
 
