@@ -359,9 +359,9 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
     bias = second_order_noise_bias(
         surface, factors.terms[0], optics, None, inverse_sigma, NOISY * noise * steepness(*slopes)
     )
-    of_median = "offset", "drift", "discrepancy", "lines"
-    change = s.offset_std * median / f.priors.offset
-    priors = replace(f.priors, **{name: change * getattr(f.priors, name) for name in of_median})
+    of_median = "offset", "drift", "discrepancy", "lines"  # stated as shares of the median signal
+    ratio = median / (f.priors.offset / s.offset_std)
+    priors = replace(f.priors, **{name: ratio * getattr(f.priors, name) for name in of_median})
     fixed = replace(
         f,
         inverse_sigma=inverse_sigma,

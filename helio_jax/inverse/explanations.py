@@ -1,6 +1,7 @@
 """Competing explanations of one stack's micrographs, each fitted; the one that explains them best is kept.
 
-The first is the photometric solution, with regions at the levels of the steps that mask bands show. Where the data
+The first is the photometric solution, with regions at the levels of the steps that mask bands show; where none do and
+the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data
 contradict its fit, objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can
 explain nearly any images: there, patches are tried first. With a flat border they are also tried where the fit moves
 the instrument far beyond what is stated (`is_strained`). A level that explains the images about as well as the one that
@@ -154,7 +155,7 @@ class _Fits:
 
     @cached_property
     def shadowed(self) -> list[Region]:
-        """The upper side of a step that faces away from the beam, which no mask band shows: with a free border only."""
+        """The upper side of a step in the beam's shadow, which no mask band shows: with a free border only."""
         if self.settings.border == "flat":
             return []
         upper = find_shadow_step(*signal_of(self.stack), Raster.of(self.stack), self.stack.instrument.beam_shift)
@@ -227,7 +228,10 @@ class _Fits:
         return expected_chi_square(self.stack, self.stack.instrument, chi_square)
 
     def contradicted(self, residuals: np.ndarray, right: float) -> float:
-        """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit; `right`: see above."""
+        """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit.
+
+        `right`: chi-square of a right fit (`right_chi_square`).
+        """
         return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT * right))
 
     @property
@@ -318,7 +322,7 @@ class _Fits:
         return self.start(AlbedoPatches.none(self.stack.shape[1:]))
 
     def from_steps(self, patches: AlbedoPatches) -> Explanation:
-        """Fit from the photometric solution, with regions at the levels of the steps that are measured."""
+        """Fit from the photometric solution, with regions at the levels of steps, measured or in the beam's shadow."""
         start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None

@@ -32,12 +32,14 @@ from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
-GEOMETRY = "distance", "tilt", "aim"
-"""Parameters that show an incomplete model where they come out farther off than stated: error bars are inflated."""
-MODEL, MIN_MODEL_RATIO = ("discrepancy",), 1.3
-"""The same, apart from the few numbers of the geometry, for Birge ratios beyond chance."""
-READOUT, MIN_BIRGE_RATIO = (("log_gain", "offset"), ("log_multiple",)), 2.0
-"""The same, each group by itself, but only for Birge ratios above this one: gains usually differ by chance."""
+INFLATING = (
+    (("distance", "tilt", "aim"), 1.0),
+    (("discrepancy",), 1.3),
+    (("log_gain", "offset"), 2.0),
+    (("log_multiple",), 2.0),
+)
+"""Parameters that show an incomplete model where they come out farther off than stated, and the Birge ratio above which
+they inflate the error bars: that of modes, gains and multiple scattering is often larger than 1 by chance."""
 
 Report = Callable[[int, int, str], None]
 """Called with (iteration, iterations in all, what is known so far)."""
@@ -148,10 +150,9 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
 
 def inflated(posterior: Posterior, state: FitState) -> Posterior:
     """Inflate the error bars where a state's instrument, or what the model lacks, contradicts what is stated."""
-    found = posterior.inflated(state.parameters, GEOMETRY).inflated(state.parameters, MODEL, MIN_MODEL_RATIO)
-    for names in READOUT:
-        found = found.inflated(state.parameters, names, MIN_BIRGE_RATIO)
-    return found
+    for names, min_ratio in INFLATING:
+        posterior = posterior.inflated(state.parameters, names, min_ratio)
+    return posterior
 
 
 def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:

@@ -155,15 +155,15 @@ def relief_responses(
 
 def _relief_changes(surface: Surface, raster: Raster, has_enough_images: np.ndarray, distance: float) -> list[Surface]:
     """Make the changes of a relief that keep its shape: lower, flatter, tilted about y, tilted about x."""
-    none = np.zeros(has_enough_images.shape)
     mean = np.mean(surface.height[has_enough_images])
-    x, y = raster.centred_positions()
-    return [
-        Surface(none - distance, none, none),
-        Surface(mean - surface.height, -surface.slope_x, -surface.slope_y),
-        Surface(x, none + 1.0, none),
-        Surface(y, none, none + 1.0),
-    ]
+    lower, *tilts = plane_changes(raster, distance)
+    return [lower, Surface(mean - surface.height, -surface.slope_x, -surface.slope_y), *tilts]
+
+
+def plane_changes(raster: Raster, distance: float) -> list[Surface]:
+    """Make the changes of all heights by a plane: lower by `distance` [um], tilted about y, tilted about x."""
+    none, (x, y) = np.zeros(raster.shape), raster.centred_positions()
+    return [Surface(none - distance, none, none), Surface(x, none + 1.0, none), Surface(y, none, none + 1.0)]
 
 
 def _vertical_change(surface: Surface, change: Surface, shift: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Steps that face away from an oblique beam: straight lines through the image beside which the lower ground is bright.
 
 The beam jumps over the ground in the wall's shadow, so that no detector's mask is seen: there is no band to measure.
-But the ground next to the shadow is brighter than the upper edge by what the wall scatters on it, and some detectors
-see a part of their penumbrae there. The line tells where the step is; its height is for the search of levels (`levels`)
-and the fit to find.
+But multiple scattering from the wall makes the ground next to the shadow brighter than the upper edge (its *glow*), and
+the penumbra of a detector's mask may reach beyond the shadow. The line tells where the step is; its height is for the
+search of levels (`levels`) and the fit to find.
 """
 
 from itertools import pairwise
@@ -11,54 +11,60 @@ from typing import NamedTuple
 
 import numpy as np
 
+from helio_jax.arrays import robust_std
 from helio_jax.forward.optics import Raster
+from helio_jax.inverse.dash_lines import Line
 
 MIN_JUMP = 0.03
 """Least jump of a signal at the line, in its median."""
 SIGNIFICANT = 100.0
 """Least chi-square of the jumps of all detectors. By chance the best of 20 000 lines has 25 with three detectors."""
 UNIQUE, APART = 4.0, 4.0
-"""So many times as large must it be as on any parallel line farther than this [pixels]: waves have many crests."""
+"""Least ratio of its chi-square to that of any parallel line farther off than this [pixels]: waves have many crests."""
 NEAR, LEAST_NEAR = (1.5, 4.5), 0.12
-"""Pixels so far from a line [pixels] still differ by at least this share of the jump: dashes of low steps and crests of
-short waves are narrower."""
+"""So far from a line [pixels] both sides still differ by at least this share of the jump: dashes of low steps and
+crests of short waves are narrower."""
 FAR, MOST_FAR = (8.0, 14.0), 0.85
-"""Pixels so far from a line on both sides differ by at most this share of the jump: of two facets that meet in a crease
+"""So far from a line [pixels] both sides differ by at most this share of the jump: at a crease, where two facets meet,
 they differ by all of it."""
 QUARTERS, MIN_SHARE = 4, 0.4
-"""The jump is in all parts of a line: in each of so many at least this share of the mean one."""
+"""In each of so many parts of a line the jump is at least this share of the mean one."""
 MIN_LENGTH = 0.5
-"""Least length of a line, in the image's shorter side."""
+"""Least length of a line, as a share of the image's shorter side."""
+LEAST_SIDE = 8.0
+"""Smaller images do not show how glow levels off [pixels]."""
 _SHIFT = 4
 """Lines are tried so many times per pixel ..."""
 _ANGLES = np.radians(np.arange(-84.0, 84.5, 1.0))
 """... and at these angles between their normal and the way of the beam, which is far from parallel to them ..."""
 _FINER = np.radians(np.arange(-1.0, 1.01, 0.2))
 """... and at these ones about the best."""
-_MEDIAN_SQUARE = 0.455
-"""Median square of a normal deviate of variance 1."""
 _NEAR, _NEXT = 1.5, -0.5
 """Weights of the means over the first and the second pixel beside a line: the signal at it, extrapolated."""
 
 
-class _Line(NamedTuple):
-    """A line tried: the angle of its normal [rad]; its distance from the middle of the image along that [pixels]; and
-    the jump of every detector's signal there, along the normal, with its variance [detector]; and the largest
-    chi-square of the lines parallel to it."""
+class _Jump(NamedTuple):
+    """Jump of the signals at a line that was tried.
 
-    angle: float
-    offset: float
-    jump: np.ndarray
+    Attributes:
+        line: through the whole image.
+        size, variance: of the jump along the line's normal, in the median signal [detector].
+        rival: largest chi-square of the lines parallel to it.
+    """
+
+    line: Line
+    size: np.ndarray
     variance: np.ndarray
     rival: float
 
     @property
-    def normal(self) -> np.ndarray:
-        return np.array([np.cos(self.angle), np.sin(self.angle)])
-
-    @property
     def chi_square(self) -> float:
-        return float(np.sum(self.jump**2 / self.variance))
+        return float(np.sum(self.size**2 / self.variance))
+
+    def projected(self, change: np.ndarray) -> np.ndarray:
+        """Project changes of the signals [detector, ...] on the jump: 1 for the jump itself."""
+        weight = self.size / self.variance
+        return np.tensordot(weight, change, 1) / (weight @ self.size)
 
 
 def find_shadow_step(
@@ -77,37 +83,45 @@ def find_shadow_step(
 
     Source: own derivation; signals on both sides are extrapolated to the line, so that slopes of them are no jump.
     """
-    if not any(beam_shift):
+    is_live = np.isfinite(signal).any((1, 2))
+    if not any(beam_shift) or not is_live.any():
         return None
+    signal, variance = signal[is_live], variance[is_live]
     unit = np.nanmedian(signal, axis=(1, 2))[:, None, None]
     share, spread = signal / unit, _with_relief(signal, variance) / unit**2
     side = np.sqrt(float(raster.dx) * float(raster.dy))
     place = np.moveaxis(np.asarray(raster.centred_positions()), 0, -1) / side
+    if np.ptp(place, axis=(0, 1)).min() < LEAST_SIDE:
+        return None
     way = float(np.arctan2(beam_shift[1], beam_shift[0]))
 
-    def best_of(angles: np.ndarray) -> _Line:
-        return max((_best_line(share, spread, place, angle) for angle in angles), key=lambda line: line.chi_square)
+    def best_of(angles: np.ndarray) -> _Jump:
+        return max((_largest_jump(share, spread, place, angle) for angle in angles), key=lambda jump: jump.chi_square)
 
-    best = best_of(best_of(way + _ANGLES).angle + _FINER)
-    is_step = best.chi_square > max(SIGNIFICANT, UNIQUE * best.rival) and best.jump.max() > MIN_JUMP
+    best = best_of(best_of(way + _ANGLES).line.angle + _FINER)
+    is_step = best.chi_square > max(SIGNIFICANT, UNIQUE * best.rival) and best.size.max() > MIN_JUMP
     if not is_step or not _is_glow(best, share, place) or not _is_through(best, share, spread, place):
         return None
-    return place @ best.normal < best.offset
+    return place @ best.line.normal < best.line.offset
 
 
 def _with_relief(signal: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Enlarge the variance of signals to the one that neighbours differ by: relief is no step [detector, y, x]."""
-    change = np.nanmedian(np.diff(signal, axis=2) ** 2, axis=(1, 2)) / (2.0 * _MEDIAN_SQUARE)
-    return variance * np.maximum(change / np.nanmedian(variance, axis=(1, 2)), 1.0)[:, None, None]
+    change = 0.5 * robust_std(np.diff(signal, axis=2), (1, 2)) ** 2
+    return variance * np.maximum(change / np.nanmedian(variance, axis=(1, 2), keepdims=True), 1.0)
 
 
-def _best_line(share: np.ndarray, spread: np.ndarray, place: np.ndarray, angle: float) -> _Line:
+def _largest_jump(share: np.ndarray, spread: np.ndarray, place: np.ndarray, angle: float) -> _Jump:
     """Find the line of a direction at which the signals jump most; arguments as those of `_jumps`."""
-    offset, jump, variance = _jumps(share, spread, place @ np.array([np.cos(angle), np.sin(angle)]))
+    line = Line(float(angle), 0.0, 0.0, 0.0)
+    u, w = place @ line.normal, place @ line.along
+    offset, jump, variance = _jumps(share, spread, u)
     chi_square = np.sum(jump**2 / variance, axis=0)
     i = int(np.argmax(chi_square))
     rival = np.max(chi_square, where=np.abs(offset - offset[i]) > APART, initial=0.0)
-    return _Line(angle, float(offset[i]), jump[:, i], variance[:, i], float(rival))
+    along = w[np.abs(u - offset[i]) < 1.0]
+    line = line._replace(offset=float(offset[i]), start=float(along.min()), end=float(along.max()))
+    return _Jump(line, jump[:, i], variance[:, i], float(rival))
 
 
 def _jumps(share: np.ndarray, spread: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -134,41 +148,37 @@ def _jumps(share: np.ndarray, spread: np.ndarray, u: np.ndarray) -> tuple[np.nda
         mean, variance = total / count, noise / count**2
     first = np.arange(2 * _SHIFT, mean.shape[-1] - _SHIFT)
     strips = (first, _NEAR), (first + _SHIFT, _NEXT), (first - _SHIFT, -_NEAR), (first - 2 * _SHIFT, -_NEXT)
-    jump = sum((weight * mean[:, at] for at, weight in strips), np.zeros(1))
-    of_jump = sum((weight**2 * variance[:, at] for at, weight in strips), np.zeros(1))
+    jump = np.sum([weight * mean[:, at] for at, weight in strips], axis=0)
+    of_jump = np.sum([weight**2 * variance[:, at] for at, weight in strips], axis=0)
     is_known = np.isfinite(jump) & (of_jump > 0.0)
     return low + first / _SHIFT, np.where(is_known, jump, 0.0), np.where(is_known, of_jump, np.inf)
 
 
-def _is_glow(line: _Line, share: np.ndarray, place: np.ndarray) -> bool:
-    """Decide whether signals level off from the jump at a line as glow does: neither at once nor not at all."""
-    u, weight = place @ line.normal - line.offset, line.jump / line.variance
+def _is_glow(jump: _Jump, share: np.ndarray, place: np.ndarray) -> bool:
+    """Decide whether signals level off beyond a line as glow does: neither at once nor not at all."""
+    u = place @ jump.line.normal - jump.line.offset
 
-    def still(low: float, high: float) -> float | None:
-        """Return the difference of strips on both sides, in that of the jump; None where one is beyond the image."""
-        beyond, before = (np.isfinite(share).all(0) & (way * u > low) & (way * u < high) for way in (1.0, -1.0))
+    def left(low: float, high: float) -> float | None:
+        """Return the share of the jump that is left between strips on both sides; None where one is not observed."""
+        beyond, before = (np.isfinite(share).all(0) & (sign * u > low) & (sign * u < high) for sign in (1.0, -1.0))
         if not beyond.any() or not before.any():
             return None
-        change = share[:, beyond].mean(1) - share[:, before].mean(1)
-        return float(weight @ change / (weight @ line.jump))
+        return float(jump.projected(share[:, beyond].mean(1) - share[:, before].mean(1)))
 
-    near, far = still(*NEAR), still(*FAR)
+    near, far = left(*NEAR), left(*FAR)
     return near is not None and near > LEAST_NEAR and (far is None or far < MOST_FAR)
 
 
-def _is_through(line: _Line, share: np.ndarray, spread: np.ndarray, place: np.ndarray) -> bool:
-    """Decide whether the jump is in all parts of a line."""
-    u, w = place @ line.normal, place @ np.array([-line.normal[1], line.normal[0]])
-    beside = np.abs(u - line.offset) < 1.0
-    if np.ptp(w[beside]) < MIN_LENGTH * min(u.shape):
+def _is_through(jump: _Jump, share: np.ndarray, spread: np.ndarray, place: np.ndarray) -> bool:
+    """Decide whether a line is long enough, and the jump in all parts of it."""
+    line = jump.line
+    if line.end - line.start < MIN_LENGTH * min(place.shape[:2]):
         return False
-    ends = np.linspace(w[beside].min(), w[beside].max(), QUARTERS + 1)
-    weight = line.jump / line.variance
-    for start, end in pairwise(ends):
-        part = (w >= start) & (w <= end) & (np.abs(u - line.offset) < 4.0)
-        offset, jump, variance = _jumps(share[:, part][:, None], spread[:, part][:, None], u[part][None])
-        here = np.abs(offset - line.offset) <= 0.5
-        seen = here & np.all(np.isfinite(variance), axis=0)
-        if not seen.any() or (weight @ jump[:, seen]).max() < MIN_SHARE * float(weight @ line.jump):
+    u, w = place @ line.normal - line.offset, place @ line.along
+    for start, end in pairwise(np.linspace(line.start, line.end, QUARTERS + 1)):
+        part = (w >= start) & (w <= end) & (np.abs(u) < 4.0)
+        offset, change, variance = _jumps(share[:, part][:, None], spread[:, part][:, None], u[part][None])
+        seen = (np.abs(offset) <= 0.5) & np.all(np.isfinite(variance), axis=0)
+        if not seen.any() or jump.projected(change[:, seen]).max() < MIN_SHARE:
             return False
     return True

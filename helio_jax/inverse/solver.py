@@ -18,8 +18,8 @@ from helio_jax.inverse.residuals import FixedTerms, Unknowns, border_residuals, 
 OF_SAMPLE = "albedo", "patch"
 """Parameters that are free even while the instrument is held."""
 WEAK = 1e-6
-"""Prior weight of what all heights have in common where they are whitened; nothing else keeps a change that the data do
-not show from being infinite."""
+"""Prior weight of common changes of the heights where they are whitened, or one that the data do not show would be
+infinite. A part of the preconditioner, not of the solution."""
 CG_TOLERANCE = 1e-2
 """Relative residual of the normal equations at which conjugate gradients stop."""
 
@@ -137,8 +137,8 @@ def _is_free(parameters: Parameters, is_instrument_free: Any) -> jax.Array:
 class CommonHeights(eqx.Module):
     """Changes of the surface that all heights have in common, as changes of the whitened unknowns [change, y, x].
 
-    The data tell them from gains and geometry by far less than they tell single heights: by themselves, conjugate
-    gradients would take many steps for them alone.
+    They are nearly degenerate with gains and geometry. By single heights alone, conjugate gradients would take many
+    steps for them.
     """
 
     height: Any
@@ -146,7 +146,7 @@ class CommonHeights(eqx.Module):
     slope_y: Any
 
     def moved(self, unknowns: Unknowns, amplitude: jax.Array) -> Unknowns:
-        """Move unknowns by so much of each change [change]."""
+        """Move unknowns by amplitudes [change] of the changes."""
         return Unknowns(
             unknowns.height + jnp.tensordot(amplitude, self.height, 1),
             unknowns.slope_x + jnp.tensordot(amplitude, self.slope_x, 1),
@@ -162,7 +162,7 @@ def whitened_parameters(
     """Compute the matrix whose columns are combinations of parameters and changes that all heights have in common.
 
     Moved along them, the residuals change by one standard deviation each, and in ways that are orthogonal. The last
-    rows are the amplitudes of `common`; what is 0 there does not take part, nor do held parameters of the instrument.
+    rows are the amplitudes of `common`. Held parameters of the instrument do not take part.
 
     Source: coarse space of a two-level preconditioner: Nicolaides, SIAM J. Numer. Anal. 24 (1987) 355.
     """
@@ -175,13 +175,12 @@ def whitened_parameters(
         parts = data_residuals(surface, parameters, fixed), border_residuals(surface, parameters, fixed)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    takes_part = jnp.any(common.height != 0.0, (1, 2)).astype(flat.dtype)
-    is_free = jnp.concatenate([_is_free(start.parameters, is_instrument_free), takes_part])
-    jacobian = jax.jacfwd(misfit)(jnp.concatenate([flat, jnp.zeros(takes_part.size)])) * is_free
-    prior = jnp.concatenate([jnp.ones(flat.size), 1.0 - (1.0 - WEAK) * takes_part])
+    n_common = len(common.height)
+    is_free = jnp.append(_is_free(start.parameters, is_instrument_free), jnp.ones(n_common))
+    jacobian = jax.jacfwd(misfit)(jnp.append(flat, jnp.zeros(n_common))) * is_free
+    prior = jnp.append(jnp.ones(flat.size), jnp.full(n_common, WEAK))
     factor = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.diag(prior))
-    mixing = jax.scipy.linalg.solve_triangular(factor, jnp.eye(is_free.size), lower=True).T
-    return mixing.at[flat.size :].multiply(takes_part[:, None])
+    return jax.scipy.linalg.solve_triangular(factor, jnp.eye(is_free.size), lower=True).T
 
 
 @compiled

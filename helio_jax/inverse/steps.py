@@ -31,6 +31,7 @@ from helio_jax.inverse.residuals import (
     second_order_noise_bias,
     surface_of,
 )
+from helio_jax.inverse.responses import plane_changes
 from helio_jax.inverse.solver import CommonHeights, Solution, solve, whitened_parameters
 from helio_jax.inverse.state import FitState, Held
 from helio_jax.robust import cauchy_weight
@@ -266,8 +267,12 @@ def step(
     start, fixed = freeze(problem, state, limit, cut, occluded)
     common, free = _common_heights(problem, state, fixed), np.asarray(float(is_instrument_free))
     with jax.enable_x64(True):
-        is_mixed = problem.is_instrument_unknown or problem.is_level_free or problem.priors.law is not None
-        is_mixed = is_mixed or bool(problem.discrepancy_std)
+        is_mixed = (
+            problem.is_instrument_unknown
+            or problem.is_level_free
+            or problem.priors.law is not None
+            or problem.discrepancy_std > 0.0
+        )
         if (is_instrument_free and is_mixed) or start.parameters.patch.size:
             mixing = whitened_parameters(start, fixed, common, free)
         else:  # as they are, where they are held or little is unknown
@@ -281,10 +286,9 @@ def step(
 
 def _common_heights(problem: FitProblem, state: FitState, fixed: FixedTerms) -> CommonHeights:
     """Make the changes that all heights have in common: the relief's scale; with a free level, that and tilts, too."""
-    surface, none, one = levelled(problem, state), np.zeros(problem.raster.shape), np.ones(problem.raster.shape)
-    (x, y), distance = problem.position, float(problem.optics.sample_distance)
-    level = [Surface(distance * one, none, none), Surface(x, one, none), Surface(y, none, one)]
-    changes = [surface, *(level if problem.is_level_free else ())]
+    changes = [levelled(problem, state)]
+    if problem.is_level_free:
+        changes += plane_changes(problem.raster, float(problem.optics.sample_distance))
     whitened = [_whitened(change, change.height, fixed) for change in changes]
     return CommonHeights(*(np.stack(parts) for parts in zip(*whitened, strict=True)))
 

@@ -72,8 +72,8 @@ def with_upright_walls(grid: Grid, behind: Grid, beam_shift: tuple[float, float]
         beam_shift: `Instrument.beam_shift` of the grid.
 
     Returns:
-        Both refined (`refined_grid`), without lines of points between rows or columns that are joined alike; and the
-        number of the pixel to which every point belongs. Without walls: the grids as they are.
+        Both refined (`refined_grid`), without the lines of points that no wall needs; and the number of the pixel to
+        which every point belongs. Without walls: the grids as they are.
     """
     x, y, z = grid
     walls = wall_links(x + beam_shift[0] * z, y + beam_shift[1] * z, z)
@@ -105,8 +105,11 @@ def refined_grid(
 
 
 def _needed(wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:
-    """Mark the lines of points that walls need: those of the pixels, and those between rows that a wall parts
-    somewhere or along which the walls between columns are others [3 y - 2]."""
+    """Mark the rows of points that walls need [3 y - 2].
+
+    Those of the pixels, and those between two rows of pixels that a wall parts somewhere, or whose walls between
+    columns differ.
+    """
     between = wall_y.any(1) | (wall_x[1:] != wall_x[:-1]).any(1)
     return np.append(np.column_stack([np.ones(between.size, bool), between, between]).ravel(), True)
 

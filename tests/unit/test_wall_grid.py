@@ -17,7 +17,13 @@ def grid(z: np.ndarray):
 
 
 def refined(z: np.ndarray):
+    """Refine heights with all points."""
     return refined_grid(grid(z), grid(z), SHIFT, *wall_links(X, Y, z))
+
+
+def used(z: np.ndarray):
+    """Refine heights as predictions use them, without the lines that no wall needs."""
+    return with_upright_walls(grid(z), grid(z), SHIFT)
 
 
 def test_without_walls_nothing_changes():
@@ -43,13 +49,14 @@ def test_walls_stand_half_way():
     Rejects a ramp from point to point: its heights are between the levels.
     """
     is_high = (X > 9.0) & (Y > 5.0)
-    fine, _, number = refined(20.0 * is_high)
-    x, y, z = fine
-    assert z.shape == (34, 43) and set(np.unique(z)) == {0.0, 20.0}
-    assert np.array_equal(z > 0.0, is_high.ravel()[number])
-    on_raster = x + SHIFT[0] * z, y + SHIFT[1] * z
-    assert on_raster[0][z > 0].min() == pytest.approx(9.0, abs=2.0 * GAP * PITCH)
-    assert on_raster[1][z > 0].min() == pytest.approx(5.0, abs=2.0 * GAP * PITCH)
+    for refine in (used, refined):
+        (x, y, z), _, number = refine(20.0 * is_high)
+        assert set(np.unique(z)) == {0.0, 20.0}
+        assert np.array_equal(z > 0.0, is_high.ravel()[number])
+        on_raster = x + SHIFT[0] * z, y + SHIFT[1] * z
+        assert on_raster[0][z > 0].min() == pytest.approx(9.0, abs=2.0 * GAP * PITCH)
+        assert on_raster[1][z > 0].min() == pytest.approx(5.0, abs=2.0 * GAP * PITCH)
+    assert z.shape == (34, 43)
     assert np.array_equal(z[::3, ::3], 20.0 * is_high)
 
 
@@ -58,13 +65,14 @@ def test_surface_stays_closed_and_tilted_levels_plane():
     is_high = np.abs(np.hypot(X - 14.0, Y - 11.0) - 6.0) < 2.5
     plane = 0.2 * X - 0.1 * Y
     z = plane + 18.0 * is_high
-    fine, _, number = refined(z)
-    x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
-    off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
-    assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.mean(np.abs(off) > 1e-9) < 0.03
-    edges = np.sort(surface_body(*fine).faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    _, times = np.unique(edges, axis=0, return_counts=True)
-    assert times.max() == 2 and np.sum(times == 1) == 2 * (np.sum(fine[2].shape) - 2)
+    for refine in (used, refined):
+        fine, _, number = refine(z)
+        x, y = fine[0] + SHIFT[0] * fine[2], fine[1] + SHIFT[1] * fine[2]
+        off = fine[2] - (0.2 * x - 0.1 * y) - 18.0 * is_high.ravel()[number]
+        assert np.abs(off).max() <= 0.5 * PITCH * 0.3 + 1e-9 and np.mean(np.abs(off) > 1e-9) < 0.03
+        edges = np.sort(surface_body(*fine).faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, times = np.unique(edges, axis=0, return_counts=True)
+        assert times.max() == 2 and np.sum(times == 1) == 2 * (np.sum(fine[2].shape) - 2)
 
 
 def test_wall_that_ends():
@@ -87,10 +95,12 @@ def test_foot_of_a_hidden_side_is_moved():
     z = np.where(X > 13.0, 0.0, 20.0)
     at = grid(z)
     behind = tuple(np.where(np.isclose(X, 14.0), f - 3.0, f) for f in at)
-    fine, moved, number = refined_grid(at, behind, SHIFT, *wall_links(X, Y, z))
-    change = np.any([a != b for a, b in zip(fine, moved, strict=True)], axis=0)
-    assert change.any() and np.all(np.isclose(X.ravel()[number[change]], 14.0))
-    assert not change[::3, ::3].any() and np.all(fine[0][change] - moved[0][change] == pytest.approx(3.0))
+    for results in (with_upright_walls(at, behind, SHIFT), refined_grid(at, behind, SHIFT, *wall_links(X, Y, z))):
+        fine, moved, number = results
+        change = np.any([a != b for a, b in zip(fine, moved, strict=True)], axis=0)
+        assert change.any() and np.all(np.isclose(X.ravel()[number[change]], 14.0))
+        assert np.all(fine[0][change] - moved[0][change] == pytest.approx(3.0))
+    assert not change[::3, ::3].any()
 
 
 def test_lines_that_no_wall_needs_are_left_out():
@@ -100,7 +110,7 @@ def test_lines_that_no_wall_needs_are_left_out():
     """
     z = np.where((X > 20.0) & (Y > 13.0), 30.0, 0.5 * np.exp(-0.1 * ((X - 8.0) ** 2 + (Y - 6.0) ** 2)))
     fine, _, _ = refined(z)
-    few, _, number = with_upright_walls(grid(z), grid(z), SHIFT)
+    few, _, number = used(z)
     assert few[2].size < 0.3 * fine[2].size and set(range(z.size)) == set(number.ravel())
     at = np.stack([few[0] + SHIFT[0] * few[2], few[1] + SHIFT[1] * few[2]], -1)
     line_x, line_y = at[0, :, 0], at[:, 0, 1]
