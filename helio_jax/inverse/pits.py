@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_opening, distance_transform_edt, median_filter
 from scipy.optimize import minimize_scalar
 
+from helio_jax.arrays import BORDER_WIDTH, border_mask
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.levels import GAIN, at_level
@@ -29,6 +30,8 @@ DEPTHS = 0.0625, 0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0
 """Depths that are tried, in widths of the pit ..."""
 REFINEMENTS = 6
 """... and how many more around the best one."""
+MOST_OF_BORDER = 0.5
+"""Largest share of the border's pixels in a pit."""
 _SQUARE = np.ones((3, 3))
 
 
@@ -94,7 +97,9 @@ class PitSearch:
         is_unexplained = where & (median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT)
         closed = binary_closing(np.pad(binary_opening(is_unexplained, np.ones((2, 2))), 1), _SQUARE)[1:-1, 1:-1]
         number = numbered(closed, LEAST_PIXELS)
-        return [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]
+        found = [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]
+        # what holds most of the border is no pit in a substrate: the whole image is unexplained
+        return [inside for inside in found if np.mean(inside[border_mask(inside.shape, BORDER_WIDTH)]) < MOST_OF_BORDER]
 
     def sunk(self, pits: Pits, inside: np.ndarray, above: float) -> tuple[Pits, float]:
         """Sink a region below the floor around it, to the level that explains the data best.

@@ -34,6 +34,7 @@ from helio_jax.inverse.residuals import (
     border_residuals,
     data_residuals,
     edge_residuals,
+    edge_residuals_at,
     edge_scale,
     surface_of,
 )
@@ -41,6 +42,9 @@ from helio_jax.inverse.samples import add_common_modes, on_raster
 
 MAX_PIXELS = 8_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
+LEAST_TOLD = 0.1
+"""Variance with which a combination of parameters is expected to deviate from the stated one, in prior variances, at
+least: linear theory is not right to less."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,8 @@ class Linearised:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
         common: derivative with respect to what many heights have in common [residual, common]: the common modes, the
-            held level and, as the last, the mean height through the scale of the edges; it adds common @ weights.T to
+            held level and, as the last, the mean height through the scale of the edges, and the bend ratios along x and
+            along y; it adds common @ weights.T to
             `surface`.
         weights: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
@@ -173,7 +178,7 @@ class Posterior:
         mine = np.array([name.partition("[")[0] in of for name in self.names])
         flat = np.concatenate([np.ravel(getattr(parameters, name)) for name in of])
         own = self.instrument_covariance[np.ix_(mine, mine)]
-        factor = birge_ratio(flat, own)
+        factor = birge_ratio(flat, own / self.inflation**2)
         if factor < min_ratio:
             return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
@@ -234,8 +239,8 @@ class _Rows:
 def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
     """Compute the blocks of the Jacobian.
 
-    In this order: data by surface field, data, edges and border by parameter, edges by mean height; and the factor of
-    the edges' weights.
+    In this order: data by surface field, data, edges and border by parameter, edges by mean height; along x and along
+    y, edges by the bend ratio and that by the slopes; and the factor of the edges' weights.
     """
     surface, at = surface_of(unknowns, fixed), unknowns.parameters
     names = ("height", "slope_x", "slope_y")
@@ -249,8 +254,11 @@ def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
         jax.jacfwd(lambda values, f=f: f(surface, at.replaced(**values), fixed))(free)
         for f in (data_residuals, edge_residuals, border_residuals)
     )
-    raised = jax.jvp(lambda s: edge_residuals(s, at, fixed), (surface,), (directions[0],))[1]
-    return data, data_by, (*edges_by, border_by), raised, edge_scale(surface, at, fixed)
+    ratios, by_slopes = fixed.edges.bend_ratios(surface), jax.jacrev(fixed.edges.bend_ratios)(surface)
+    raised = jax.jvp(lambda s: edge_residuals_at(s, at, fixed, ratios), (surface,), (directions[0],))[1]
+    bent = jax.jvp(lambda r: edge_residuals_at(surface, at, fixed, r), (ratios,), ((1.0, 1.0),))[1]
+    bends = (bent[0], by_slopes[0].slope_x), (bent[1], by_slopes[1].slope_y)
+    return data, data_by, (*edges_by, border_by), raised, bends, edge_scale(surface, at, fixed)
 
 
 def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
@@ -262,7 +270,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     pixel = np.arange(fixed.border.size).reshape(shape)
     with jax.enable_x64(True):
         found = jax.tree.map(np.asarray, block_derivatives(unknowns, fixed))
-    data, data_by, others_by, raised, scale = found
+    data, data_by, others_by, raised, bends, scale = found
     free = unknowns.parameters.free()
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
@@ -300,13 +308,17 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     weights = np.asarray(fixed.modes.weights)[is_used]
     response = np.asarray(fixed.modes.response)[is_used] * np.asarray(fixed.inverse_sigma)
     n_modes, anchors = len(weights), np.asarray(fixed.anchor_weight).reshape(n_anchors, pixel.size)
-    n_common = n_modes + n_anchors + 1
+    n_common = n_modes + n_anchors + 3
     common, of_surface = np.zeros((len(by_instrument), n_common)), np.zeros((3 * pixel.size, n_common))
     common[:n_data, :n_modes] = response.reshape(n_modes, n_data).T
     of_surface[::3, :n_modes] = weights.reshape(n_modes, pixel.size).T
-    common[n_rows : n_rows + n_anchors, n_modes:-1], of_surface[::3, n_modes:-1] = np.eye(n_anchors), anchors.T
+    common[n_rows : n_rows + n_anchors, n_modes:-3], of_surface[::3, n_modes:-3] = np.eye(n_anchors), anchors.T
     by_height = np.concatenate([part.ravel() for part in raised])
-    common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
+    common[n_data : n_data + by_height.size, -3], of_surface[::3, -3] = by_height, 1.0 / pixel.size
+    before = n_data
+    for column, part, (by_ratio, by_slope) in zip((-2, -1), (1, 2), bends, strict=True):
+        common[before : before + by_ratio.size, column] = by_ratio.ravel()
+        of_surface[part::3, column], before = by_slope.ravel(), before + by_ratio.size
     return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
 
 
@@ -390,7 +402,8 @@ def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
     """Compute the Birge ratio of an instrument: its deviation over what prior and data explain; at least 1.
 
     Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
-    about the stated one. Only combinations that the data determine better than the prior count.
+    about the stated one. One that the data tell next to nothing of should stay where it is stated: it counts only as
+    far as it does not.
 
     Args:
         values: fitted, in prior deviations [parameter].
@@ -399,11 +412,10 @@ def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
     Source: Birge, Phys. Rev. 40 (1932) 207; as scale factor: Particle Data Group, Introduction, sec. 5.2.2.
     """
     left, ways = np.linalg.eigh(covariance)
-    is_determined = left < 0.5
-    if not is_determined.any():
-        return 1.0
-    square = (ways.T @ values)[is_determined] ** 2 / (1.0 - left[is_determined])
-    return float(max(1.0, np.sqrt(square.mean())))
+    told = np.clip(1.0 - left, 0.0, 1.0)  # errors that agree between pixels can leave more than the prior
+    floor = np.maximum(told, LEAST_TOLD)
+    square = np.sum((ways.T @ values) ** 2 / floor)
+    return float(max(1.0, np.sqrt(square / max(1.0, np.sum(told / floor)))))
 
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:

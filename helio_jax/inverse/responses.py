@@ -25,7 +25,7 @@ from helio_jax.forward.surface import Surface, slopes_of_normal, unit_normal
 from helio_jax.inverse.samples import thinning
 
 LEVEL_FACET = 0.9
-"""Facets whose unit normal has a larger vertical part count as level."""
+"""Vertical part of the unit normal beyond which facets answer to their own normal no more strongly."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
 
@@ -50,9 +50,10 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Estimate the fall of multiple scattering M per unit of a facet's vertical normal component [detector, y, x].
 
     A facet whose normal has the vertical part n_z sees its surroundings with the view factor (1 - n_z) / 2, so what
-    they send it changes by -M / (1 - n_z) per unit of n_z; 0 for level facets. Source: own derivation.
+    they send it changes by -M / (1 - n_z) per unit of n_z; level facets, whose n_z hardly changes, by that of
+    n_z = `LEVEL_FACET`. Source: own derivation.
     """
-    return np.where(up < LEVEL_FACET, multiple / np.maximum(1.0 - up, 1.0 - LEVEL_FACET), 0.0)
+    return multiple / np.maximum(1.0 - up, 1.0 - LEVEL_FACET)
 
 
 @compiled

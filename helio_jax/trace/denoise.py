@@ -4,12 +4,15 @@ import math
 
 import numpy as np
 
+from helio_jax.arrays import robust_std
 from helio_jax.kernel import kernel
 
 SMOOTH_PIXELS = 1.0
 """Gaussian width of one pass [pixels]."""
-SMOOTH_NORMALS = 0.2
-"""Gaussian width of the range weight: difference of unit normals."""
+SMOOTH_NORMALS = 0.05, 0.2
+"""Gaussian width of the range weight: least and largest difference of unit normals, and between them ..."""
+NORMAL_NOISES = 4.0
+"""... this many standard deviations of their noise."""
 _REACH = math.ceil(2.5 * SMOOTH_PIXELS)
 _RIDGE = 0.1
 """Ridge penalty on the slopes of the local planes, relative to the weight of the centre pixel."""
@@ -41,8 +44,9 @@ def smooth_along_surface(
     """
     smooth = np.ascontiguousarray(np.moveaxis(images, 0, -1), np.float64)
     about = np.ascontiguousarray(normals, np.float64), np.ascontiguousarray(points / pitch, np.float64)
+    width = range_width(normals)
     for number in range(passes):
-        smooth = _fit_planes(smooth, *about, 2**number)
+        smooth = _fit_planes(smooth, *about, 2**number, width)
     return np.moveaxis(smooth, -1, 0)
 
 
@@ -54,8 +58,19 @@ def passes_for(paths: float, wanted: float) -> int:
     return passes
 
 
+def range_width(normals: np.ndarray) -> float:
+    """Return the width of the range weight for unit normals [y, x, 3], from their noise.
+
+    Their noise is taken from their second differences along rows and columns, which most of a surface leaves small: a
+    wider weight would round the creases of a surface that is known well, and its hollows would see less of themselves.
+    """
+    bends = [np.diff(normals, 2, axis).ravel() for axis in (0, 1)]
+    noise = robust_std(np.concatenate(bends)) / math.sqrt(6.0)
+    return float(np.clip(NORMAL_NOISES * noise, *SMOOTH_NORMALS))
+
+
 @kernel
-def _fit_planes(images, normals, points, spacing):
+def _fit_planes(images, normals, points, spacing, width):
     """Evaluate at each pixel the plane fitted around it [y, x, image]."""
     ny, nx, n_images = images.shape
     out = np.empty_like(images)
@@ -75,7 +90,7 @@ def _fit_planes(images, normals, points, spacing):
                         off += normals[row, column, a] * (points[y, x, a] - points[row, column, a])
                     if abs(off) > _SAME_LEVEL[0] + _SAME_LEVEL[1] * spacing * math.hypot(i, j):
                         continue
-                    weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + change / SMOOTH_NORMALS**2))
+                    weight = math.exp(-0.5 * ((i * i + j * j) / SMOOTH_PIXELS**2 + change / width**2))
                     matrix[0, 0] += weight
                     matrix[0, 1] += weight * i
                     matrix[0, 2] += weight * j

@@ -41,6 +41,12 @@ def test_no_pit_where_the_substrate_explains_all():
     assert found((0.0, 0.0))[1] is None
 
 
+def test_an_image_that_nothing_explains_is_no_pit():
+    """Residuals of 4 everywhere, as of a substrate of another albedo: no pit that leaves no substrate around it."""
+    search = PitSearch(lambda s: np.full((1, *SHAPE), 4.0 - 0.001 * np.abs(s.height)), (PITCH, PITCH), (0.0, 0.0))
+    assert search.find(SHAPE) is None
+
+
 def test_a_hopeless_search_ends_with_the_largest_pit():
     """Where a floor leaves more than `hopeless`, the inner pit is not looked for, and there are no pits at all."""
     tried = []
