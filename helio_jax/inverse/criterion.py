@@ -381,18 +381,18 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
 
 def _edges_at(case: Case, noise: Any) -> Edges:
     """Weight the edges as `edges.find_edges` and `edges.smoothness_weight` do, for a slope noise."""
-    weights, smooth, bent, (ny, nx) = [], [], [], case.surface.height.shape
+    weights, smooth, bend_share, (ny, nx) = [], [], [], case.surface.height.shape
     for terms, axis, shape in ((case.edge_x, 1, (ny, nx - 1)), (case.edge_y, 0, (ny - 1, nx))):
         sigma = jnp.sqrt((NOISE_FLOOR * noise) ** 2 + terms.variance)
         joined = cauchy_weight(terms.misfit / sigma, case.settings.jump_limits[-1]) ** 2
         weights.append((joined.reshape(shape), (jnp.sqrt(joined) / sigma).reshape(shape)))
-        bent.append((terms.variance / sigma**2).reshape(shape))
+        bend_share.append((terms.variance / sigma**2).reshape(shape))
         own = joined * cauchy_weight(terms.kink / 24.0, NOISE_FLOOR * noise)
         previous, following = around(own.reshape(shape), axis)
         smooth.append(previous * following)
     (joined_x, weight_x), (joined_y, weight_y) = weights
     changes = case.fixed.edges.change_x, case.fixed.edges.change_y
-    return Edges(joined_x, joined_y, weight_x, weight_y, smooth[0], smooth[1], bent[0], bent[1], *changes)
+    return Edges(joined_x, joined_y, weight_x, weight_y, smooth[0], smooth[1], bend_share[0], bend_share[1], *changes)
 
 
 def _largest_change(image: jax.Array) -> jax.Array:

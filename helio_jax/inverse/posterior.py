@@ -42,7 +42,7 @@ from helio_jax.inverse.samples import add_common_modes, on_raster
 
 MAX_PIXELS = 8_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
-LEAST_TOLD = 0.1
+LEAST_DETERMINED = 0.1
 """Variance with which a combination of parameters is expected to deviate from the stated one, in prior variances, at
 least: linear theory is not right to less."""
 
@@ -256,8 +256,8 @@ def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
     )
     ratios, by_slopes = fixed.edges.bend_ratios(surface), jax.jacrev(fixed.edges.bend_ratios)(surface)
     raised = jax.jvp(lambda s: edge_residuals_at(s, at, fixed, ratios), (surface,), (directions[0],))[1]
-    bent = jax.jvp(lambda r: edge_residuals_at(surface, at, fixed, r), (ratios,), ((1.0, 1.0),))[1]
-    bends = (bent[0], by_slopes[0].slope_x), (bent[1], by_slopes[1].slope_y)
+    by_ratio = jax.jvp(lambda r: edge_residuals_at(surface, at, fixed, r), (ratios,), ((1.0, 1.0),))[1]
+    bends = (by_ratio[0], by_slopes[0].slope_x), (by_ratio[1], by_slopes[1].slope_y)
     return data, data_by, (*edges_by, border_by), raised, bends, edge_scale(surface, at, fixed)
 
 
@@ -412,10 +412,10 @@ def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
     Source: Birge, Phys. Rev. 40 (1932) 207; as scale factor: Particle Data Group, Introduction, sec. 5.2.2.
     """
     left, ways = np.linalg.eigh(covariance)
-    told = np.clip(1.0 - left, 0.0, 1.0)  # errors that agree between pixels can leave more than the prior
-    floor = np.maximum(told, LEAST_TOLD)
+    determined = np.clip(1.0 - left, 0.0, 1.0)  # errors that agree between pixels can leave more than the prior
+    floor = np.maximum(determined, LEAST_DETERMINED)
     square = np.sum((ways.T @ values) ** 2 / floor)
-    return float(max(1.0, np.sqrt(square / max(1.0, np.sum(told / floor)))))
+    return float(max(1.0, np.sqrt(square / max(1.0, np.sum(determined / floor)))))
 
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:

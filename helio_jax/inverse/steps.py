@@ -187,8 +187,8 @@ def freeze(
         along_y.weight * strictness,
         smoothness_weight(along_x.joined, slope_x, problem.pixel_noise, 1),
         smoothness_weight(along_y.joined, slope_y, problem.pixel_noise, 0),
-        along_x.bent,
-        along_y.bent,
+        along_x.bend_share,
+        along_y.bend_share,
         np.diff(slope_x, axis=1),
         np.diff(slope_y, axis=0),
     )

@@ -64,17 +64,17 @@ def test_kinks_do_not_pull_the_relief_down():
     change = np.diff(slope, axis=1)
 
     def misfit(h, s, is_held=False):
-        ratio = 1.0 if is_held else bend_ratio(s, edges.bent, edges.weight, change, 1)
+        ratio = 1.0 if is_held else bend_ratio(s, edges.bend_share, edges.weight, change, 1)
         gap = trapezoid_gap(h, s, PITCH, 1) * edges.weight
-        return np.sum(gap**2 / (1.0 + edges.bent * (ratio - 1.0)))
+        return np.sum(gap**2 / (1.0 + edges.bend_share * (ratio - 1.0)))
 
-    assert bend_ratio(slope, edges.bent, edges.weight, change, 1) == pytest.approx(1.0, abs=1e-12)
+    assert bend_ratio(slope, edges.bend_share, edges.weight, change, 1) == pytest.approx(1.0, abs=1e-12)
     start, grown = misfit(height, slope), misfit(1.02 * height, 1.02 * slope)
     assert abs(grown - start) < 0.001 * start < 0.03 * start < misfit(1.02 * height, 1.02 * slope, True) - start
     alone = slope.copy()
     alone[0] *= 1.02
-    assert bend_ratio(alone, edges.bent, edges.weight, change, 1) == pytest.approx(1.0, abs=4e-4)
-    assert bend_ratio(0.0 * slope, 0.0 * edges.bent, edges.weight, 0.0 * change, 1) == 1.0
+    assert bend_ratio(alone, edges.bend_share, edges.weight, change, 1) == pytest.approx(1.0, abs=4e-4)
+    assert bend_ratio(0.0 * slope, 0.0 * edges.bend_share, edges.weight, 0.0 * change, 1) == 1.0
 
 
 @pytest.mark.parametrize("axis", [0, 1])
