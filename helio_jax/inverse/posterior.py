@@ -42,7 +42,7 @@ from helio_jax.inverse.samples import add_common_modes, on_raster
 
 MAX_PIXELS = 8_000
 """Largest raster whose information matrix is factorised; above, the raster is thinned."""
-LEAST_DETERMINED = 0.1
+LEAST_EXPECTED = 0.1
 """Variance with which a combination of parameters is expected to deviate from the stated one, in prior variances, at
 least: linear theory is not right to less."""
 
@@ -127,6 +127,8 @@ class Posterior:
         common_modes: fully correlated errors that were added for the same reason, or for a fit that has not converged,
             one standard deviation of each [error, y, x], um.
         sums: of the sums that were asked for, neither inflated nor with common modes.
+        independent_covariance: that of the instrument were all errors independent, as the fit takes them, never
+            inflated; None: `instrument_covariance`.
     """
 
     samples: np.ndarray
@@ -138,6 +140,7 @@ class Posterior:
     inflation: float = 1.0
     common_modes: np.ndarray | None = None
     sums: SumsPosterior | None = None
+    independent_covariance: np.ndarray | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -178,7 +181,9 @@ class Posterior:
         mine = np.array([name.partition("[")[0] in of for name in self.names])
         flat = np.concatenate([np.ravel(getattr(parameters, name)) for name in of])
         own = self.instrument_covariance[np.ix_(mine, mine)]
-        factor = birge_ratio(flat, own / self.inflation**2)
+        spread = own / self.inflation**2
+        independent = spread if self.independent_covariance is None else self.independent_covariance[np.ix_(mine, mine)]
+        factor = birge_ratio(flat, independent, spread)
         if factor < min_ratio:
             return self
         followed = self.instrument_covariance[:, mine] @ np.linalg.solve(own, flat)
@@ -380,7 +385,14 @@ def sample_posterior(
     instrument = influence.T @ noise
     surface = solve(linear.transposed(noise)) - answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
-    found = Posterior(to_height(surface), instrument.T, -to_height(answer), covariance(influence), linear.names)
+    found = Posterior(
+        to_height(surface),
+        instrument.T,
+        -to_height(answer),
+        covariance(influence),
+        linear.names,
+        independent_covariance=own,
+    )
     if sums is None:
         return found
     free = solve(sums[: len(answer)])
@@ -398,24 +410,26 @@ def tilts_of(names: tuple[str, ...]) -> list[int]:
     return [names.index(name) for name in ("tilt[0]", "tilt[1]") if name in names]
 
 
-def birge_ratio(values: np.ndarray, covariance: np.ndarray) -> float:
+def birge_ratio(values: np.ndarray, independent: np.ndarray, spread: np.ndarray) -> float:
     """Compute the Birge ratio of an instrument: its deviation over what prior and data explain; at least 1.
 
-    Where the priors are right, a combination that the data leave with the variance c is found with the variance 1 - c
-    about the stated one. One that the data tell next to nothing of should stay where it is stated: it counts only as
-    far as it does not.
+    Where the priors are right and the data leave the covariance C if their errors are independent, fitted values are
+    found about the stated ones with the covariance 1 - C; errors that agree between pixels, by which the error is S,
+    add S - C. A combination that the data tell next to nothing of should stay where it is stated: it counts only as far
+    as it does not.
 
     Args:
         values: fitted, in prior deviations [parameter].
-        covariance: posterior, in prior deviations [parameter, parameter].
+        independent: C, in prior deviations [parameter, parameter].
+        spread: S, likewise.
 
     Source: Birge, Phys. Rev. 40 (1932) 207; as scale factor: Particle Data Group, Introduction, sec. 5.2.2.
     """
-    left, ways = np.linalg.eigh(covariance)
-    determined = np.clip(1.0 - left, 0.0, 1.0)  # errors that agree between pixels can leave more than the prior
-    floor = np.maximum(determined, LEAST_DETERMINED)
+    expected, ways = np.linalg.eigh(np.eye(len(values)) - 2.0 * independent + spread)
+    expected = np.maximum(expected, 0.0)
+    floor = np.maximum(expected, LEAST_EXPECTED)
     square = np.sum((ways.T @ values) ** 2 / floor)
-    return float(max(1.0, np.sqrt(square / max(1.0, np.sum(determined / floor)))))
+    return float(max(1.0, np.sqrt(square / max(1.0, np.sum(expected / floor)))))
 
 
 def exact_height_covariance(linear: Linearised) -> np.ndarray:

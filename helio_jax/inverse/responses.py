@@ -24,8 +24,10 @@ from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal, unit_normal
 from helio_jax.inverse.samples import thinning
 
-LEVEL_FACET = 0.9
-"""Vertical part of the unit normal beyond which facets answer to their own normal no more strongly."""
+STEEP_FACET, LEVEL_FACET = 0.9, 0.98
+"""Vertical parts of the unit normal: below the first, facets answer to their own normal by all that they see; between
+the two as at the first; from the second on less and less, down to nothing at 1: the normals of level ground are noise,
+and beside a wall what they see is not all around them."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
 
@@ -50,10 +52,11 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Estimate the fall of multiple scattering M per unit of a facet's vertical normal component [detector, y, x].
 
     A facet whose normal has the vertical part n_z sees its surroundings with the view factor (1 - n_z) / 2, so what
-    they send it changes by -M / (1 - n_z) per unit of n_z; level facets, whose n_z hardly changes, by that of
-    n_z = `LEVEL_FACET`. Source: own derivation.
+    they send it changes by -M / (1 - n_z) per unit of n_z. Continuous: a threshold makes fits of facets near it cycle.
+    Source: own derivation.
     """
-    return multiple / np.maximum(1.0 - up, 1.0 - LEVEL_FACET)
+    tilted = 1.0 - up
+    return multiple * np.minimum(1.0, tilted / (1.0 - LEVEL_FACET)) / np.maximum(tilted, 1.0 - STEEP_FACET)
 
 
 @compiled

@@ -9,10 +9,10 @@ from helio_jax.kernel import kernel
 
 SMOOTH_PIXELS = 1.0
 """Gaussian width of one pass [pixels]."""
-SMOOTH_NORMALS = 0.05, 0.2
-"""Gaussian width of the range weight: least and largest difference of unit normals, and between them ..."""
-NORMAL_NOISES = 4.0
-"""... this many standard deviations of their noise."""
+SMOOTH_NORMALS = 0.2
+"""Gaussian width of the range weight: difference of unit normals."""
+LEAST_SMOOTH_NORMALS, NORMAL_NOISES = 0.05, 4.0
+"""Range weight for the surface itself: its least width, and its width in standard deviations of the normals' noise."""
 _REACH = math.ceil(2.5 * SMOOTH_PIXELS)
 _RIDGE = 0.1
 """Ridge penalty on the slopes of the local planes, relative to the weight of the centre pixel."""
@@ -22,7 +22,12 @@ surface whose normals turn by half a radian keeps below it."""
 
 
 def smooth_along_surface(
-    images: np.ndarray, normals: np.ndarray, points: np.ndarray, pitch: float, passes: int = 1
+    images: np.ndarray,
+    normals: np.ndarray,
+    points: np.ndarray,
+    pitch: float,
+    passes: int = 1,
+    width: float = SMOOTH_NORMALS,
 ) -> np.ndarray:
     """Smooth images over neighbours with similar normals on the same level.
 
@@ -37,6 +42,7 @@ def smooth_along_surface(
         points: of the surface, sample frame [y, x, 3], um.
         pitch: of the raster, the larger of both, um.
         passes: at least 1.
+        width: of the range weight.
 
     Source: weights: Petschnigg et al., ACM Trans. Graph. 23 (2004) 664, eq. 3; passes: Dammertz, Sewtz, Hanika and
         Lensch, High Performance Graphics 2010, sec. 3; local planes: Fan and Gijbels, Local Polynomial Modelling
@@ -44,7 +50,6 @@ def smooth_along_surface(
     """
     smooth = np.ascontiguousarray(np.moveaxis(images, 0, -1), np.float64)
     about = np.ascontiguousarray(normals, np.float64), np.ascontiguousarray(points / pitch, np.float64)
-    width = range_width(normals)
     for number in range(passes):
         smooth = _fit_planes(smooth, *about, 2**number, width)
     return np.moveaxis(smooth, -1, 0)
@@ -58,15 +63,16 @@ def passes_for(paths: float, wanted: float) -> int:
     return passes
 
 
-def range_width(normals: np.ndarray) -> float:
-    """Return the width of the range weight for unit normals [y, x, 3], from their noise.
+def surface_width(normals: np.ndarray) -> float:
+    """Return the width of the range weight for smoothing a surface itself, from the noise of its normals [y, x, 3].
 
-    Their noise is taken from their second differences along rows and columns, which most of a surface leaves small: a
-    wider weight would round the creases of a surface that is known well, and its hollows would see less of themselves.
+    The noise is taken from second differences along rows and columns, which most of a surface leaves small. A wider
+    weight would round the creases, and hollows would see less of themselves. Images need the full width: along a steep
+    rim, normals differ between neighbours by more than noise.
     """
     bends = [np.diff(normals, 2, axis).ravel() for axis in (0, 1)]
     noise = robust_std(np.concatenate(bends)) / math.sqrt(6.0)
-    return float(np.clip(NORMAL_NOISES * noise, *SMOOTH_NORMALS))
+    return float(np.clip(NORMAL_NOISES * noise, LEAST_SMOOTH_NORMALS, SMOOTH_NORMALS))
 
 
 @kernel

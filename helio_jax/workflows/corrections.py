@@ -29,7 +29,7 @@ from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
 from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
 from helio_jax.trace import masks
-from helio_jax.trace.denoise import passes_for, smooth_along_surface
+from helio_jax.trace.denoise import SMOOTH_NORMALS, passes_for, smooth_along_surface, surface_width
 from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
@@ -343,10 +343,17 @@ class _Raster:
         """Number the pixels of the image; in a grid with more points around it, the nearest one's of each [point]."""
         return np.pad(np.arange(self.x.size).reshape(self.x.shape), (shape[0] - len(self.x)) // 2, mode="edge").ravel()
 
-    def smoothed(self, images: np.ndarray, height: np.ndarray, normals: np.ndarray, passes: int = 1) -> np.ndarray:
+    def smoothed(
+        self,
+        images: np.ndarray,
+        height: np.ndarray,
+        normals: np.ndarray,
+        passes: int = 1,
+        width: float = SMOOTH_NORMALS,
+    ) -> np.ndarray:
         """Smooth images [image, y, x] along a surface of heights [y, x], um, and unit normals [y, x, 3]."""
         points = np.stack(self.surface(self.x, self.y, height), -1)
-        return smooth_along_surface(images, normals, points, max(self.pitches), passes)
+        return smooth_along_surface(images, normals, points, max(self.pitches), passes, width)
 
     def denoised(self, height: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
@@ -354,7 +361,8 @@ class _Raster:
         Noise makes facets see one another: on a flat that would add half a per cent of its signal. Where the mean
         height differs by more than `MAX_SMOOTHING_STEP`, neighbours are at another level, and the height stays.
         """
-        mean = self.smoothed(np.concatenate([np.moveaxis(normals, -1, 0), height[None]]), height, normals)
+        fields = np.concatenate([np.moveaxis(normals, -1, 0), height[None]])
+        mean = self.smoothed(fields, height, normals, width=surface_width(normals))
         smooth = np.moveaxis(mean[:3], 0, -1)
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         is_near = np.abs(mean[3] - height) < MAX_SMOOTHING_STEP * min(self.pitches)

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from helio_jax.trace.denoise import SMOOTH_NORMALS, passes_for, range_width, smooth_along_surface
+from helio_jax.trace.denoise import (
+    LEAST_SMOOTH_NORMALS,
+    SMOOTH_NORMALS,
+    passes_for,
+    smooth_along_surface,
+    surface_width,
+)
 
 SHAPE = (40, 50)
 ROW, COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -68,9 +74,9 @@ def test_weights_are_as_wide_as_the_noise_of_the_normals():
     """
     noise = 0.03 * np.random.default_rng(5).normal(size=(*SHAPE, 3))
     zigzag = np.where((COLUMN // 5 % 2 == 0)[..., None], bent(-1), [0.0, 0.0, 1.0])
-    assert range_width(np.zeros((*SHAPE, 3)) + noise) == pytest.approx(4.0 * 0.03, rel=0.05)
-    assert range_width(zigzag + noise) < 0.2
-    assert range_width(zigzag) == SMOOTH_NORMALS[0] and range_width(20.0 * noise) == SMOOTH_NORMALS[1]
+    assert surface_width(np.zeros((*SHAPE, 3)) + noise) == pytest.approx(4.0 * 0.03, rel=0.05)
+    assert surface_width(zigzag + noise) < 0.2
+    assert surface_width(zigzag) == LEAST_SMOOTH_NORMALS and surface_width(20.0 * noise) == SMOOTH_NORMALS
 
 
 def test_a_gentle_crease_stays():
@@ -82,5 +88,5 @@ def test_a_gentle_crease_stays():
     normals = np.stack([-slope, 0.0 * slope, np.ones(SHAPE)], -1) / np.sqrt(1.0 + 0.23**2)
     height = 0.23 * (24.5 - np.abs(COLUMN - 24.5))
     points = np.stack([COLUMN, ROW, height], -1).astype(float)
-    found = smooth_along_surface(height[None], normals, points, 1.0)[0]
+    found = smooth_along_surface(height[None], normals, points, 1.0, width=surface_width(normals))[0]
     assert np.abs(found - height)[:, 8:-8].max() < 0.015 * 0.46
