@@ -26,7 +26,7 @@ from helio_jax.inverse.samples import thinning
 
 STEEP_FACET, LEVEL_FACET = 0.9, 0.98
 """Vertical parts of the unit normal: below the first, facets answer to their own normal by all that they see; between
-the two as at the first; from the second on less and less, down to nothing at 1: the normals of level ground are noise,
+the two as at the first; from the second on less and less, down to nothing at 1: the normals of flat parts are noise,
 and beside a wall what they see is not all around them."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
