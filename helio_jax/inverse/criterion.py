@@ -212,7 +212,7 @@ def expect_errors(case: Case, optics: Optics, is_smooth: Any = False) -> Expecta
         White, Econometrica 48 (1980) 817.
     """
     fixed, error_share, floor, masked, counts = _terms_at(case, optics, is_smooth)
-    data, data_by, (*edges_by, border_by), raised, bends, scale = block_derivatives(case.unknowns, fixed)
+    data, data_by, (*edges_by, border_by), raised, scale = block_derivatives(case.unknowns, fixed)
     free = case.unknowns.parameters.free()
     n, shape = data[0][0].size, case.surface.height.shape
 
@@ -223,7 +223,7 @@ def expect_errors(case: Case, optics: Optics, is_smooth: Any = False) -> Expecta
     of_data = own, by_parameter(data_by, len(own), n)
     edges = [
         (*rows, by_parameter(blocks, len(rows[0])))
-        for rows, blocks in zip(_edge_rows(case, fixed, raised, bends, scale), edges_by, strict=True)
+        for rows, blocks in zip(_edge_rows(case, fixed, raised, scale), edges_by, strict=True)
     ]
     others = sum(_of_edges(rows, axis) for rows, axis in zip(edges, (1, 0), strict=True))
     others = others + _of_border(case, by_parameter(border_by, n))
@@ -274,21 +274,20 @@ def _root(square: jax.Array) -> jax.Array:
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
-def _edge_rows(case: Case, fixed: FixedTerms, raised: Any, bends: Any, scale: Any) -> list[tuple[jax.Array, jax.Array]]:
+def _edge_rows(case: Case, fixed: FixedTerms, raised: Any, scale: Any) -> list[tuple[jax.Array, jax.Array]]:
     """Compute the derivatives of the edges' residuals by the heights and by the slopes along the edge [edge, pixel].
 
     Along x and along y.
     """
     out, edges, n = [], fixed.edges, case.surface.height.size
-    for terms, weight, smooth, by_height, (by_ratio, by_slope) in (
-        (case.edge_x, edges.inverse_std_x, edges.smooth_x, raised[0], bends[0]),
-        (case.edge_y, edges.inverse_std_y, edges.smooth_y, raised[1], bends[1]),
+    for terms, weight, smooth, by_height in (
+        (case.edge_x, edges.inverse_std_x, edges.smooth_x, raised[0]),
+        (case.edge_y, edges.inverse_std_y, edges.smooth_y, raised[1]),
     ):
         of_slope = terms.mean - (terms.mean * (smooth.ravel() / 12.0)) @ terms.second
         w = (scale * weight).reshape(-1, 1)
-        # the last terms: through the scale of all edges, which follows the mean height, and the ratio of the bends
-        through_bends = by_ratio.reshape(-1, 1) * by_slope.ravel()
-        out.append((w * terms.of_height + by_height.reshape(-1, 1) / n, through_bends - w * of_slope))
+        # the last term: through the scale of all edges, which follows the mean height
+        out.append((w * terms.of_height + by_height.reshape(-1, 1) / n, -w * of_slope))
     return out
 
 
@@ -381,18 +380,16 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
 
 def _edges_at(case: Case, noise: Any) -> Edges:
     """Weight the edges as `edges.find_edges` and `edges.smoothness_weight` do, for a slope noise."""
-    weights, smooth, bend_share, (ny, nx) = [], [], [], case.surface.height.shape
+    weights, smooth, (ny, nx) = [], [], case.surface.height.shape
     for terms, axis, shape in ((case.edge_x, 1, (ny, nx - 1)), (case.edge_y, 0, (ny - 1, nx))):
         sigma = jnp.sqrt((NOISE_FLOOR * noise) ** 2 + terms.variance)
         joined = cauchy_weight(terms.misfit / sigma, case.settings.jump_limits[-1]) ** 2
         weights.append((joined.reshape(shape), (jnp.sqrt(joined) / sigma).reshape(shape)))
-        bend_share.append((terms.variance / sigma**2).reshape(shape))
         own = joined * cauchy_weight(terms.kink / 24.0, NOISE_FLOOR * noise)
         previous, following = around(own.reshape(shape), axis)
         smooth.append(previous * following)
     (joined_x, weight_x), (joined_y, weight_y) = weights
-    changes = case.fixed.edges.change_x, case.fixed.edges.change_y
-    return Edges(joined_x, joined_y, weight_x, weight_y, smooth[0], smooth[1], bend_share[0], bend_share[1], *changes)
+    return Edges(joined_x, joined_y, weight_x, weight_y, *smooth)
 
 
 def _largest_change(image: jax.Array) -> jax.Array:

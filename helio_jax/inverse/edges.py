@@ -90,12 +90,10 @@ class AxisEdges:
     Attributes:
         sigma: standard deviation of (height change / pitch) - (mean of the two slopes) on an edge without a jump.
         joined: weight that is left to the edge, 1: joined, 0: a depth jump.
-        bend_share: share of kink and curvature in the variance; the rest is noise.
     """
 
     sigma: np.ndarray
     joined: np.ndarray
-    bend_share: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
@@ -133,31 +131,9 @@ def find_edges(
     before, after = along(slope, axis)
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
     own = noise_of_edges(noise, axis)
-    of_bends = kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2
-    sigma = np.sqrt((NOISE_FLOOR * own) ** 2 + of_bends)
+    sigma = np.sqrt((NOISE_FLOOR * own) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
     misfit = trapezoid_gap(height, slope, pitch, axis) / sigma
-    return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2, of_bends / sigma**2)
-
-
-def bend_ratio(slope: Any, bend_share: Any, weight: Any, before: Any, axis: int) -> Any:
-    """Compute by how much the kinks along an axis have grown: ratio of the weighted sums of squared changes of slope.
-
-    The misfits of kinks and curved edges grow with the relief, and so do their standard deviations. Were these held,
-    every kink would pull the relief down by as much as all of its data tell where gains are unknown, too: a pyramid
-    came out 1 to 2 % too low. So the variances that are left to bends follow the relief's scale, as one number for all
-    edges: single kinks stay as they are, or they would grow to explain noise. 1 where all is flat.
-
-    Args:
-        slope: at the pixels, along the axis [y, x].
-        bend_share, weight: of the edges: share of bends in the variance, and factor to standard deviations.
-        before: change of slope in the edges when the weights were made.
-        axis: 0 (y) or 1 (x).
-
-    Source: own derivation; scale invariance as of the Haar prior of a scale parameter: Jaynes, IEEE Trans. Syst. Sci.
-        Cybern. 4 (1968) 227.
-    """
-    own, (start, end) = bend_share * weight**2, along(slope, axis)
-    return (1.0 + (own * (end - start) ** 2).sum()) / (1.0 + (own * before**2).sum())
+    return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2)
 
 
 def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float | np.ndarray, axis: int) -> np.ndarray:

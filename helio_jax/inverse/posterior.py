@@ -34,7 +34,6 @@ from helio_jax.inverse.residuals import (
     border_residuals,
     data_residuals,
     edge_residuals,
-    edge_residuals_at,
     edge_scale,
     surface_of,
 )
@@ -55,8 +54,7 @@ class Linearised:
         surface: derivative with respect to (height [um], slope x, slope y) of every pixel, [residual, 3 * pixel].
         instrument: derivative with respect to the instrument parameters, in prior deviations [residual, parameter].
         common: derivative with respect to what many heights have in common [residual, common]: the common modes, the
-            held level and, as the last, the mean height through the scale of the edges, and the bend ratios along x and
-            along y; it adds common @ weights.T to
+            held level and, as the last, the mean height through the scale of the edges; it adds common @ weights.T to
             `surface`.
         weights: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
@@ -244,8 +242,8 @@ class _Rows:
 def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
     """Compute the blocks of the Jacobian.
 
-    In this order: data by surface field, data, edges and border by parameter, edges by mean height; along x and along
-    y, edges by the bend ratio and that by the slopes; and the factor of the edges' weights.
+    In this order: data by surface field, data, edges and border by parameter, edges by mean height; and the factor of
+    the edges' weights.
     """
     surface, at = surface_of(unknowns, fixed), unknowns.parameters
     names = ("height", "slope_x", "slope_y")
@@ -259,11 +257,8 @@ def block_derivatives(unknowns: Unknowns, fixed: FixedTerms):
         jax.jacfwd(lambda values, f=f: f(surface, at.replaced(**values), fixed))(free)
         for f in (data_residuals, edge_residuals, border_residuals)
     )
-    ratios, by_slopes = fixed.edges.bend_ratios(surface), jax.jacrev(fixed.edges.bend_ratios)(surface)
-    raised = jax.jvp(lambda s: edge_residuals_at(s, at, fixed, ratios), (surface,), (directions[0],))[1]
-    by_ratio = jax.jvp(lambda r: edge_residuals_at(surface, at, fixed, r), (ratios,), ((1.0, 1.0),))[1]
-    bends = (by_ratio[0], by_slopes[0].slope_x), (by_ratio[1], by_slopes[1].slope_y)
-    return data, data_by, (*edges_by, border_by), raised, bends, edge_scale(surface, at, fixed)
+    raised = jax.jvp(lambda s: edge_residuals(s, at, fixed), (surface,), (directions[0],))[1]
+    return data, data_by, (*edges_by, border_by), raised, edge_scale(surface, at, fixed)
 
 
 def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
@@ -275,7 +270,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     pixel = np.arange(fixed.border.size).reshape(shape)
     with jax.enable_x64(True):
         found = jax.tree.map(np.asarray, block_derivatives(unknowns, fixed))
-    data, data_by, others_by, raised, bends, scale = found
+    data, data_by, others_by, raised, scale = found
     free = unknowns.parameters.free()
     rows = _Rows(pixel.size)
     for k in range(data[0].shape[0]):
@@ -313,17 +308,13 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     weights = np.asarray(fixed.modes.weights)[is_used]
     response = np.asarray(fixed.modes.response)[is_used] * np.asarray(fixed.inverse_sigma)
     n_modes, anchors = len(weights), np.asarray(fixed.anchor_weight).reshape(n_anchors, pixel.size)
-    n_common = n_modes + n_anchors + 3
+    n_common = n_modes + n_anchors + 1
     common, of_surface = np.zeros((len(by_instrument), n_common)), np.zeros((3 * pixel.size, n_common))
     common[:n_data, :n_modes] = response.reshape(n_modes, n_data).T
     of_surface[::3, :n_modes] = weights.reshape(n_modes, pixel.size).T
-    common[n_rows : n_rows + n_anchors, n_modes:-3], of_surface[::3, n_modes:-3] = np.eye(n_anchors), anchors.T
+    common[n_rows : n_rows + n_anchors, n_modes:-1], of_surface[::3, n_modes:-1] = np.eye(n_anchors), anchors.T
     by_height = np.concatenate([part.ravel() for part in raised])
-    common[n_data : n_data + by_height.size, -3], of_surface[::3, -3] = by_height, 1.0 / pixel.size
-    before = n_data
-    for column, part, (by_ratio, by_slope) in zip((-2, -1), (1, 2), bends, strict=True):
-        common[before : before + by_ratio.size, column] = by_ratio.ravel()
-        of_surface[part::3, column], before = by_slope.ravel(), before + by_ratio.size
+    common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
     return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
 
 

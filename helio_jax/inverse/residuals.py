@@ -18,7 +18,7 @@ from helio_jax.forward.laws import Law, mean_over_aperture
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface, one_sided, unit_normal
-from helio_jax.inverse.edges import bend_ratio, fourth_order_slopes, trapezoid_gap
+from helio_jax.inverse.edges import fourth_order_slopes, trapezoid_gap
 from helio_jax.inverse.parameters import (
     NAMES,
     Parameters,
@@ -136,8 +136,6 @@ class Edges(eqx.Module):
         joined_x, joined_y: weight that is left to the edge, 1 joined, 0 a depth jump.
         inverse_std_x, inverse_std_y: factor from an edge's misfit to standard deviations, robustly weighted.
         smooth_x, smooth_y: weight of the fourth-order term of the slopes of every pixel [y, x].
-        bend_share_x, bend_share_y: share of kinks and curvature in an edge's variance.
-        change_x, change_y: change of slope in an edge when these were found.
     """
 
     joined_x: Any
@@ -146,17 +144,6 @@ class Edges(eqx.Module):
     inverse_std_y: Any
     smooth_x: Any
     smooth_y: Any
-    bend_share_x: Any
-    bend_share_y: Any
-    change_x: Any
-    change_y: Any
-
-    def bend_ratios(self, surface: Surface) -> tuple[Any, Any]:
-        """Compute `edges.bend_ratio` of a surface along x and along y."""
-        return (
-            bend_ratio(surface.slope_x, self.bend_share_x, self.inverse_std_x, self.change_x, 1),
-            bend_ratio(surface.slope_y, self.bend_share_y, self.inverse_std_y, self.change_y, 0),
-        )
 
 
 class FixedTerms(eqx.Module):
@@ -355,21 +342,10 @@ def _level_sensitivity(height: jax.Array, moves: jax.Array, law: Law | None, fix
 
 def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> tuple[jax.Array, jax.Array]:
     """Compute the edges' residuals [y, x - 1], [y - 1, x]."""
-    return edge_residuals_at(surface, parameters, fixed, fixed.edges.bend_ratios(surface))
-
-
-def edge_residuals_at(
-    surface: Surface, parameters: Parameters, fixed: FixedTerms, ratios: tuple[Any, Any]
-) -> tuple[jax.Array, jax.Array]:
-    """Compute the edges' residuals where the bends have grown by given ratios (`edges.bend_ratio`)."""
     scale, e = edge_scale(surface, parameters, fixed), fixed.edges
     gap_x = trapezoid_gap(surface.height, fourth_order_slopes(surface.slope_x, e.smooth_x, 1), fixed.dx, 1)
     gap_y = trapezoid_gap(surface.height, fourth_order_slopes(surface.slope_y, e.smooth_y, 0), fixed.dy, 0)
-    grown_x, grown_y = (1.0 + b * (r - 1.0) for b, r in zip((e.bend_share_x, e.bend_share_y), ratios, strict=True))
-    return (
-        gap_x * e.inverse_std_x * scale / jnp.sqrt(grown_x),
-        gap_y * e.inverse_std_y * scale / jnp.sqrt(grown_y),
-    )
+    return gap_x * e.inverse_std_x * scale, gap_y * e.inverse_std_y * scale
 
 
 def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:

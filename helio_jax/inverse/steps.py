@@ -187,10 +187,6 @@ def freeze(
         along_y.weight * strictness,
         smoothness_weight(along_x.joined, slope_x, problem.pixel_noise, 1),
         smoothness_weight(along_y.joined, slope_y, problem.pixel_noise, 0),
-        along_x.bend_share,
-        along_y.bend_share,
-        np.diff(slope_x, axis=1),
-        np.diff(slope_y, axis=0),
     )
     free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))

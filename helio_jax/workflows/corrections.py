@@ -50,7 +50,7 @@ CONTINUATIONS = "level", "mirrored"
 """How the surface goes on beyond a free border: `extend_border`, `mirror_border`."""
 MIRRORED = 0.5
 """Share of the image that is mirrored at each border."""
-LIFT_PIXELS = 0.05
+LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
 
 
