@@ -1,11 +1,10 @@
 """Competing explanations of one stack's micrographs, each fitted; the one that explains them best is kept.
 
 The first is the photometric solution, with regions at the levels of the steps that mask bands show; where none do and
-the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data
-contradict its fit, objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can
-explain nearly any images: there, patches are tried first. With a flat border they are also tried where the fit moves
-the instrument far beyond what is stated (`is_strained`). A level that explains the images about as well as the one that
-is kept is undecided.
+the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data contradict its fit, objects on a
+flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any images:
+there, patches are tried first. With a flat border they are also tried where the fit moves the instrument far beyond
+what is stated (`is_strained`). A level that explains the images about as well as the one that is kept is undecided.
 """
 
 import math
