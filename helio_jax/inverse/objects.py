@@ -40,6 +40,8 @@ SHARP = 0.2
 """A signal that jumps by more than this share of the flat substrate's, beyond its change nearby, shows an edge."""
 LEAST_PIXELS = 12
 """Smaller objects are not looked for."""
+HOPELESS = 2.0
+"""No more objects are looked for where the first leaves so many times the misfit of the relief without a substrate."""
 MOST_OBJECTS = 8
 """More objects are not looked for: the smaller ones keep the relief that they start with."""
 LEAST_SEGMENT = 4
@@ -108,9 +110,10 @@ class ObjectSearch:
     unexplained: Callable[[Surface], np.ndarray]
     report: Callable[[str], None] = lambda said: None
 
-    def find(self, objects: Objects) -> Trial:
-        """Find each object's outline and level, from outlines that are too wide."""
+    def find(self, objects: Objects) -> Trial | None:
+        """Find each object's outline and level, from outlines that are too wide; None where there is no hope."""
         best, n = self._tried(objects), len(objects.shift)
+        hopeless = HOPELESS * self.misfit(self.relief)
         sizes = np.bincount(objects.number.ravel())[1:]
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
@@ -120,6 +123,8 @@ class ObjectSearch:
             for steps in STEPS:
                 others = list(self._shifted(best, number, steps))
                 best = _best([best, *others, *(self._peeled(t, number) for t in others)])
+            if best.misfit > hopeless:
+                return None
         return best
 
     def _tried(self, objects: Objects) -> Trial:
@@ -193,7 +198,8 @@ def find_objects(
         return None
     raster = Raster.of(stack)
     search = ObjectSearch(relief, sharp, (raster.dy, raster.dx), misfit, substrate.unexplained, report)
-    return search.find(Objects(enclosed, (0.0,) * int(enclosed.max()))).objects
+    found = search.find(Objects(enclosed, (0.0,) * int(enclosed.max())))
+    return None if found is None else found.objects
 
 
 @dataclass(frozen=True)

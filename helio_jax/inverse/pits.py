@@ -24,6 +24,8 @@ LIMIT = 3.0
 """Mean square residual, over detectors, above which a flat floor does not explain a pixel."""
 LEAST_FLOOR = 0.15
 """Least share of a pit's pixels that show its floor: a wall alone has no level."""
+LEAST_EXPLAINED = 0.5
+"""Least share of a visible floor that is explained once the pit has its level: what is not flat is no pit."""
 MOST_PITS = 8
 """More pits are not looked for."""
 DEPTHS = 0.0625, 0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0
@@ -77,7 +79,7 @@ class PitSearch:
                 break
             inside, above = places.pop(0)
             deeper, level = self.sunk(pits, inside, above)
-            if deeper.misfit < pits.misfit - GAIN:
+            if deeper.misfit < pits.misfit - GAIN and self.is_floor_explained(deeper.surface, inside):
                 pits = deeper
                 inner = self.outlines(pits.surface, floor_of(pits.surface, inside))
                 places = [(within, level) for within in inner] + places
@@ -92,9 +94,17 @@ class PitSearch:
         except PredictionError:
             return np.inf
 
+    def is_unexplained(self, surface: Surface) -> np.ndarray:
+        """Mark the pixels that a surface does not explain [y, x]."""
+        return median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT
+
+    def is_floor_explained(self, surface: Surface, inside: np.ndarray) -> bool:
+        """Whether a surface explains the floor of a pit [y, x]."""
+        return bool(np.mean(self.is_unexplained(surface)[floor_of(surface, inside)]) <= 1.0 - LEAST_EXPLAINED)
+
     def outlines(self, surface: Surface, where: np.ndarray) -> list[np.ndarray]:
         """Find the regions of some pixels that a surface does not explain, the largest first [y, x]."""
-        is_unexplained = where & (median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT)
+        is_unexplained = where & self.is_unexplained(surface)
         closed = binary_closing(np.pad(binary_opening(is_unexplained, np.ones((2, 2))), 1), _SQUARE)[1:-1, 1:-1]
         number = numbered(closed, LEAST_PIXELS)
         found = [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]

@@ -49,7 +49,9 @@ def search(outline, level):
     wide = (np.hypot(X - 26, Y - 18) < 14.0).astype(int)
     unexplained = np.where(outline, 2.0 * LIMIT, 0.5 * LIMIT)
     found = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
-    return found.find(Objects(wide, (0.0,))), relief
+    best = found.find(Objects(wide, (0.0,)))
+    assert best is not None
+    return best, relief
 
 
 @pytest.mark.parametrize("level", [LEVEL, -60.0])
@@ -60,6 +62,24 @@ def test_outline_and_level_come_from_what_explains_the_images(level):
     surface = found.objects.surface(relief)
     assert surface.height[18, 26] == pytest.approx(level, abs=8.0)
     assert np.all(surface.slope_x[found.objects.number > 0] == 0.1) and np.all(surface.height[:3] == 0.0)
+
+
+def test_no_second_object_where_the_first_leaves_far_more_than_no_substrate():
+    """A flat substrate that leaves 3 times the misfit of the relief alone ends the search, 1.5 times does not."""
+    relief = Surface(np.full(SHAPE, 30.0), *np.zeros((2, *SHAPE)))
+    outlines = ((X < 20) + 2 * (X > 30)) * (np.abs(Y - 20) < 10)
+    for factor, ends in ((3.0, True), (1.5, False)):
+        said: list[str] = []
+        trial = ObjectSearch(
+            relief,
+            np.zeros(SHAPE, bool),
+            (10.0, 10.0),
+            lambda surface, f=factor: 100.0 if np.all(surface.height == 30.0) else f * 100.0,
+            lambda surface: np.full(SHAPE, 2.0 * LIMIT),
+            said.append,
+        )
+        assert (trial.find(Objects(outlines, (0.0, 0.0))) is None) == ends
+        assert len(said) == (1 if ends else 2)
 
 
 @pytest.fixture(scope="module")

@@ -47,6 +47,17 @@ def test_an_image_that_nothing_explains_is_no_pit():
     assert search.find(SHAPE) is None
 
 
+def test_a_cone_is_no_pit():
+    """A floor at any level explains a ring of it alone: no pit, and nothing is looked for within. A flat one is a pit.
+
+    Without the rule there is a pit of several levels, whose floors explain 10 to 20 % of their pixels.
+    """
+    cone = np.minimum(8.0 * np.hypot(X - 25, Y - 20) - 120.0, 0.0)
+    for truth, is_pit in ((cone, False), (-100.0 * (cone < -30.0), True)):
+        search = PitSearch(lambda s, z=truth: (0.9 + np.abs(s.height - z) / 12.0)[None], (PITCH, PITCH), (0.0, 0.0))
+        assert (search.find(SHAPE) is not None) == is_pit
+
+
 def test_a_hopeless_search_ends_with_the_largest_pit():
     """Where a floor leaves more than `hopeless`, the inner pit is not looked for, and there are no pits at all."""
     tried = []
