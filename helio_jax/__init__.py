@@ -46,6 +46,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   maps                samples from height maps and reconstructions
   placement           scale, rotation and position of any sample
   surfaces            triangles and exact spheres of a sample; closed-form first hits
+  hidden_side         where the side that the beam does not see may stand
   body                Body: triangles and spheres with material names
   border              continuation of a surface beyond its image
   wall_grid           grid of heights whose walls are half-way between pixels

@@ -160,3 +160,24 @@ def check_correlation(n: int, std: Sequence[float], correlation: Sequence[Sequen
         raise ValueError("std must be >= 0, correlation symmetric with a diagonal of ones: calibrate anew")
     if np.linalg.eigvalsh(matrix).min() < -0.01:
         raise ValueError("correlation must not have negative eigenvalues: calibrate anew")
+
+
+def distance_to_end(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
+    """Compute the distance from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
+
+    A region that reaches the image's border does not end there.
+    """
+    step = min(pitch)
+    room = np.pad(inside, 1, mode="edge")
+    row, column = (index + 1.0 for index in np.nonzero(inside))
+    left, is_in = np.zeros(row.size), np.ones(row.size, bool)
+    for n in range(1, int(math.hypot(*(np.array(inside.shape) * pitch)) / step) + 2):
+        at_row = np.clip(np.rint(row + n * step * way[1] / pitch[0]), 0, room.shape[0] - 1).astype(int)
+        at_column = np.clip(np.rint(column + n * step * way[0] / pitch[1]), 0, room.shape[1] - 1).astype(int)
+        is_in &= room[at_row, at_column]
+        if not is_in.any():
+            break
+        left[is_in] = n * step
+    distance = np.zeros(inside.shape)
+    distance[inside] = left + 0.5 * step
+    return distance

@@ -337,6 +337,7 @@ class _Fits:
                     lambda trial: self.short_fit(trial, patches),
                     self.stack.instrument.beam_shift,
                     self.say,
+                    is_substrate_flat=self.settings.border == "flat",
                 )
                 start, is_undecided = found.surface, covered(steps, found.undecided)
                 if moved := [steps[i] for i in found.moved]:

@@ -1,9 +1,9 @@
 """Levels of regions that depth jumps part from their surroundings: many are tried, the best explanation is kept.
 
 `search_levels` tries each region at a number of levels: flat, with the relief that was fitted, and with the wall that
-the beam would see. All physics is predicted anew, nothing is fitted: masks that end elsewhere than in the images are
-what tells the levels apart. The level is then fitted like every other height, and its error bar says whether masks or
-the near field fix it; a region that something else explains about as well is undecided.
+the beam would see, within the region or beside it. All physics is predicted anew, nothing is fitted: masks that end
+elsewhere than in the images are what tells the levels apart. The level is then fitted like every other height, and its
+error bar says whether masks or the near field fix it; a region that something else explains about as well is undecided.
 """
 
 import math
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.optimize import minimize_scalar
 
-from helio_jax.arrays import nearest_known
+from helio_jax.arrays import distance_to_end, nearest_known
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.quality import FLOATING
@@ -29,12 +29,14 @@ _SHIFTS = (0.03, 0.06, 0.125, 0.25)
 GAIN = 30.0
 """By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
 worse may be true as well."""
+MOST_FITS = 2
+"""So many surfaces with a region at its measured level are fitted shortly."""
 _LEVEL_STEPS = 5
 """Evaluations by which the best level is refined."""
 
 SKIRT = 4
 """Pixels around a region that a fit without the jump may have raised."""
-KINDS = "flat", "as fitted", "flat, with a wall"
+KINDS = "flat", "as fitted", "flat, with a wall", "flat, beside a wall"
 """Relief of a region that is put to another level."""
 
 Misfit = Callable[[Surface], float]
@@ -50,27 +52,6 @@ class Levels(NamedTuple):
     surface: Surface
     moved: list[int]
     undecided: list[int]
-
-
-def _distance_to_region_edge(inside: np.ndarray, way: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
-    """Compute the distance from every pixel of a region to its end in a direction (x, y) [y, x], um; 0 outside.
-
-    A region that reaches the image's border does not end there.
-    """
-    step = min(pitch)
-    room = np.pad(inside, 1, mode="edge")
-    row, column = (index + 1.0 for index in np.nonzero(inside))
-    left, is_in = np.zeros(row.size), np.ones(row.size, bool)
-    for n in range(1, int(math.hypot(*(np.array(inside.shape) * pitch)) / step) + 2):
-        at_row = np.clip(np.rint(row + n * step * way[1] / pitch[0]), 0, room.shape[0] - 1).astype(int)
-        at_column = np.clip(np.rint(column + n * step * way[0] / pitch[1]), 0, room.shape[1] - 1).astype(int)
-        is_in &= room[at_row, at_column]
-        if not is_in.any():
-            break
-        left[is_in] = n * step
-    distance = np.zeros(inside.shape)
-    distance[inside] = left + 0.5 * step
-    return distance
 
 
 def at_level(
@@ -99,11 +80,35 @@ def at_level(
     if beam_shift is not None:
         along, sign = math.hypot(*beam_shift), np.sign(level)
         x, y = (-sign * shift / along for shift in beam_shift)
-        height = _distance_to_region_edge(inside, (x, y), pitch) / along
+        height = distance_to_end(inside, (x, y), pitch) / along
         is_wall = height < abs(level)
         wall = Surface(surroundings + sign * height, -sign * x / along, -sign * y / along)
         flat = jax.tree.map(lambda *fields: np.where(is_wall, *fields), wall, flat)
     return jax.tree.map(lambda *fields: np.where(inside, *fields), flat, surface)
+
+
+def beside_wall(
+    inside: np.ndarray,
+    surface: Surface,
+    level: float,
+    surroundings: float,
+    pitch: tuple[float, float],
+    beam_shift: tuple[float, float],
+) -> Surface:
+    """Make a surface with a region flat at a level above its surroundings, and the wall that the beam sees outside it.
+
+    The wall of a plateau that faces the beam is beside the plateau, where the micrographs show it as a region of its
+    own; of a hollow, the beam sees the far wall, which is within (`at_level`). Arguments as those.
+    """
+    flat = at_level(inside, surface, level, surroundings, pitch, None)
+    if level <= 0.0:
+        return flat
+    along = math.hypot(*beam_shift)
+    x, y = (shift / along for shift in beam_shift)
+    height = level - distance_to_end(~inside, (x, y), pitch) / along
+    wall = Surface(surroundings + height, *(np.full(inside.shape, way / along) for way in (x, y)))
+    is_wall = ~inside & (height > 0.0)
+    return jax.tree.map(lambda *fields: np.where(is_wall, *fields), wall, flat)
 
 
 @dataclass(frozen=True)
@@ -150,25 +155,27 @@ class _RegionSearch:
         if kind == "as fitted":
             rise = level + self.surroundings - float(np.median(self.base.height[self.inside]))
             return Surface(self.base.height + rise * self.inside, self.base.slope_x, self.base.slope_y)
+        if kind == "flat, beside a wall":
+            return beside_wall(self.inside, self.base, level, self.surroundings, self.pitch, self.beam_shift)
         shift = self.beam_shift if kind == "flat, with a wall" else None
         return at_level(self.inside, self.base, level, self.surroundings, self.pitch, shift)
 
     def misfit_at(self, level: float, kind: str) -> float:
         """Compute the misfit with the region at a level above the surroundings, um; infinite if not predictable."""
-        self.report(f"{self.name}: trying the level {level:+.0f} um, {kind}")
         trial = self.trial(level, kind)
         key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
         if key not in self.tried:
+            self.report(f"{self.name}: trying the level {level:+.0f} um, {kind}")
             try:
                 self.tried[key] = self.misfit(trial)
             except PredictionError:  # no level of a wall that nothing can be predicted of
                 self.tried[key] = np.inf
         return self.tried[key]
 
-    def search(self, levels: list[float]) -> list[Surface]:
-        """Find the best level of each kind of relief."""
+    def search(self, levels: list[float]) -> list[tuple[float, Surface]]:
+        """Find the best level of each kind of relief: its misfit and surface."""
         out = []
-        for kind in KINDS if any(self.beam_shift) else KINDS[:-1]:
+        for kind in KINDS if any(self.beam_shift) else KINDS[:2]:
             tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
             best = tried[i]
@@ -176,7 +183,7 @@ class _RegionSearch:
                 bracket, options = (tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]), {"maxiter": _LEVEL_STEPS}
                 found = minimize_scalar(self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options=options)
                 best = min((best, float(found.x)), key=lambda level, kind=kind: self.misfit_at(level, kind))
-            out.append(self.trial(best, kind))
+            out.append((self.misfit_at(best, kind), self.trial(best, kind)))
         return out
 
     def shifts(self, levels: list[float]) -> list[float]:
@@ -195,11 +202,16 @@ def search_levels(
     short_fit: ShortFit,
     beam_shift: tuple[float, float] = (0.0, 0.0),
     report: Callable[[str], None] = lambda said: None,
+    is_substrate_flat: bool = False,
 ) -> Levels:
     """Find the surface with all regions at the levels that explain the images best.
 
     For every kind of relief the best level is found with nothing fitted. What explains the images best after a short
     fit is kept.
+
+    A fit that bridged jumps raised the surroundings, and their masks and multiple scattering let it stay so: the foot
+    of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions are also tried on a flat
+    substrate, where there may be one.
 
     Args:
         regions: one after the other; they may overlap.
@@ -209,20 +221,31 @@ def search_levels(
         misfit, short_fit: see `Misfit`, `ShortFit`.
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
+        is_substrate_flat: whether regions are also tried on a flat substrate at height 0.
     """
     best, found = short_fit(surface)
     moved, undecided = [], []
     for i, region in enumerate(regions):
         inside = region.inside
         done = covered(regions, moved) & ~inside
-        base = without_skirt(inside, done, found)
         around = grown(inside, SKIRT) & ~inside
-        surroundings = float(np.median(base.height[around]))
-        name = f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
-        search = _RegionSearch(name, inside, base, surroundings, pitch, beam_shift, misfit, report)
-        trials = search.search([level - surroundings for level in region.heights(surroundings, pitch, max_width)])
+
+        def search_on(base: Surface, where: str = "", i=i, region=region, around=around):
+            surroundings = float(np.median(base.height[around]))
+            name = f"region {i + 1} of {len(regions)}, {region.inside.sum()} pixels{where}"
+            search = _RegionSearch(name, region.inside, base, surroundings, pitch, beam_shift, misfit, report)
+            return search, [level - surroundings for level in region.heights(surroundings, pitch, max_width)]
+
+        search, levels = search_on(without_skirt(inside, done, found))
+        surroundings, trials = search.surroundings, search.search(levels)
+        if is_substrate_flat:
+            flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
+            search, levels = search_on(flat, ", on a flat substrate")
+            trials += search.search(levels)
+        if region.step is not None:
+            trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
         explanations = [(best, found)]
-        for trial in trials:
+        for _, trial in trials:
             with suppress(PredictionError):
                 explanations.append(short_fit(trial))
         value, better = min(explanations, key=lambda entry: entry[0])

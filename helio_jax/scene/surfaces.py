@@ -9,18 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from helio_jax.arrays import WALL_PITCHES
 from helio_jax.errors import SceneError
 from helio_jax.scene.body import Body
 
 WALL_SEGMENTS = 1440
 """Segments of a moat's outer wall: the polygon lies at most 2.4e-6 of its radius inside the circle."""
-_MIN_NORMAL_Z = 0.5
-"""Lower limit of the normal's z when the height at the foot of a wall is extrapolated: a wall counts as 60 degrees."""
-_LEE_PIXELS = 2.0
-"""Gaussian width [pixels] of the smoothed heights whose downhill direction defines the lee side of an edge."""
-_LEE_COSINE = 0.25
-"""Lee side: the cosine of the angle between downhill direction and beam azimuth is at least this."""
 
 
 def flat_body(size: float, height: float = 0.0) -> Body:
@@ -182,71 +175,6 @@ def surface_body(
     return Body(np.concatenate([points, extra]), np.concatenate([faces, extra_faces]))
 
 
-def occluded_vertices(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, normals: np.ndarray, beam_shift: tuple[float, float], share: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimate the shadowed surface on the lee side of occlusion edges of a beam-frame grid, for `with_cavities`.
-
-    The shadowed surface lies between the sheet along the beam, its outer limit, and the vertical below the edge. The
-    point at the sheet's foot is moved back by a fraction of the way to the vertical, in its tangent plane (a wall
-    counts as 60 degrees). The sheet itself faces the plate and would scatter atoms there that a real cavity keeps.
-    Measured on spheres A and B and in a trench: tests/physics/test_hidden_side.py.
-
-    Args:
-        x, y, z: sample-frame positions [y, x], um, as for `surface_body`.
-        normals: unit normals there [y, x, 3].
-        beam_shift: `Instrument.beam_shift` of the grid.
-        share: fraction of the way, 0 (the sheet along the beam) to 1 (a vertical wall below the edge).
-
-    Returns:
-        x, y, z with the moved points [y, x], um.
-    """
-    from scipy.ndimage import gaussian_filter, maximum_filter
-
-    pitch_x, pitch_y = (
-        np.abs(np.diff(at + z * shift, axis=axis)).mean()
-        for axis, at, shift in zip((1, 0), (x, y), beam_shift, strict=True)
-    )
-    slope_x, slope_y = np.gradient(gaussian_filter(z, _LEE_PIXELS))[::-1]
-    downhill = -slope_x / pitch_x, -slope_y / pitch_y
-    along_beam = downhill[0] * beam_shift[0] + downhill[1] * beam_shift[1]
-    is_lee = along_beam > _LEE_COSINE * np.hypot(*downhill) * np.hypot(*beam_shift)
-    fall = maximum_filter(z, size=3) - z
-    drop = np.where((fall > WALL_PITCHES * max(pitch_x, pitch_y)) & is_lee, fall, 0.0)
-    back_x, back_y = (share * drop * shift for shift in beam_shift)
-    rise = (normals[..., 0] * back_x + normals[..., 1] * back_y) / np.maximum(normals[..., 2], _MIN_NORMAL_Z)
-    return x - back_x, y - back_y, z + rise
-
-
-def with_cavities(body: Body, grid: tuple[np.ndarray, ...], behind: tuple[np.ndarray, ...]) -> Body:
-    """Move the lower ends of a `surface_body`'s faces across occlusion edges; a strip of faces closes the gap.
-
-    Args:
-        body: its first vertices are the grid's.
-        grid: x, y, z of the grid's points [y, x], um.
-        behind: new lower ends, from `occluded_vertices`.
-    """
-    from scipy.ndimage import maximum_filter
-
-    points, ends = (np.stack([field.ravel() for field in fields], -1) for fields in (grid, behind))
-    foot, n = np.flatnonzero(np.any(points != ends, axis=1)), len(body.vertices)
-    if not foot.size:
-        return body
-    hidden, rim = np.arange(n), np.full(n, np.inf)
-    hidden[foot] = n + np.arange(foot.size)
-    rim[foot] = 0.5 * (maximum_filter(grid[2], size=3).ravel() + points[:, 2])[foot]
-    top = body.vertices[body.faces, 2].max(1)
-    is_across = np.any(top[:, None] > rim[body.faces], axis=1)
-    seen, across = body.faces[~is_across], body.faces[is_across]
-    # edges shared by a face across an occlusion edge and another face, in the other's direction
-    edge, other = (f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2) for f in (across[:, ::-1], seen))
-    shared = other[np.isin(other @ [n, 1], edge @ [n, 1])]
-    u, v = shared.T
-    strip = _with_area(np.concatenate([np.stack([v, u, hidden[u]], 1), np.stack([v, hidden[u], hidden[v]], 1)]))
-    vertices, faces = np.concatenate([body.vertices, ends[foot]]), np.concatenate([seen, hidden[across], strip])
-    return Body(vertices, faces)
-
-
 def first_hit_spheres(
     x: np.ndarray, y: np.ndarray, spheres: np.ndarray, beam_shift: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -322,10 +250,10 @@ def _strip(inner: np.ndarray, outer: np.ndarray, is_closed: bool = True) -> np.n
     """Triangulate between two counter-clockwise polylines of equal length."""
     i1, o1 = np.roll(inner, -1), np.roll(outer, -1)
     faces = np.stack([np.stack([i1, inner, outer], 1), np.stack([i1, outer, o1], 1)], 1)
-    return _with_area((faces if is_closed else faces[:-1]).reshape(-1, 3))
+    return with_area((faces if is_closed else faces[:-1]).reshape(-1, 3))
 
 
-def _with_area(faces: np.ndarray) -> np.ndarray:
+def with_area(faces: np.ndarray) -> np.ndarray:
     """Select the faces [m, 3] whose three vertices differ."""
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return faces[has_area]

@@ -25,8 +25,9 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.border import extend_border, mirror_border
+from helio_jax.scene.hidden_side import occluded_vertices, with_cavities
 from helio_jax.scene.scattering import COSINE_LAW, Term
-from helio_jax.scene.surfaces import occluded_vertices, surface_body, with_cavities
+from helio_jax.scene.surfaces import surface_body
 from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import SMOOTH_NORMALS, passes_for, smooth_along_surface, surface_width
