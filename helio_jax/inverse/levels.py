@@ -210,8 +210,8 @@ def search_levels(
     fit is kept.
 
     A fit that bridged jumps raised the surroundings, and their masks and multiple scattering let it stay so: the foot
-    of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions are also tried on a flat
-    substrate, where there may be one.
+    of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions of measured levels are also tried
+    on a flat substrate, where there may be one.
 
     Args:
         regions: one after the other; they may overlap.
@@ -221,7 +221,7 @@ def search_levels(
         misfit, short_fit: see `Misfit`, `ShortFit`.
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
-        is_substrate_flat: whether regions are also tried on a flat substrate at height 0.
+        is_substrate_flat: whether regions of measured levels are also tried on a flat substrate at height 0.
     """
     best, found = short_fit(surface)
     moved, undecided = [], []
@@ -238,11 +238,11 @@ def search_levels(
 
         search, levels = search_on(without_skirt(inside, done, found))
         surroundings, trials = search.surroundings, search.search(levels)
-        if is_substrate_flat:
-            flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
-            search, levels = search_on(flat, ", on a flat substrate")
-            trials += search.search(levels)
         if region.step is not None:
+            if is_substrate_flat:
+                flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
+                search, levels = search_on(flat, ", on a flat substrate")
+                trials += search.search(levels)
             trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
         explanations = [(best, found)]
         for _, trial in trials:

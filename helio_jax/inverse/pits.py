@@ -5,7 +5,7 @@ substrate does not explain are the pit, to the pixel; a pit in a pit is what the
 explain. The level of a floor is the one whose masks, wall and multiple scattering explain the micrographs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,7 +31,9 @@ MOST_PITS = 8
 DEPTHS = 0.0625, 0.125, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0
 """Depths that are tried, in widths of the pit ..."""
 REFINEMENTS = 6
-"""... and how many more around the best one."""
+"""... and how many more around the best ones: a minimum may be narrower than their distance ..."""
+MOST_MINIMA = 2
+"""... so that around so many minima more are tried."""
 MOST_OF_BORDER = 0.5
 """Largest share of the border's pixels in a pit."""
 _SQUARE = np.ones((3, 3))
@@ -136,12 +138,21 @@ class PitSearch:
 
         depths = [width * share for share in DEPTHS]
         tried = [misfit(depth) for depth in depths]
-        best = int(np.argmin(tried))
-        bounds = depths[max(best - 1, 0)], depths[min(best + 1, len(depths) - 1)]
-        found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": REFINEMENTS})
-        value, depth = min((tried[best], depths[best]), (float(found.fun), float(found.x)))
+        value, depth = min(zip(tried, depths, strict=True))
+        for place in minima(tried)[:MOST_MINIMA]:
+            bounds = depths[max(place - 1, 0)], depths[min(place + 1, len(depths) - 1)]
+            found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": REFINEMENTS})
+            value, depth = min((value, depth), (float(found.fun), float(found.x)))
         number = np.where(inside, pits.number.max() + 1, pits.number)
         return Pits(trial(depth), number, value), above - depth
+
+
+def minima(values: Sequence[float]) -> list[int]:
+    """List the places of local minima, the least first."""
+    room = np.pad(np.asarray(values, float), 1, constant_values=np.inf)
+    inner = room[1:-1]
+    places = np.flatnonzero((inner <= room[:-2]) & (inner <= room[2:]) & np.isfinite(inner))
+    return places[np.argsort(inner[places], kind="stable")].tolist()
 
 
 def floor_of(surface: Surface, inside: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.correlated_errors import EdgeError
 from helio_jax.inverse.edges import find_edges
 from helio_jax.inverse.explanations import _Fits
-from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of
+from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of, minima
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import EDGE_PLACE, edge_std
 from helio_jax.workflows.corrections import make_predictor
@@ -35,6 +35,21 @@ def test_a_pit_in_a_pit_has_two_outlines_and_two_levels():
     assert pits is not None and pits.number.max() >= 2
     assert np.sum((pits.number > 0) != OUTER) <= 4  # corners
     assert np.sum(np.abs(pits.surface.height - truth) > 0.05 * 130.0) <= 8
+
+
+def test_all_minima_of_the_depth_are_looked_into():
+    """A narrow minimum at 57 um beside a wide one at 500 um: both are found, the least first."""
+    assert minima([5.0, 3.0, 4.0, 6.0, 2.0, 2.5]) == [4, 1]
+    assert minima([np.inf, np.inf]) == [] and minima([1.0]) == [0]
+
+    def residuals(surface):
+        depth = -surface.height
+        narrow = 0.9 + 2.0 * np.minimum(np.abs(depth - 57.0) / 20.0, 2.0)
+        wide = 1.2 + 2.0 * np.minimum(np.abs(depth - 500.0) / 400.0, 2.0)
+        return np.where(OUTER, np.minimum(narrow, wide), 0.9 + np.abs(depth))[None]
+
+    pits = PitSearch(residuals, (PITCH, PITCH), (0.0, 0.0)).find(SHAPE)
+    assert pits is not None and np.median(pits.surface.height[OUTER]) == pytest.approx(-57.0, abs=5.0)
 
 
 def test_no_pit_where_the_substrate_explains_all():
