@@ -13,7 +13,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.anchor_settings import AnchorSettings
-from helio_jax.inverse.anchoring import LIMIT, MEASURED, _Known, _moved, leave_out, pulls_of, with_anchors
+from helio_jax.inverse.anchoring import LIMIT, MEASURED, _Known, _moved, are_coherent, leave_out, pulls_of, with_anchors
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.explanations import explain
 from helio_jax.inverse.fit import derivative_of_sums, with_posterior
@@ -338,3 +338,13 @@ def test_a_measured_step_that_contradicts_all_else_is_not_used(hills):
     assert "not used" in both.checks[2].sentence()
     spread = [np.median(found.fit.posterior.height_std) for found in (right, both)]
     assert spread[1] > spread[0]
+
+
+def test_a_measured_step_that_moves_few_pixels_is_not_coherent():
+    """Sides that move as a whole, one of them not at all, count; 12 of 70 pixels that move far alone do not."""
+    weight, change = np.zeros((3, 20, 20)), np.zeros((3, 20, 20))
+    weight[:, 2:9, 2:12], weight[:, 12:16, 2:12] = 1.0 / 70.0, -1.0 / 40.0
+    change[0, 2:9, 2:12] = 1.0 + 0.2 * np.arange(10)
+    change[1, 2:5, 2:6] = 6.0
+    change[2, 2:9, 2:12], change[2, 12:14, 2:5] = 1.0, 10.0
+    assert are_coherent(weight, change).tolist() == [True, False, False]
