@@ -9,7 +9,8 @@ error bar says whether masks or the near field fix it; a region that something e
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -141,14 +142,23 @@ class _RegionSearch:
     """Levels tried for one region; `tried` maps the heights of each trial to its misfit."""
 
     name: str
-    inside: np.ndarray
+    region: Region
     base: Surface
-    surroundings: float
     pitch: tuple[float, float]
+    max_width: float
     beam_shift: tuple[float, float]
     misfit: Misfit
     report: Callable[[str], None]
     tried: dict[bytes, float] = field(default_factory=dict)
+
+    @property
+    def inside(self) -> np.ndarray:
+        return self.region.inside
+
+    @cached_property
+    def surroundings(self) -> float:
+        """Height of the surface around the region, um."""
+        return float(np.median(self.base.height[grown(self.inside, SKIRT) & ~self.inside]))
 
     def trial(self, level: float, kind: str) -> Surface:
         """Make the surface with the region at a level above the surroundings, um."""
@@ -172,9 +182,10 @@ class _RegionSearch:
                 self.tried[key] = np.inf
         return self.tried[key]
 
-    def search(self, levels: list[float]) -> list[tuple[float, Surface]]:
+    def search(self) -> list[tuple[float, Surface]]:
         """Find the best level of each kind of relief: its misfit and surface."""
-        out = []
+        heights = self.region.heights(self.surroundings, self.pitch, self.max_width)
+        levels, out = [height - self.surroundings for height in heights], []
         for kind in KINDS if any(self.beam_shift) else KINDS[:2]:
             tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
@@ -228,21 +239,13 @@ def search_levels(
     for i, region in enumerate(regions):
         inside = region.inside
         done = covered(regions, moved) & ~inside
-        around = grown(inside, SKIRT) & ~inside
-
-        def search_on(base: Surface, where: str = "", i=i, region=region, around=around):
-            surroundings = float(np.median(base.height[around]))
-            name = f"region {i + 1} of {len(regions)}, {region.inside.sum()} pixels{where}"
-            search = _RegionSearch(name, region.inside, base, surroundings, pitch, beam_shift, misfit, report)
-            return search, [level - surroundings for level in region.heights(surroundings, pitch, max_width)]
-
-        search, levels = search_on(without_skirt(inside, done, found))
-        surroundings, trials = search.surroundings, search.search(levels)
+        base, name = without_skirt(inside, done, found), f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
+        search = _RegionSearch(name, region, base, pitch, max_width, beam_shift, misfit, report)
+        trials = search.search()
         if region.step is not None:
             if is_substrate_flat:
                 flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
-                search, levels = search_on(flat, ", on a flat substrate")
-                trials += search.search(levels)
+                trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
             trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
         explanations = [(best, found)]
         for _, trial in trials:
@@ -252,7 +255,8 @@ def search_levels(
         if value < best - GAIN:
             best, found = value, better
             moved.append(i)
-        if any(_differ(found, other, inside, surroundings) for value, other in explanations if value < best + GAIN):
+        as_good = [other for value, other in explanations if value < best + GAIN]
+        if any(_differ(found, other, inside, search.surroundings) for other in as_good):
             undecided.append(i)
     return Levels(found, moved, undecided)
 

@@ -113,7 +113,7 @@ class ObjectSearch:
     def find(self, objects: Objects) -> Trial | None:
         """Find each object's outline and level, from outlines that are too wide; None where there is no hope."""
         best, n = self._tried(objects), len(objects.shift)
-        hopeless = HOPELESS * self.misfit(self.relief)
+        hopeless = HOPELESS * self._misfit_of(self.relief)
         sizes = np.bincount(objects.number.ravel())[1:]
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
@@ -127,11 +127,15 @@ class ObjectSearch:
                 return None
         return best
 
-    def _tried(self, objects: Objects) -> Trial:
+    def _misfit_of(self, surface: Surface) -> float:
+        """Compute the misfit of a surface; infinite where nothing can be predicted of it."""
         try:
-            return Trial(objects, self.misfit(objects.surface(self.relief)))
+            return self.misfit(surface)
         except PredictionError:
-            return Trial(objects, np.inf)
+            return np.inf
+
+    def _tried(self, objects: Objects) -> Trial:
+        return Trial(objects, self._misfit_of(objects.surface(self.relief)))
 
     def _shifted(self, trial: Trial, number: int, shares: Iterable[float]) -> Iterator[Trial]:
         """Shift an object by shares of its width."""
