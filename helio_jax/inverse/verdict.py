@@ -96,24 +96,19 @@ class Misfit:
     Attributes:
         difference: model minus data, NaN where not observed [detector, y, x].
         std: standard deviation of the data about the model [detector, y, x].
-        edge_std: of the data by where within its pixel an edge lies (`edge_std`) [detector, y, x].
         form_factor: of the heights, without masks [detector, 3, y, x].
         normals: of the heights [y, x, 3].
     """
 
     difference: np.ndarray
     std: np.ndarray
-    edge_std: np.ndarray
     form_factor: np.ndarray
     normals: np.ndarray
 
     @property
     def residuals(self) -> np.ndarray:
-        """(model - data) / standard deviation [detector, y, x].
-
-        Edges of the image count as known to a pixel only: no map on this raster knows more.
-        """
-        return self.difference / np.hypot(self.std, self.edge_std)
+        """(model - data) / standard deviation [detector, y, x]."""
+        return self.difference / self.std
 
 
 def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPatches, trace: Trace) -> Misfit:
@@ -132,8 +127,7 @@ def misfit_of_map(stack: MicrographStack, rec: Reconstruction, patches: AlbedoPa
     phi = form_factor(optics, rec.height)
     single = single_scattering(phi - c.masked, np.moveaxis(normals, -1, 0))
     model = albedo * (single + (0.0 if stack.is_without_multiple else c.multiple))
-    edges = edge_std(signal, variance)
-    return Misfit(model - signal, data_std(variance, model, c, albedo), edges, albedo * phi, normals)
+    return Misfit(model - signal, data_std(variance, model, c, albedo), albedo * phi, normals)
 
 
 def _traced_state(problem: "FitProblem", state: "FitState", trace: Trace) -> tuple["FitState", np.ndarray, np.ndarray]:
@@ -161,8 +155,7 @@ def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> M
     optics = moved_optics(problem.optics, problem.moves(state.parameters))
     gain = np.exp(problem.priors.gain * state.parameters.log_gain)[:, None, None, None]
     phi = gain * problem.patches_at(state.parameters).albedo * form_factor(optics, state.surface.height)
-    edges = edge_std(problem.signal, problem.variance)
-    return Misfit(difference, std, edges, phi, state.surface.normals(problem.shift))
+    return Misfit(difference, std, phi, state.surface.normals(problem.shift))
 
 
 def residuals_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> np.ndarray:

@@ -51,9 +51,7 @@ def misfit_of(instrument, height, slopes, wrong_by, noise=1e-9) -> Misfit:
     true, found = (n / np.linalg.norm(n, axis=0) for n in normal)
     phi = form_factor(Optics.of(instrument), np.full((N, N), height))
     difference = np.einsum("kiyx,iyx->kyx", phi, found - true)
-    return Misfit(
-        difference, np.full(difference.shape, noise), np.zeros(difference.shape), phi, np.moveaxis(found, 0, -1)
-    )
+    return Misfit(difference, np.full(difference.shape, noise), phi, np.moveaxis(found, 0, -1))
 
 
 def test_slope_errors_are_those_of_the_map(bshem):
@@ -145,7 +143,7 @@ def test_error_bars_of_a_tested_map_hold_what_its_path_adds(bshem):
     )
     ringed = ring(6.0, 10.0)
     wrong = misfit_of(bshem, 0.0, (0.0, 0.0), (0.2, 0.0))
-    misfit = Misfit(wrong.difference * ringed, wrong.std, wrong.edge_std, wrong.form_factor, wrong.normals)
+    misfit = Misfit(wrong.difference * ringed, wrong.std, wrong.form_factor, wrong.normals)
     tested = rec.replace(chi_square=np.where(ring(5.0, 11.0), 1e4, 1.0))
     found = with_path_error(tested, misfit, stack, ReconstructSettings(border="flat"))
     assert found.height_std is not None
