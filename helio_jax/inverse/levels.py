@@ -37,8 +37,10 @@ _LEVEL_STEPS = 5
 
 SKIRT = 4
 """Pixels around a region that a fit without the jump may have raised."""
-KINDS = "flat", "as fitted", "flat, with a wall", "flat, beside a wall"
-"""Relief of a region that is put to another level."""
+RELIEFS = "flat", "as fitted"
+"""Relief of a region that is put to another level ..."""
+WALLS = "flat, with a wall", "flat, beside a wall"
+"""... and, where an oblique beam sees its wall, that wall within the region or outside it."""
 
 Misfit = Callable[[Surface], float]
 """Half the chi-square of the data expected on a surface, nothing fitted."""
@@ -183,10 +185,10 @@ class _RegionSearch:
         return self.tried[key]
 
     def search(self) -> list[tuple[float, Surface]]:
-        """Find the best level of each kind of relief: its misfit and surface."""
+        """Find the best level of each kind of relief: its misfit and surface, each surface once."""
         heights = self.region.heights(self.surroundings, self.pitch, self.max_width)
-        levels, out = [height - self.surroundings for height in heights], []
-        for kind in KINDS if any(self.beam_shift) else KINDS[:2]:
+        levels, out = [height - self.surroundings for height in heights], {}
+        for kind in RELIEFS + (WALLS if any(self.beam_shift) else ()):
             tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
             best = tried[i]
@@ -194,8 +196,9 @@ class _RegionSearch:
                 bracket, options = (tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]), {"maxiter": _LEVEL_STEPS}
                 found = minimize_scalar(self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options=options)
                 best = min((best, float(found.x)), key=lambda level, kind=kind: self.misfit_at(level, kind))
-            out.append((self.misfit_at(best, kind), self.trial(best, kind)))
-        return out
+            surface = self.trial(best, kind)
+            out.setdefault(surface.height.tobytes(), (self.misfit_at(best, kind), surface))
+        return list(out.values())
 
     def shifts(self, levels: list[float]) -> list[float]:
         """Choose the levels to which the relief that was fitted is shifted: about its own, unless one is known, um."""

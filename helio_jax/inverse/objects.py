@@ -40,7 +40,7 @@ SHARP = 0.2
 """A signal that jumps by more than this share of the flat substrate's, beyond its change nearby, shows an edge."""
 LEAST_PIXELS = 12
 """Smaller objects are not looked for."""
-HOPELESS = 2.0
+MOST_MISFIT = 2.0
 """No more objects are looked for where the first leaves so many times the misfit of the relief without a substrate."""
 MOST_OBJECTS = 8
 """More objects are not looked for: the smaller ones keep the relief that they start with."""
@@ -111,9 +111,12 @@ class ObjectSearch:
     report: Callable[[str], None] = lambda said: None
 
     def find(self, objects: Objects) -> Trial | None:
-        """Find each object's outline and level, from outlines that are too wide; None where there is no hope."""
+        """Find each object's outline and level, from outlines that are too wide.
+
+        None where a flat substrate explains too little (`MOST_MISFIT`).
+        """
         best, n = self._tried(objects), len(objects.shift)
-        hopeless = HOPELESS * self._misfit_of(self.relief)
+        limit = MOST_MISFIT * self._misfit_of(self.relief)
         sizes = np.bincount(objects.number.ravel())[1:]
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
@@ -123,7 +126,7 @@ class ObjectSearch:
             for steps in STEPS:
                 others = list(self._shifted(best, number, steps))
                 best = _best([best, *others, *(self._peeled(t, number) for t in others)])
-            if best.misfit > hopeless:
+            if best.misfit > limit:
                 return None
         return best
 

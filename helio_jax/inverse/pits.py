@@ -75,16 +75,17 @@ class PitSearch:
         """Find the pits of an image; None where there is none, or where the search is hopeless."""
         flat = Surface(*np.zeros((3, *shape)))
         pits = Pits(flat, np.zeros(shape, int), self.misfit(flat))
-        places = [(inside, 0.0) for inside in self.outlines(flat, np.ones(shape, bool))]
+        places = [(inside, 0.0) for inside in outlines(self.is_unexplained(flat))]
         for _ in range(MOST_PITS):
             if not places:
                 break
             inside, above = places.pop(0)
             deeper, level = self.sunk(pits, inside, above)
-            if deeper.misfit < pits.misfit - GAIN and self.is_floor_explained(deeper.surface, inside):
-                pits = deeper
-                inner = self.outlines(pits.surface, floor_of(pits.surface, inside))
-                places = [(within, level) for within in inner] + places
+            if deeper.misfit < pits.misfit - GAIN:
+                floor, is_unexplained = floor_of(deeper.surface, inside), self.is_unexplained(deeper.surface)
+                if np.mean(is_unexplained[floor]) <= 1.0 - LEAST_EXPLAINED:
+                    pits = deeper
+                    places = [(within, level) for within in outlines(floor & is_unexplained)] + places
             if pits.misfit > self.hopeless:
                 return None
         return pits if pits.number.any() else None
@@ -99,19 +100,6 @@ class PitSearch:
     def is_unexplained(self, surface: Surface) -> np.ndarray:
         """Mark the pixels that a surface does not explain [y, x]."""
         return median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT
-
-    def is_floor_explained(self, surface: Surface, inside: np.ndarray) -> bool:
-        """Whether a surface explains the floor of a pit [y, x]."""
-        return bool(np.mean(self.is_unexplained(surface)[floor_of(surface, inside)]) <= 1.0 - LEAST_EXPLAINED)
-
-    def outlines(self, surface: Surface, where: np.ndarray) -> list[np.ndarray]:
-        """Find the regions of some pixels that a surface does not explain, the largest first [y, x]."""
-        is_unexplained = where & self.is_unexplained(surface)
-        closed = binary_closing(np.pad(binary_opening(is_unexplained, np.ones((2, 2))), 1), _SQUARE)[1:-1, 1:-1]
-        number = numbered(closed, LEAST_PIXELS)
-        found = [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]
-        # what holds most of the border is no pit in a substrate: the whole image is unexplained
-        return [inside for inside in found if np.mean(inside[border_mask(inside.shape, BORDER_WIDTH)]) < MOST_OF_BORDER]
 
     def sunk(self, pits: Pits, inside: np.ndarray, above: float) -> tuple[Pits, float]:
         """Sink a region below the floor around it, to the level that explains the data best.
@@ -147,12 +135,21 @@ class PitSearch:
         return Pits(trial(depth), number, value), above - depth
 
 
+def outlines(is_unexplained: np.ndarray) -> list[np.ndarray]:
+    """Find the regions of pixels that a surface does not explain, the largest first [y, x]."""
+    closed = binary_closing(np.pad(binary_opening(is_unexplained, np.ones((2, 2))), 1), _SQUARE)[1:-1, 1:-1]
+    number = numbered(closed, LEAST_PIXELS)
+    found = [number == n for n in 1 + np.argsort(-np.bincount(number.ravel())[1:], kind="stable")]
+    # what holds most of the border is no pit in a substrate: the whole image is unexplained
+    return [inside for inside in found if np.mean(inside[border_mask(inside.shape, BORDER_WIDTH)]) < MOST_OF_BORDER]
+
+
 def minima(values: Sequence[float]) -> list[int]:
     """List the places of local minima, the least first."""
-    room = np.pad(np.asarray(values, float), 1, constant_values=np.inf)
-    inner = room[1:-1]
-    places = np.flatnonzero((inner <= room[:-2]) & (inner <= room[2:]) & np.isfinite(inner))
-    return places[np.argsort(inner[places], kind="stable")].tolist()
+    from scipy.signal import find_peaks
+
+    places, _ = find_peaks(np.pad(-np.asarray(values, float), 1, constant_values=-np.inf))
+    return sorted((places - 1).tolist(), key=lambda place: values[place])
 
 
 def floor_of(surface: Surface, inside: np.ndarray) -> np.ndarray:

@@ -5,9 +5,9 @@ faces the plate and would scatter atoms there that a real cavity keeps.
 """
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, maximum_filter
+from scipy.ndimage import maximum_filter
 
-from helio_jax.arrays import WALL_PITCHES, distance_to_end
+from helio_jax.arrays import WALL_PITCHES, distance_to_end, nearest_known
 from helio_jax.scene.body import Body
 from helio_jax.scene.surfaces import with_area
 
@@ -49,6 +49,8 @@ def occluded_vertices(
     )
     fall = _fall_from_before(z, beam_shift, pitch)
     drop = np.where(fall > WALL_PITCHES * max(pitch), fall, 0.0)
+    if not drop.any():
+        return x, y, z
     back = np.minimum(share * drop * along, _free_way(z, fall > _LEAST_RISE * max(pitch), beam_shift, pitch))
     back_x, back_y = (back * shift / along for shift in beam_shift)
     rise = (normals[..., 0] * back_x + normals[..., 1] * back_y) / np.maximum(normals[..., 2], _MIN_NORMAL_Z)
@@ -69,10 +71,7 @@ def _free_way(
     z: np.ndarray, is_foot: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]
 ) -> np.ndarray:
     """Compute how far back along the beam a point at a wall's foot stays at that wall or below its top [y, x], um."""
-    if not is_foot.any():
-        return np.zeros(z.shape)
-    nearest = tuple(np.asarray(distance_transform_edt(~is_foot, return_distances=False, return_indices=True)))
-    is_top = z > z[nearest] + _LEAST_RISE * max(pitch)
+    is_top = z > z[nearest_known(is_foot)] + _LEAST_RISE * max(pitch)
     x, y = (-shift / np.hypot(*beam_shift) for shift in beam_shift)
     way = distance_to_end(is_foot | is_top, (x, y), (pitch[0], pitch[1]))
     return np.maximum(way - 0.5 * min(pitch), 0.0)

@@ -9,7 +9,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.correlated_errors import EdgeError
 from helio_jax.inverse.edges import find_edges
 from helio_jax.inverse.explanations import _Fits
-from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of, minima
+from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of, minima, outlines
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import EDGE_PLACE, edge_std
 from helio_jax.workflows.corrections import make_predictor
@@ -96,7 +96,7 @@ def test_outlines_need_several_pixels():
     wrong[:, 5, 5] = 100.0
     wrong[0, 20:24, 30:35] = 2.0 * np.sqrt(LIMIT)
     search = PitSearch(lambda _: wrong, (PITCH, PITCH), (0.0, 0.0))
-    regions = search.outlines(Surface(*np.zeros((3, *SHAPE))), np.ones(SHAPE, bool))
+    regions = outlines(search.is_unexplained(Surface(*np.zeros((3, *SHAPE)))))
     assert len(regions) == 1
     rows, columns = np.nonzero(regions[0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 23, 30, 34)
