@@ -1,76 +1,200 @@
-"""Correction of a scan's motion by what its images should be, where heights move pixels: Gauss-Newton.
+"""Correction of the motions of several scans, all at once, where heights move pixels: Gauss-Newton.
 
-At oblique incidence no rigid motion of the images exists, but on a known surface one of the sample does: images that
-are read at the surface differ from the predicted ones by their gradient times the motion's error.
+At oblique incidence no rigid motion of the images exists, but on a known surface one of the sample does. More than
+three images of a point, read at the right places, agree on one albedo and normal; where they do not, their gradients
+tell the motions' errors. Albedo and normal of every pixel are eliminated, so the motions are fitted to the images
+themselves, not to what other scans predict that may be as far off.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.arrays import robust_std
+from helio_jax.arrays import pitch, robust_std
+from helio_jax.block_fit import eliminate
 from helio_jax.errors import GuardError
 from helio_jax.robust import cauchy_weight
 
 ROBUST_LIMIT = 2.0
-"""Residual at which a pixel counts half, in robust standard deviations: masks and shadows are not predicted."""
+"""Residual at which a datum counts half, in robust standard deviations: masks and shadows are in no normal."""
+REWEIGHTINGS = 5
+"""Solutions with weights of the one before."""
+SHIFT_STD, ROTATION_STD = 3.0, math.radians(0.3)
+"""Assumed standard deviations of the stage's shifts [pixels] and rotations [rad]."""
+N_OWN = 3
+"""Unknowns of a pixel: albedo times normal."""
+WORST_CONDITION = 1e-10
+"""Least share of the largest eigenvalue that the smallest one of determined motions has."""
+LEAST_TRUE = 0.1
+"""Least share of the information that is taken to be the structure's, not that of noise in the gradients."""
+ALBEDO_STD = 0.03
+"""Assumed standard deviation of the albedo, from pixel to pixel, over its typical value."""
+_LEAST_LEFT = 0.05
+_DAMPING = 1e-9
+"""Of pixels whose images do not tell their normals."""
 
 
-def correct_motion(
-    images: np.ndarray, predicted: np.ndarray, is_known: np.ndarray, x: np.ndarray, y: np.ndarray, smoothing: float
-) -> tuple[Rigid, float, float]:
-    """Fit the rigid motion by which images must be moved to agree with predicted ones, and a gain of each image.
+class MotionCorrection(NamedTuple):
+    """What must be changed of the motions of scans.
 
-    Valid for errors up to about the smoothing.
+    Attributes:
+        motions: correction c of each scan: its motion m becomes m after c; the first scan's is none.
+        moved: by how much each moves a pixel's place, root mean square where the images have structure [um].
+        std: standard deviation of that, by residuals that are independent over the smoothing's area [um].
+    """
+
+    motions: tuple[Rigid, ...]
+    moved: tuple[float, ...]
+    std: tuple[float, ...]
+
+
+def correct_motions(
+    images: np.ndarray,
+    variance: np.ndarray,
+    form_factor: np.ndarray,
+    is_known: np.ndarray,
+    scan: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    smoothing: float,
+    stated: tuple[Rigid, ...],
+) -> MotionCorrection:
+    """Fit the rigid motions by which the images of all scans agree, and a gain of each image.
+
+    Valid for errors up to about the smoothing. Images that tell little leave motions where they are stated to be.
 
     Args:
-        images: of one scan, read on the surface [detector, y, x].
-        predicted: what they should be.
-        is_known: where both are known [detector, y, x].
+        images: read on the surface [image, y, x].
+        variance: of their noise [image, y, x].
+        form_factor: of that surface [image, 3, y, x].
+        is_known: [image, y, x].
+        scan: number of each image's scan, from 0 [image].
         x, y: raster of the common frame [um].
-        smoothing: standard deviation of the Gaussian that images and prediction are smoothed by [pixels].
-
-    Returns:
-        The correction c: the scan's motion m becomes m after c. Then, where the images have structure (root mean
-        square, weighted by the squared gradient): by how much it moves a pixel's place, and the standard deviation of
-        that, by residuals that are independent over the smoothing's area [um].
+        smoothing: standard deviation of the Gaussian that images are smoothed by [pixels].
+        stated: corrections that lead to the motions that the stage states, to `ROTATION_STD` and `SHIFT_STD`.
 
     Raises:
-        GuardError: the images determine no motion: nothing is known of them, or they show no structure.
+        GuardError: the images determine no motion: fewer than four see the same points, or they show no structure.
+
+    Source: Gauss-Newton with the pixels' unknowns eliminated (`helio_jax.block_fit`); noise in the gradients, which
+    would shorten the steps and the error bars, is taken off the information (errors in variables: Fuller, Measurement
+    Error Models, 1987, sec. 2.2).
     """
-    (grid_x, grid_y), number = np.meshgrid(x, y), len(images)
-    scale = 0.5 * max(np.ptp(x), np.ptp(y))
-    rows, right = [], []
-    for k, (image, model, known) in enumerate(zip(images, predicted, is_known, strict=True)):
-        weight = ndimage.gaussian_filter(known.astype(float), smoothing)
-        smooth = lambda f, known=known, weight=weight: (  # noqa: E731
-            ndimage.gaussian_filter(np.where(known, f, 0.0), smoothing) / np.maximum(weight, 1e-6)
-        )
-        seen, wanted = smooth(image), smooth(model)
-        down, along = np.gradient(wanted, y, x)
-        is_used = np.asarray(ndimage.binary_erosion(known & (weight > 0.5), iterations=2), bool)
-        gain = np.zeros((number, *image.shape))
-        gain[k] = seen
-        turned = (grid_x * down - grid_y * along) / scale
-        rows.append(np.stack([along, down, turned, *gain], -1)[is_used])
-        right.append((wanted - seen)[is_used])
-    design, misfit = np.concatenate(rows), np.concatenate(right)
-    if np.linalg.matrix_rank(design) < design.shape[1]:
-        raise GuardError(
-            f"no motion can be fitted: {len(misfit)} pixels of the scan and of what the others predict show no "
-            "structure that tells it: take the stage's motions (--motions stage)"
-        )
-    weight = np.ones(len(misfit))
-    for _ in range(5):
-        found = np.linalg.lstsq(design * weight[:, None], misfit * weight, rcond=None)[0]
-        rest = misfit - design @ found
-        weight = cauchy_weight(rest / max(robust_std(rest), 1e-300), ROBUST_LIMIT)
-    area = max(1.0, 4.0 * math.pi * smoothing**2)
-    covariance = robust_std(rest) ** 2 * area * np.linalg.inv((design * weight[:, None] ** 2).T @ design)[:3, :3]
-    # along the gradient a place moves by (change of the image) / |gradient|, weighted by its square
-    slope, energy = design[:, :3], np.sum(design[:, :2] ** 2)
-    moved = math.sqrt(float(np.sum((slope @ found[:3]) ** 2)) / energy)
-    std = math.sqrt(float(np.einsum("ni,ij,nj->", slope, covariance, slope)) / energy)
-    return Rigid(float(found[2] / scale), (float(found[0]), float(found[1]))), moved, std
+    number, n_scans = len(images), int(scan.max()) + 1
+    (grid_x, grid_y), scale = np.meshgrid(x, y), 0.5 * max(np.ptp(x), np.ptp(y))
+    seen = np.stack([_smoothed(i, known, smoothing) for i, known in zip(images, is_known, strict=True)])
+    down, along = np.gradient(seen, y, x, axis=(1, 2))
+    ways = np.stack([along, down, (grid_x * down - grid_y * along) / scale], -1)
+    inside = np.stack([ndimage.binary_erosion(known, iterations=2) for known in is_known])
+    use = inside & (inside.sum(0) > N_OWN)
+    n_moved = 3 * (n_scans - 1)
+    by_common = np.zeros((*images.shape, n_moved + number - 1))
+    for k, of_scan in enumerate(scan):
+        if of_scan:
+            by_common[k, ..., 3 * (of_scan - 1) : 3 * of_scan] = -ways[k]
+        if k:
+            by_common[k, ..., n_moved + k - 1] = -seen[k]
+    at = use.any(0)
+    if not at.any():
+        raise _undetermined(0)
+    residual, own, common = seen[:, at], np.moveaxis(form_factor, 1, -1)[:, at], by_common[:, at]
+    slope_noise = (np.where(is_known, variance, 0.0) * gradient_gain(smoothing, (pitch(y), pitch(x))))[:, at]
+    # derivatives of along, down and turned by the gradient along x and y
+    lever = np.zeros((int(at.sum()), 3, 2))
+    lever[:, 0, 0] = lever[:, 1, 1] = 1.0
+    lever[:, 2] = np.stack([-grid_y[at], grid_x[at]], -1) / scale
+
+    area = max(1.0, 4.0 * math.pi * smoothing**2)  # whose noise is one datum's
+    weight = robust = use[:, at].astype(float)
+    prior_std = np.array([SHIFT_STD * pitch(x), SHIFT_STD * pitch(y), ROTATION_STD * scale])
+    prior = np.concatenate([np.tile(prior_std**-2.0, n_scans - 1), np.zeros(number - 1)])
+    wanted = np.concatenate([*((*c.shift, c.rotation * scale) for c in stated[1:]), np.zeros(number - 1)])
+    step, own_prior = np.zeros(len(wanted)), None
+    for _ in range(1 + REWEIGHTINGS):
+        fit = eliminate(residual, robust, own, common, own_prior, _DAMPING)
+        _check_determined(fit.information, int(at.sum()))
+        pixel = fit.pixel_steps(step)
+        rest = residual - np.einsum("knb,nb->kn", own, pixel) - common @ step
+        # share of its noise that is left in a datum's residual: the pixel's unknowns take the rest
+        left = 1.0 - robust * np.einsum("kni,nij,knj->kn", own, fit.covariance, own)
+        std = max(float(robust_std((rest / np.sqrt(np.maximum(left, _LEAST_LEFT)))[weight > 0.0])), 1e-300)
+        information = fit.information / (area * std**2) + np.diag(prior)
+        step = np.linalg.solve(information, fit.right / (area * std**2) + prior * wanted)
+        robust = weight * cauchy_weight(rest / std, ROBUST_LIMIT) ** 2
+        own_prior = _same_albedo(pixel, std)
+    added = np.zeros_like(information)
+    for k, of_scan in enumerate(scan):
+        if of_scan:
+            block = slice(3 * (of_scan - 1), 3 * of_scan)
+            noise = (robust * left * slope_noise)[k]
+            added[block, block] += np.einsum("n,nia,nja->ij", noise, lever, lever)
+    true = _without_noise(fit.information, added)
+    covariance = np.linalg.inv(true / (area * std**2) + np.diag(prior))
+    found = MotionCorrection((Rigid(0.0, (0.0, 0.0)),), (0.0,), (0.0,))
+    for n in range(n_scans - 1):
+        part = slice(3 * n, 3 * n + 3)
+        dx, dy, turn = step[part]
+        slope = ways[scan == n + 1][use[scan == n + 1]]
+        # along the gradient a place moves by (change of the image) / |gradient|, weighted by its square
+        energy = np.sum(slope[:, :2] ** 2)
+        moved = math.sqrt(float(np.sum((slope @ step[part]) ** 2) / energy))
+        place_std = math.sqrt(float(np.einsum("ni,ij,nj->", slope, covariance[part, part], slope) / energy))
+        motion = Rigid(float(turn / scale), (float(dx), float(dy)))
+        found = MotionCorrection((*found.motions, motion), (*found.moved, moved), (*found.std, place_std))
+    return found
+
+
+def _same_albedo(pixel: np.ndarray, std: float) -> tuple[np.ndarray, np.ndarray]:
+    """Make the prior that all pixels have one albedo, as `eliminate` takes it; pixels far from it are left out of it.
+
+    Without it a motion's error, some motions of all scans together, can look like another surface.
+
+    Args:
+        pixel: albedo times normal [n, 3].
+        std: of the data, in whose units the information is.
+    """
+    albedo = np.linalg.norm(pixel, axis=1)
+    typical = float(np.median(albedo))
+    normal = pixel / np.maximum(albedo, 1e-300)[:, None]
+    trust = cauchy_weight((albedo - typical) / (ALBEDO_STD * typical), ROBUST_LIMIT) ** 2
+    trust = trust * (std / (ALBEDO_STD * typical)) ** 2
+    return trust[:, None, None] * normal[:, :, None] * normal[:, None, :], (trust * typical)[:, None] * normal
+
+
+def gradient_gain(smoothing: float, pitch: tuple[float, float]) -> float:
+    """Compute the variance of a smoothed image's gradient over that of the image's noise, mean of y and x [1/um2]."""
+    reach = 2 + math.ceil(4.0 * smoothing)
+    point = np.zeros((2 * reach + 1,) * 2)
+    point[reach, reach] = 1.0
+    return 0.5 * sum(float(np.sum(g**2)) for g in np.gradient(ndimage.gaussian_filter(point, smoothing), *pitch))
+
+
+def _without_noise(information: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Take what noise adds to an information matrix off, but for `LEAST_TRUE` of it in every direction."""
+    root = np.linalg.cholesky(information)
+    share, ways = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, noise).T))
+    turned = root @ ways
+    return turned @ np.diag(np.maximum(1.0 - share, LEAST_TRUE)) @ turned.T
+
+
+def _smoothed(image: np.ndarray, is_known: np.ndarray, smoothing: float) -> np.ndarray:
+    """Smooth an image over its known pixels [pixels]."""
+    weight = ndimage.gaussian_filter(is_known.astype(float), smoothing)
+    return ndimage.gaussian_filter(np.where(is_known, image, 0.0), smoothing) / np.maximum(weight, 1e-6)
+
+
+def _check_determined(information: np.ndarray, n_pixels: int) -> None:
+    """Refuse images that do not determine motions and gains."""
+    least, *_, largest = np.linalg.eigvalsh(information)
+    if least <= WORST_CONDITION * largest:
+        raise _undetermined(n_pixels)
+
+
+def _undetermined(n_pixels: int) -> GuardError:
+    return GuardError(
+        f"no motion can be fitted: {n_pixels} pixels that four or more images see show no structure that tells it: "
+        "take the stage's motions (--motions stage)"
+    )

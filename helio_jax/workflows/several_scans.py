@@ -12,15 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy import ndimage
 
-from helio_jax.alignment.correction import correct_motion
+from helio_jax.alignment.correction import correct_motions
 from helio_jax.alignment.resample import common_raster, resample
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import fill_gaps, pitch
 from helio_jax.errors import InputFileError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics
-from helio_jax.forward.render import single_scattering
-from helio_jax.inverse.linear import MIN_IMAGES, signal_of, solve_linear
+from helio_jax.inverse.linear import MIN_IMAGES, signal_of
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.measure.sample_grid import resample_heights
@@ -31,7 +30,7 @@ MAX_ITERATIONS = 30
 """Largest number of iterations between heights and places."""
 SETTLED = 0.05
 """They end where places change by less than this, root mean square [pixels]."""
-FIRST_SMOOTHING, LAST_SMOOTHING, FALL = 3.0, 1.0, 0.8
+FIRST_SMOOTHING, LAST_SMOOTHING, FALL = 3.0, 0.5, 0.8
 """Fitted motions: smoothing of the images in the first iteration, the least one [pixels], its factor per iteration."""
 UNSETTLED = 0.2
 """A larger change in the last iteration is warned of [pixels]."""
@@ -165,32 +164,19 @@ def merged_heights(
 def _corrected_motions(
     joined: JoinedScans, height: np.ndarray, smoothing: float
 ) -> tuple[tuple[Rigid, ...], tuple[float, ...], float]:
-    """Correct every motion by what the other scans predict (all, where others have too few images).
-
-    The first scan's motion stays: where it disagrees with the others, the common frame is moved.
+    """Correct all motions but the first scan's by what all images agree on.
 
     Returns:
         The motions, the standard deviation of a pixel's place by each [um], and by how much the largest correction
         moves places [pixels].
     """
     stack, scans = joined.stack, joined.scans.stacks
-    signal, variance = signal_of(stack)
     phi = form_factor(Optics.of(stack.instrument), height)
-    number = np.repeat(np.arange(len(scans)), [s.shape[0] for s in scans])
-    corrections, std, moved = [], [], 0.0
-    for scan in range(len(scans)):
-        own = number == scan
-        used = ~own if np.sum(~own) >= MIN_IMAGES else np.ones(len(own), bool)
-        solution = solve_linear(signal[used], variance[used], phi[used])
-        predicted = single_scattering(phi[own], np.moveaxis(solution.albedo[..., None] * solution.normals, -1, 0))
-        is_known = stack.is_observed[own] & (stack.is_observed[used].sum(0) >= MIN_IMAGES) & np.isfinite(predicted)
-        correction, shift, place = correct_motion(signal[own], predicted, is_known, stack.x, stack.y, smoothing)
-        corrections.append(correction)
-        std.append(place)
-        moved = max(moved, shift / pitch(stack.x))
-    frame = corrections[0].inverse()
-    found = tuple(m.after(c.after(frame)) for m, c in zip(joined.motions, corrections, strict=True))
-    return found, tuple(std), moved
+    scan = np.repeat(np.arange(len(scans)), [s.shape[0] for s in scans])
+    stated = tuple(m.inverse().after(s) for m, s in zip(joined.motions, stage_motions(joined.scans), strict=True))
+    found = correct_motions(*signal_of(stack), phi, stack.is_observed, scan, stack.x, stack.y, smoothing, stated)
+    motions = tuple(m.after(c) for m, c in zip(joined.motions, found.motions, strict=True))
+    return motions, found.std, max(found.moved) / pitch(stack.x)
 
 
 def _comparable(scans: MicrographSet) -> MicrographSet:
