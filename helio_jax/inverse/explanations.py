@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from helio_jax.errors import PredictionError, SceneError
 from helio_jax.forward.optics import Raster
@@ -47,6 +48,8 @@ MAX_WIDTH = 0.125
 """Levels are searched up to twice this share of the sample distance above and below the substrate."""
 MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
+NARROW = 5
+"""Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels]."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 HOPELESS = 2.0
@@ -109,8 +112,11 @@ def explain(
         try:
             residuals = fits.residuals(best.fit) if residuals is None else residuals
             right = fits.right_chi_square(residuals)
-            share = fits.contradicted(residuals, right)
-            is_contradicted = share >= MIN_CONTRADICTED
+            contradicted = fits.contradicted(residuals, right)
+            share = contradicted.mean()
+            # pits and patches are areas; an object that is too low is contradicted at its rim
+            extent = share if other == fits.from_objects else share_of_areas(contradicted)
+            is_contradicted = extent >= MIN_CONTRADICTED
             may_be_patches = other == fits.from_albedo_patches and fits.is_strained(best.fit)
             if not is_contradicted and not may_be_patches:
                 continue
@@ -119,7 +125,7 @@ def explain(
                 continue
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
-            is_less = fits.contradicted(rest, right) < most
+            is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
                 gained += relief_of_strain(best.fit.parameters, found.fit.parameters)
@@ -205,8 +211,11 @@ class _Fits:
         )
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
-        """Half the chi-square of the data expected on a surface, nothing fitted."""
-        return half_chi_square(self.residuals_on(surface, patches))
+        """Half the chi-square of the data expected on a surface, nothing fitted; infinite if none can be predicted."""
+        try:
+            return half_chi_square(self.residuals_on(surface, patches))
+        except PredictionError:
+            return math.inf
 
     def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
         """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
@@ -214,8 +223,11 @@ class _Fits:
         return residuals_of_state(problem, FitState.at(problem, surface), self.predict_trial)
 
     def short_fit(self, surface: Surface, patches: AlbedoPatches) -> tuple[float, Surface]:
-        """The same after a short fit, and its surface."""
-        return short_fit(self.pose(surface, patches), surface, self.predict_trial)
+        """Compute the misfit (`misfit`) after a short fit from a surface, and the surface fitted."""
+        try:
+            return short_fit(self.pose(surface, patches), surface, self.predict_trial)
+        except PredictionError:
+            return math.inf, surface
 
     def residuals(self, fit: Fit) -> np.ndarray:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
@@ -226,12 +238,12 @@ class _Fits:
         chi_square = local_chi_square(residuals, self.stack.is_observed)
         return expected_chi_square(self.stack, self.stack.instrument, chi_square)
 
-    def contradicted(self, residuals: np.ndarray, right: float) -> float:
-        """Compute the share of the pixels in which residuals [detector, y, x] contradict a fit.
+    def contradicted(self, residuals: np.ndarray, right: float) -> np.ndarray:
+        """Find the pixels [y, x] in which residuals [detector, y, x] contradict a fit.
 
         `right`: chi-square of a right fit (`right_chi_square`).
         """
-        return float(np.mean(local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT * right))
+        return local_chi_square(residuals, self.stack.is_observed) > CHI_SQUARE_LIMIT * right
 
     @property
     def weighs_instrument(self) -> bool:
@@ -306,14 +318,7 @@ class _Fits:
         if not self.pose(known, patches).is_instrument_unknown or not self.albedo_search.is_corrected:
             return known, smoothed
         free = start_of_free_albedo(self.stack, self.albedo_search.height, self.albedo_search.solution)
-        return min((known, free), key=lambda surface: self._misfit_from(surface, patches)), smoothed
-
-    def _misfit_from(self, surface: Surface, patches: AlbedoPatches) -> float:
-        """Half the chi-square that a short fit from a surface ends at; infinite where nothing can be predicted."""
-        try:
-            return self.short_fit(surface, patches)[0]
-        except PredictionError:
-            return math.inf
+        return min((known, free), key=lambda surface: self.short_fit(surface, patches)[0]), smoothed
 
     @cached_property
     def plain_start(self) -> tuple[Surface, Surface]:
@@ -327,26 +332,23 @@ class _Fits:
         labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
         if steps := measured_regions(self.steps) or self.shadowed:
             raster = Raster.of(self.stack)
-            try:
-                found = search_levels(
-                    steps,
-                    start,
-                    (raster.dy, raster.dx),
-                    MAX_WIDTH * self.stack.instrument.sample_distance,
-                    lambda trial: self.misfit(trial, patches),
-                    lambda trial: self.short_fit(trial, patches),
-                    self.stack.instrument.beam_shift,
-                    self.say,
-                    is_substrate_flat=self.settings.border == "flat",
-                )
-                start, is_undecided = found.surface, covered(steps, found.undecided)
-                if moved := [steps[i] for i in found.moved]:
-                    labels = labelled(moved)
-                    anchors = level_anchors(labels, moved, start)
-                    # masks on the raster, whose edges lie on pixels, would pull measured levels off
-                    labels[covered(steps, [i for i in found.moved if steps[i].height is not None])] = 0
-            except PredictionError as e:  # the fit begins at a smoother start
-                self.say(f"levels of measured steps are given up: {e}")
+            found = search_levels(
+                steps,
+                start,
+                (raster.dy, raster.dx),
+                MAX_WIDTH * self.stack.instrument.sample_distance,
+                lambda trial: self.misfit(trial, patches),
+                lambda trial: self.short_fit(trial, patches),
+                self.stack.instrument.beam_shift,
+                self.say,
+                is_substrate_flat=self.settings.border == "flat",
+            )
+            start, is_undecided = found.surface, covered(steps, found.undecided)
+            if moved := [steps[i] for i in found.moved]:
+                labels = labelled(moved)
+                anchors = level_anchors(labels, moved, start)
+                # masks on the raster, whose edges lie on pixels, would pull measured levels off
+                labels[covered(steps, [i for i in found.moved if steps[i].height is not None])] = 0
         fit = self.fitted(start, smoothed, patches, labels, anchors)
         return Explanation(fit, is_undecided, n_steps=0 if anchors is None else len(anchors.value))
 
@@ -424,6 +426,11 @@ class _Fits:
             return self.from_steps(patches)
         surface = best.fit.state.surface
         return best._replace(fit=self.fitted(surface, surface, patches, best.number))
+
+
+def share_of_areas(is_contradicted: np.ndarray) -> float:
+    """Compute the share of the pixels that are contradicted [y, x] and in an area that is not `NARROW`."""
+    return float(binary_opening(is_contradicted, np.ones((NARROW, NARROW))).mean())
 
 
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:

@@ -8,7 +8,6 @@ error bar says whether masks or the near field fix it; a region that something e
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -19,7 +18,6 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.optimize import minimize_scalar
 
 from helio_jax.arrays import distance_to_end, nearest_known
-from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.quality import FLOATING
 
@@ -43,7 +41,7 @@ WALLS = "flat, with a wall", "flat, beside a wall"
 """... and, where an oblique beam sees its wall, that wall within the region or outside it."""
 
 Misfit = Callable[[Surface], float]
-"""Half the chi-square of the data expected on a surface, nothing fitted."""
+"""Half the chi-square of the data expected on a surface, nothing fitted; infinite where nothing can be predicted."""
 ShortFit = Callable[[Surface], tuple[float, Surface]]
 """The same after a short fit from a surface, and the surface fitted."""
 
@@ -173,15 +171,12 @@ class _RegionSearch:
         return at_level(self.inside, self.base, level, self.surroundings, self.pitch, shift)
 
     def misfit_at(self, level: float, kind: str) -> float:
-        """Compute the misfit with the region at a level above the surroundings, um; infinite if not predictable."""
+        """Compute the misfit with the region at a level above the surroundings, um."""
         trial = self.trial(level, kind)
         key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
         if key not in self.tried:
             self.report(f"{self.name}: trying the level {level:+.0f} um, {kind}")
-            try:
-                self.tried[key] = self.misfit(trial)
-            except PredictionError:  # no level of a wall that nothing can be predicted of
-                self.tried[key] = np.inf
+            self.tried[key] = self.misfit(trial)
         return self.tried[key]
 
     def search(self) -> list[tuple[float, Surface]]:
@@ -250,10 +245,7 @@ def search_levels(
                 flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
                 trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
             trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
-        explanations = [(best, found)]
-        for _, trial in trials:
-            with suppress(PredictionError):
-                explanations.append(short_fit(trial))
+        explanations = [(best, found), *(short_fit(trial) for _, trial in trials)]
         value, better = min(explanations, key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better

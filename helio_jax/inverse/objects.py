@@ -98,7 +98,7 @@ class ObjectSearch:
         relief: of the objects, at any level.
         sharp: pixels where a signal jumps [y, x].
         pitch: dy, dx, um.
-        misfit: half the chi-square of the data expected on a surface.
+        misfit: half the chi-square of the data expected on a surface; infinite where nothing can be predicted.
         unexplained: mean square residual of the flat substrate beside the objects of a surface [y, x].
         report: called with what is tried next.
     """
@@ -116,7 +116,7 @@ class ObjectSearch:
         None where a flat substrate explains too little (`MOST_MISFIT`).
         """
         best, n = self._tried(objects), len(objects.shift)
-        limit = MOST_MISFIT * self._misfit_of(self.relief)
+        limit = MOST_MISFIT * self.misfit(self.relief)
         sizes = np.bincount(objects.number.ravel())[1:]
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
@@ -130,15 +130,8 @@ class ObjectSearch:
                 return None
         return best
 
-    def _misfit_of(self, surface: Surface) -> float:
-        """Compute the misfit of a surface; infinite where nothing can be predicted of it."""
-        try:
-            return self.misfit(surface)
-        except PredictionError:
-            return np.inf
-
     def _tried(self, objects: Objects) -> Trial:
-        return Trial(objects, self._misfit_of(objects.surface(self.relief)))
+        return Trial(objects, self.misfit(objects.surface(self.relief)))
 
     def _shifted(self, trial: Trial, number: int, shares: Iterable[float]) -> Iterator[Trial]:
         """Shift an object by shares of its width."""
@@ -168,10 +161,7 @@ class ObjectSearch:
         for _ in range(max(objects.number.shape)):
             inside = objects.number == number
             core = _core(inside)
-            try:
-                found = self.unexplained(objects.outlined(number, core).surface(self.relief))
-            except PredictionError:
-                break
+            found = self.unexplained(objects.outlined(number, core).surface(self.relief))
             is_kept = core | (inside & (median_filter(found, 3) > LIMIT))
             other = objects.outlined(number, _filled(binary_opening(is_kept, np.ones((2, 2)))))
             if np.sum(other.number == number) < LEAST_PIXELS or np.array_equal(other.number, objects.number):
@@ -246,9 +236,15 @@ class _Substrate:
         return np.sqrt(signal_of(self.stack)[1]) / self.single(self.form)
 
     def unexplained(self, surface: Surface) -> np.ndarray:
-        """Compute the mean square residual of the substrate, masked and lit by what stands on it [y, x]."""
+        """Compute the mean square residual of the substrate, masked and lit by what stands on it [y, x].
+
+        Infinite where nothing can be predicted.
+        """
         signal, variance = signal_of(self.stack)
-        corrections = self.predict(surface.height, surface.normals(self.stack.instrument.beam_shift))
+        try:
+            corrections = self.predict(surface.height, surface.normals(self.stack.instrument.beam_shift))
+        except PredictionError:
+            return np.full(signal.shape[1:], np.inf)
         model = self.single(self.form - corrections.masked) + corrections.multiple
         s = self.settings.refine
         masked = s.mask_error * self.single(corrections.masked)
