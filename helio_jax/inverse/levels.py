@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -32,6 +32,9 @@ MOST_FITS = 2
 """So many surfaces with a region at its measured level are fitted shortly."""
 _LEVEL_STEPS = 5
 """Evaluations by which the best level is refined."""
+
+_UNPREDICTED = 1e100
+"""Stands for an infinite misfit, of which no parabola can be made."""
 
 SKIRT = 4
 """Pixels around a region that a fit without the jump may have raised."""
@@ -188,9 +191,9 @@ class _RegionSearch:
             i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
             best = tried[i]
             if len(tried) > 1:
-                bracket, options = (tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)]), {"maxiter": _LEVEL_STEPS}
-                found = minimize_scalar(self.misfit_at, bounds=bracket, args=(kind,), method="bounded", options=options)
-                best = min((best, float(found.x)), key=lambda level, kind=kind: self.misfit_at(level, kind))
+                at = lambda level, kind=kind: self.misfit_at(level, kind)  # noqa: E731
+                _, found = least_between(at, tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)], _LEVEL_STEPS)
+                best = min((best, found), key=at)
             surface = self.trial(best, kind)
             out.setdefault(surface.height.tobytes(), (self.misfit_at(best, kind), surface))
         return list(out.values())
@@ -254,6 +257,15 @@ def search_levels(
         if any(_differ(found, other, inside, search.surroundings) for other in as_good):
             undecided.append(i)
     return Levels(found, moved, undecided)
+
+
+def least_between(misfit: Callable[[float], float], low: float, high: float, evaluations: int) -> tuple[float, float]:
+    """Find the least misfit between two places in so many evaluations: the misfit, and where it is."""
+    options = {"maxiter": evaluations}
+    found: Any = minimize_scalar(
+        lambda at: min(misfit(at), _UNPREDICTED), bounds=(low, high), method="bounded", options=options
+    )
+    return float(found.fun), float(found.x)
 
 
 def covered(regions: Sequence[Region], numbers: Iterable[int]) -> np.ndarray:

@@ -41,7 +41,9 @@ SHARP = 0.2
 LEAST_PIXELS = 12
 """Smaller objects are not looked for."""
 MOST_MISFIT = 2.0
-"""No more objects are looked for where the first leaves so many times the misfit of the relief without a substrate."""
+"""No more objects are looked for where the first leaves so many times the misfit of the relief alone ..."""
+HOPELESS = 2.0
+"""... and its outline and level are not refined where it begins with so many times more."""
 MOST_OBJECTS = 8
 """More objects are not looked for: the smaller ones keep the relief that they start with."""
 LEAST_SEGMENT = 4
@@ -122,6 +124,8 @@ class ObjectSearch:
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
             starts = [best, *self._shifted(best, number, STARTS)]
             best = _best(self._without_segments(trial, number) for trial in starts)
+            if best.misfit > HOPELESS * limit:
+                return None
             best = _best([best, *(self._peeled(t, number) for t in self._shifted(best, number, STARTS))])
             for steps in STEPS:
                 others = list(self._shifted(best, number, steps))

@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_closing, binary_opening, distance_transform_edt, median_filter
-from scipy.optimize import minimize_scalar
 
 from helio_jax.arrays import BORDER_WIDTH, border_mask
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.levels import GAIN, at_level
+from helio_jax.inverse.levels import GAIN, at_level, least_between
 from helio_jax.inverse.objects import LEAST_PIXELS, numbered
 from helio_jax.inverse.quality import half_chi_square, squares
 
@@ -128,9 +127,8 @@ class PitSearch:
         tried = [misfit(depth) for depth in depths]
         value, depth = min(zip(tried, depths, strict=True))
         for place in minima(tried)[:MOST_MINIMA]:
-            bounds = depths[max(place - 1, 0)], depths[min(place + 1, len(depths) - 1)]
-            found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": REFINEMENTS})
-            value, depth = min((value, depth), (float(found.fun), float(found.x)))
+            low, high = depths[max(place - 1, 0)], depths[min(place + 1, len(depths) - 1)]
+            value, depth = min((value, depth), least_between(misfit, low, high, REFINEMENTS))
         number = np.where(inside, pits.number.max() + 1, pits.number)
         return Pits(trial(depth), number, value), above - depth
 

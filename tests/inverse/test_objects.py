@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.objects import LIMIT, Objects, ObjectSearch, enclosed_by, jumps, segments
+from helio_jax.inverse.objects import LIMIT, STARTS, Objects, ObjectSearch, enclosed_by, jumps, segments
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_surface
@@ -80,6 +80,21 @@ def test_no_second_object_where_the_first_leaves_far_more_than_no_substrate():
         )
         assert (trial.find(Objects(outlines, (0.0, 0.0))) is None) == ends
         assert len(said) == (1 if ends else 2)
+
+
+def test_a_hopeless_object_is_not_refined():
+    """A flat substrate that leaves 5 times the misfit of the relief alone ends the search at its first shifts."""
+    relief, tried = Surface(np.full(SHAPE, 30.0), *np.zeros((2, *SHAPE))), []
+
+    def misfit(surface):
+        tried.append(surface)
+        return 100.0 if np.all(surface.height == 30.0) else 500.0
+
+    inside = (np.abs(X - 20) < 8) & (np.abs(Y - 20) < 8)
+    unexplained = np.full(SHAPE, 2.0 * LIMIT)
+    trial = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
+    assert trial.find(Objects(inside.astype(int), (0.0,))) is None
+    assert len(tried) == 2 + len(STARTS)
 
 
 @pytest.fixture(scope="module")

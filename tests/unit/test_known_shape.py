@@ -145,7 +145,7 @@ def modelled_ball(bshem, axis) -> MicrographStack:
     return stack.replace(counts=counts + 3000.0 * image / np.median(image) + noise)
 
 
-@pytest.mark.parametrize("max_rounds", [1, 2, 3])
+@pytest.mark.parametrize("max_rounds", [1, 2])
 def test_few_rounds_end_on_all_pixels(bshem, monkeypatch, max_rounds):
     """A large raster is first fitted on few pixels; what comes out is of all of them, however few the rounds.
 

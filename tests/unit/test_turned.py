@@ -61,9 +61,8 @@ def test_what_stays_open_is_handed_to_the_fit(calibrated):
     A setting that is given wins. Catches a fit that takes the calibration for exact.
     """
     kept, _ = calibrated
-    given = {"max_rounds": 1, "photometric_rounds": 1, "samples": 0, "rays": 20_000}
-    rec = reconstruct(kept, "refine", border="free", refine=given)
-    asked = rec.provenance["reconstruct"]["refine"]
+    rec = reconstruct(kept, "nearfield", border="free", corrections=0, samples=0, refine={"max_rounds": 1})
+    asked = rec.provenance["reconstruct"]["refine"]  # as `refine` would have them
     assert asked["max_rounds"] == 1 and asked["drift_std"] == 0.1 and asked["gain_std"] == 0.05
     radius, distance = 3120.0, kept.instrument.sample_distance
     per_degree = (radius**2 + distance**2) / radius * math.radians(1.0)  # distance = radius / tan(polar angle)
