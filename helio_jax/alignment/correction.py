@@ -7,6 +7,7 @@ themselves, not to what other scans predict that may be as far off.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ LEAST_TRUE = 0.1
 ALBEDO_STD = 0.03
 """Assumed standard deviation of the albedo, from pixel to pixel, over its typical value."""
 _LEAST_LEFT = 0.05
+"""Least share of a datum's noise that its residual is taken to have."""
 _DAMPING = 1e-9
 """Of pixels whose images do not tell their normals."""
 
@@ -83,68 +85,128 @@ def correct_motions(
     would shorten the steps and the error bars, is taken off the information (errors in variables: Fuller, Measurement
     Error Models, 1987, sec. 2.2).
     """
-    number, n_scans = len(images), int(scan.max()) + 1
-    (grid_x, grid_y), scale = np.meshgrid(x, y), 0.5 * max(np.ptp(x), np.ptp(y))
-    seen = np.stack([_smoothed(i, known, smoothing) for i, known in zip(images, is_known, strict=True)])
-    down, along = np.gradient(seen, y, x, axis=(1, 2))
-    ways = np.stack([along, down, (grid_x * down - grid_y * along) / scale], -1)
-    inside = np.stack([ndimage.binary_erosion(known, iterations=2) for known in is_known])
-    use = inside & (inside.sum(0) > N_OWN)
-    n_moved = 3 * (n_scans - 1)
-    by_common = np.zeros((*images.shape, n_moved + number - 1))
-    for k, of_scan in enumerate(scan):
-        if of_scan:
-            by_common[k, ..., 3 * (of_scan - 1) : 3 * of_scan] = -ways[k]
-        if k:
-            by_common[k, ..., n_moved + k - 1] = -seen[k]
-    at = use.any(0)
-    if not at.any():
-        raise _undetermined(0)
-    residual, own, common = seen[:, at], np.moveaxis(form_factor, 1, -1)[:, at], by_common[:, at]
-    slope_noise = (np.where(is_known, variance, 0.0) * gradient_gain(smoothing, (pitch(y), pitch(x))))[:, at]
-    # derivatives of along, down and turned by the gradient along x and y
-    lever = np.zeros((int(at.sum()), 3, 2))
-    lever[:, 0, 0] = lever[:, 1, 1] = 1.0
-    lever[:, 2] = np.stack([-grid_y[at], grid_x[at]], -1) / scale
-
+    linear = _Linearised.of(images, variance, form_factor, is_known, scan, x, y, smoothing)
     area = max(1.0, 4.0 * math.pi * smoothing**2)  # whose noise is one datum's
-    weight = robust = use[:, at].astype(float)
+    scale, n_gains = linear.scale, len(images) - 1
     prior_std = np.array([SHIFT_STD * pitch(x), SHIFT_STD * pitch(y), ROTATION_STD * scale])
-    prior = np.concatenate([np.tile(prior_std**-2.0, n_scans - 1), np.zeros(number - 1)])
-    wanted = np.concatenate([*((*c.shift, c.rotation * scale) for c in stated[1:]), np.zeros(number - 1)])
-    step, own_prior = np.zeros(len(wanted)), None
+    prior = np.concatenate([np.tile(prior_std**-2.0, linear.n_moved), np.zeros(n_gains)])
+    wanted = np.concatenate([*((*c.shift, c.rotation * scale) for c in stated[1:]), np.zeros(n_gains)])
+    step, own_prior, robust = np.zeros(len(wanted)), None, linear.weight
     for _ in range(1 + REWEIGHTINGS):
-        fit = eliminate(residual, robust, own, common, own_prior, _DAMPING)
-        _check_determined(fit.information, int(at.sum()))
+        fit = eliminate(linear.images, robust, linear.by_own, linear.by_common, own_prior, _DAMPING)
+        _check_determined(fit.information, linear.images.shape[1])
         pixel = fit.pixel_steps(step)
-        rest = residual - np.einsum("knb,nb->kn", own, pixel) - common @ step
+        rest = linear.images - np.einsum("knb,nb->kn", linear.by_own, pixel) - linear.by_common @ step
         # share of its noise that is left in a datum's residual: the pixel's unknowns take the rest
-        left = 1.0 - robust * np.einsum("kni,nij,knj->kn", own, fit.covariance, own)
-        std = max(float(robust_std((rest / np.sqrt(np.maximum(left, _LEAST_LEFT)))[weight > 0.0])), 1e-300)
+        left = 1.0 - robust * np.einsum("kni,nij,knj->kn", linear.by_own, fit.covariance, linear.by_own)
+        std = max(float(robust_std((rest / np.sqrt(np.maximum(left, _LEAST_LEFT)))[linear.weight > 0.0])), 1e-300)
         information = fit.information / (area * std**2) + np.diag(prior)
         step = np.linalg.solve(information, fit.right / (area * std**2) + prior * wanted)
-        robust = weight * cauchy_weight(rest / std, ROBUST_LIMIT) ** 2
+        noise = linear.noise_of_gradients(robust * left)
+        robust = linear.weight * cauchy_weight(rest / std, ROBUST_LIMIT) ** 2
         own_prior = _same_albedo(pixel, std)
-    added = np.zeros_like(information)
-    for k, of_scan in enumerate(scan):
-        if of_scan:
-            block = slice(3 * (of_scan - 1), 3 * of_scan)
-            noise = (robust * left * slope_noise)[k]
-            added[block, block] += np.einsum("n,nia,nja->ij", noise, lever, lever)
-    true = _without_noise(fit.information, added)
-    covariance = np.linalg.inv(true / (area * std**2) + np.diag(prior))
+    covariance = np.linalg.inv(_without_noise(fit.information, noise) / (area * std**2) + np.diag(prior))
     found = MotionCorrection((Rigid(0.0, (0.0, 0.0)),), (0.0,), (0.0,))
-    for n in range(n_scans - 1):
-        part = slice(3 * n, 3 * n + 3)
+    for n in range(1, linear.n_moved + 1):
+        part = linear.unknowns(n)
         dx, dy, turn = step[part]
-        slope = ways[scan == n + 1][use[scan == n + 1]]
+        change = linear.change[scan == n][linear.weight[scan == n] > 0.0]
         # along the gradient a place moves by (change of the image) / |gradient|, weighted by its square
-        energy = np.sum(slope[:, :2] ** 2)
-        moved = math.sqrt(float(np.sum((slope @ step[part]) ** 2) / energy))
-        place_std = math.sqrt(float(np.einsum("ni,ij,nj->", slope, covariance[part, part], slope) / energy))
+        energy = np.sum(change[:, :2] ** 2)
+        moved = math.sqrt(float(np.sum((change @ step[part]) ** 2) / energy))
+        place_std = math.sqrt(float(np.einsum("ni,ij,nj->", change, covariance[part, part], change) / energy))
         motion = Rigid(float(turn / scale), (float(dx), float(dy)))
         found = MotionCorrection((*found.motions, motion), (*found.moved, moved), (*found.std, place_std))
     return found
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Smoothed images as linear functions of corrections, of gains, and of albedo times normal: k images, n pixels.
+
+    Corrections of a scan are shifts along x and y [um], and a rotation times `scale`: a length, too.
+
+    Attributes:
+        images: [k, n].
+        weight: 1 where used, else 0 [k, n].
+        by_own: derivative by albedo times normal [k, n, 3].
+        by_common: derivative by corrections of all scans and gains of all images, but the first [k, n, c].
+        change: of each image by the correction of its scan [k, n, 3].
+        scan: number of each image's scan [k].
+        gradient_variance: of the gradients' noise along one axis [k, n].
+        lever: derivative of `change` by the gradient along x and y [n, 3, 2].
+        scale: half the field's side [um].
+    """
+
+    images: np.ndarray
+    weight: np.ndarray
+    by_own: np.ndarray
+    by_common: np.ndarray
+    change: np.ndarray
+    scan: np.ndarray
+    gradient_variance: np.ndarray
+    lever: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(
+        cls,
+        images: np.ndarray,
+        variance: np.ndarray,
+        form_factor: np.ndarray,
+        is_known: np.ndarray,
+        scan: np.ndarray,
+        x: np.ndarray,
+        y: np.ndarray,
+        smoothing: float,
+    ) -> "_Linearised":
+        """Linearise; arguments as those of `correct_motions`."""
+        inside = np.stack([ndimage.binary_erosion(known, iterations=2) for known in is_known])
+        use = inside & (inside.sum(0) > N_OWN)
+        at = use.any(0)
+        if not at.any():
+            raise _undetermined(0)
+        smoothed = np.stack([_smoothed(i, known, smoothing) for i, known in zip(images, is_known, strict=True)])
+        down, along = (g[:, at] for g in np.gradient(smoothed, y, x, axis=(1, 2)))
+        scale = 0.5 * float(max(np.ptp(x), np.ptp(y)))
+        turn_x, turn_y = (g[at] / scale for g in np.meshgrid(x, y))
+        lever = np.zeros((int(at.sum()), 3, 2))
+        lever[:, 0, 0] = lever[:, 1, 1] = 1.0
+        lever[:, 2] = np.stack([-turn_y, turn_x], -1)
+        change = np.einsum("nia,kna->kni", lever, np.stack([along, down], -1))
+        seen, n_moved = smoothed[:, at], 3 * int(scan.max())
+        by_common = np.zeros((*seen.shape, n_moved + len(images) - 1))
+        for k, number in enumerate(scan):
+            if number:
+                by_common[k, :, 3 * (number - 1) : 3 * number] = -change[k]
+            if k:
+                by_common[k, :, n_moved + k - 1] = -seen[k]
+        gain = gradient_gain(smoothing, (pitch(y), pitch(x)))
+        noise = gain * np.where(is_known, variance, 0.0)[:, at]
+        by_own = np.moveaxis(form_factor, 1, -1)[:, at]
+        return cls(seen, use[:, at].astype(float), by_own, by_common, change, scan, noise, lever, scale)
+
+    @property
+    def n_moved(self) -> int:
+        """Number of scans that are moved."""
+        return int(self.scan.max())
+
+    def unknowns(self, number: int) -> slice:
+        """Find the unknowns of a scan's correction among the common ones."""
+        return slice(3 * (number - 1), 3 * number)
+
+    def noise_of_gradients(self, weight: np.ndarray) -> np.ndarray:
+        """Compute what the noise of the gradients adds to the information of the common unknowns [c, c].
+
+        `weight`: of the data, times the share of the noise that the pixels' unknowns leave [k, n].
+        """
+        added = np.zeros((self.by_common.shape[-1],) * 2)
+        for k, number in enumerate(self.scan):
+            if number:
+                block = self.unknowns(number)
+                noise = weight[k] * self.gradient_variance[k]
+                added[block, block] += np.einsum("n,nia,nja->ij", noise, self.lever, self.lever)
+        return added
 
 
 def _same_albedo(pixel: np.ndarray, std: float) -> tuple[np.ndarray, np.ndarray]:
