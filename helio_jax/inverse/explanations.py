@@ -4,8 +4,8 @@ The first is the photometric solution, with regions at the levels of the steps t
 the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data contradict its fit, pits in and
 objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any
 images: there, patches are tried first, and so they are where a flat border shows that the substrate's albedo is not 1.
-With a flat border they are also tried where the fit moves the instrument far beyond
-what is stated (`is_strained`). A level that explains the images about as well as the one that is kept is undecided.
+With a flat border they are also tried where the fit moves the instrument far beyond what is stated (`is_strained`). A
+level that explains the images about as well as the one that is kept is undecided.
 """
 
 import math
