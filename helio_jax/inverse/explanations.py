@@ -3,9 +3,9 @@
 The first is the photometric solution, with regions at the levels of the steps that mask bands show; where none do and
 the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data contradict its fit, pits in and
 objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any
-images: there, patches are tried first, and so they are where a flat border shows that the substrate's albedo is not 1.
-With a flat border they are also tried where the fit moves the instrument far beyond what is stated (`is_strained`). A
-level that explains the images about as well as the one that is kept is undecided.
+images: there, patches are tried first, and so they are on a substrate that is too dark. With a flat border they are
+also tried where the fit moves the instrument far beyond what is stated (`is_strained`). A level that explains the
+images about as well as the one that is kept is undecided.
 """
 
 import math
@@ -104,11 +104,12 @@ def explain(
     they did before (`MIN_CONTRADICTED`). Arguments as `reconstruct_stack`.
     """
     fits = _Fits(stack, settings, make_predict, report)
+    none = AlbedoPatches.none(stack.shape[1:])
     if start is None:
-        best, others = fits.from_steps(fits.substrate), [fits.from_pits, fits.from_objects]
+        best, others = fits.from_steps(none), [fits.from_pits, fits.from_objects]
     else:
-        best, others = fits.from_heights(start, fits.substrate), []
-    is_albedo_likely = best.fit.problem.is_instrument_unknown or bool(fits.substrate)
+        best, others = fits.from_heights(start, none), []
+    is_albedo_likely = best.fit.problem.is_instrument_unknown or fits.is_substrate_dark
     others.insert(0 if is_albedo_likely else len(others), fits.from_albedo_patches)
     residuals: np.ndarray | None = None
     for other in others:
@@ -317,19 +318,19 @@ class _Fits:
         """The photometric solution with an albedo of its own in every pixel, and the patches that it shows."""
         return search_albedo(self.stack, self.settings, self.predict_start)
 
-    @cached_property
-    def substrate(self) -> AlbedoPatches:
-        """The substrate's own albedo, where the flat border shows that it is not 1; no patches else.
+    @property
+    def is_substrate_dark(self) -> bool:
+        """Whether the flat border is darker than albedo 1 and gains as stated make it.
 
-        Fits that take it for 1 are contradicted everywhere, whatever the shape. What gains may explain is left to them.
+        It decides what is tried first, not what a fit begins with: background that was wrongly subtracted changes the
+        level, too, and a fit to the substrate's albedo alone hides that (heights 23 % too low, uncontradicted).
         """
-        none, s = AlbedoPatches.none(self.stack.shape[1:]), self.settings
-        if s.border != "flat" or not s.refine.albedo_patches:
-            return none
-        signal = signal_of(self.stack)[0][:, border_mask(self.stack.shape[1:], s.border_fraction)]
-        level = np.nanmedian(signal, axis=1) / substrate_signal(Optics.of(self.stack.instrument))
-        is_common = abs(float(np.median(np.log(level)))) > max(LEAST_COMMON, UNLIKELY_GAIN * s.refine.gain_std)
-        return self.albedo_search.patches.keeping([]) if is_common else none
+        if self.settings.border != "flat":
+            return False
+        frame = border_mask(self.stack.shape[1:], self.settings.border_fraction)
+        level = np.nanmedian(signal_of(self.stack)[0][:, frame], axis=1)
+        ratio = float(np.median(level / substrate_signal(Optics.of(self.stack.instrument))))
+        return ratio < math.exp(-max(LEAST_COMMON, UNLIKELY_GAIN * self.settings.refine.gain_std))
 
     def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
         """Find the photometric solution that a fit starts from, and a smoother one."""
@@ -341,8 +342,8 @@ class _Fits:
 
     @cached_property
     def plain_start(self) -> tuple[Surface, Surface]:
-        """The same without objects of another albedo; several explanations begin with it."""
-        return self.start(self.substrate)
+        """The same without patches of another albedo; several explanations begin with it."""
+        return self.start(AlbedoPatches.none(self.stack.shape[1:]))
 
     def from_steps(self, patches: AlbedoPatches) -> Explanation:
         """Fit from the photometric solution, with regions at the levels of steps, measured or in the beam's shadow."""
@@ -382,14 +383,13 @@ class _Fits:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
         if self.settings.border != "flat" or not self.settings.refine.objects or best.n_steps:
             return None
-        relief, smoothed = self.plain_start
+        none, (relief, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
         objects = find_objects(
             self.stack,
             self.settings,
             relief,
             self.predict_trial,
-            lambda surface: self.misfit(surface, self.substrate),
-            self.substrate,
+            lambda surface: self.misfit(surface, none),
             self.say,
         )
         if objects is None:
@@ -397,16 +397,16 @@ class _Fits:
         start = self.promising(objects.surface(relief), best)
         if start is None:
             return None
-        fit = self.fitted(start, smoothed, self.substrate, objects.number)
+        fit = self.fitted(start, smoothed, none, objects.number)
         return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
 
     def from_pits(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from pits with flat floors in a flat substrate; None where there are none."""
         if self.settings.border != "flat" or not self.settings.refine.objects:
             return None
-        raster, shape = Raster.of(self.stack), self.stack.shape[1:]
+        none, raster, shape = AlbedoPatches.none(self.stack.shape[1:]), Raster.of(self.stack), self.stack.shape[1:]
         search = PitSearch(
-            lambda surface: self.residuals_on(surface, self.substrate),
+            lambda surface: self.residuals_on(surface, none),
             (raster.dy, raster.dx),
             self.stack.instrument.beam_shift,
             self.say,
@@ -418,7 +418,7 @@ class _Fits:
         start = self.promising(pits.surface, best)
         if start is None:
             return None
-        fit = self.fitted(start, self.plain_start[1], self.substrate, pits.number)
+        fit = self.fitted(start, self.plain_start[1], none, pits.number)
         return Explanation(fit, np.zeros(shape, bool), pits.number, "pits in")
 
     def promising(self, surface: Surface, best: Explanation) -> Surface | None:
@@ -427,7 +427,7 @@ class _Fits:
         Only where the instrument is unknown, whose fits take minutes: there, fits bend the instrument, which a short
         fit holds as stated, so that a right explanation does better after a short one.
         """
-        misfit, start = self.short_fit(surface, self.substrate)
+        misfit, start = self.short_fit(surface, AlbedoPatches.none(self.stack.shape[1:]))
         problem = best.fit.problem
         if problem.is_instrument_unknown and misfit > self.short_fit(best.fit.state.surface, problem.patches)[0]:
             return None

@@ -30,7 +30,6 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.levels import GAIN
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.settings import ReconstructSettings
@@ -181,7 +180,6 @@ def find_objects(
     relief: Surface,
     predict: Predict,
     misfit: Callable[[Surface], float],
-    albedo: AlbedoPatches,
     report: Callable[[str], None] = lambda said: None,
 ) -> Objects | None:
     """Find the objects on a flat substrate in micrographs; None if no sharp edges enclose anything.
@@ -192,10 +190,9 @@ def find_objects(
         relief: of the objects, e.g. the photometric solution.
         predict: masks and multiple scattering on a surface.
         misfit: half the chi-square of the data expected on a surface.
-        albedo: of the substrate.
         report: called with what is tried next.
     """
-    substrate = _Substrate(stack, settings, predict, albedo)
+    substrate = _Substrate(stack, settings, predict)
     sharp = jumps(substrate.ratio, substrate.ratio_std) > SHARP
     enclosed = enclosed_by(sharp)
     if not enclosed.any():
@@ -213,12 +210,11 @@ class _Substrate:
     stack: MicrographStack
     settings: ReconstructSettings
     predict: Predict
-    albedo: AlbedoPatches
 
     @cached_property
     def form(self) -> np.ndarray:
-        """Form factors times albedo, nothing masked [detector, 3, y, x]."""
-        return self.albedo.albedo * form_factor(Optics.of(self.stack.instrument), np.zeros(self.stack.shape[1:]))
+        """Form factors, nothing masked [detector, 3, y, x]."""
+        return form_factor(Optics.of(self.stack.instrument), np.zeros(self.stack.shape[1:]))
 
     @cached_property
     def surface(self) -> Surface:
@@ -250,15 +246,13 @@ class _Substrate:
         """
         signal, variance = signal_of(self.stack)
         try:
-            normals = surface.normals(self.stack.instrument.beam_shift)
-            corrections = self.predict(surface.height, normals, **self.albedo.known)
+            corrections = self.predict(surface.height, surface.normals(self.stack.instrument.beam_shift))
         except PredictionError:
             return np.full(signal.shape[1:], np.inf)
-        masked = self.single(self.albedo.albedo * corrections.masked)
-        multiple = self.albedo.albedo * corrections.multiple
-        model = self.single(self.form) - masked + multiple
+        model = self.single(self.form - corrections.masked) + corrections.multiple
         s = self.settings.refine
-        masked, multiple, gain = s.mask_error * masked, s.multiple_error * multiple, s.gain_std * self.single(self.form)
+        masked = s.mask_error * self.single(corrections.masked)
+        multiple, gain = s.multiple_error * corrections.multiple, s.gain_std * self.single(self.form)
         return np.mean((signal - model) ** 2 / (variance + masked**2 + multiple**2 + gain**2), axis=0)
 
 

@@ -51,8 +51,7 @@ def test_what_begins_worse_is_not_fitted(monkeypatch, is_unknown, is_fitted):
     monkeypatch.setattr(_Fits, "short_fit", lambda self, surface, patches: (100.0 + surface.height.max(), surface))
     problem = SimpleNamespace(is_instrument_unknown=is_unknown, patches=None)
     best = SimpleNamespace(fit=SimpleNamespace(problem=problem, state=SimpleNamespace(surface=low)))
-    settings = ReconstructSettings.model_validate({"refine": {"albedo_patches": False}})
-    fits = _Fits(SimpleNamespace(shape=(3, *shape)), settings, None, None)
+    fits = _Fits(SimpleNamespace(shape=(3, *shape)), ReconstructSettings(), None, None)
     assert (fits.promising(high, best) is high) is is_fitted
     assert fits.promising(low, best) is low
 
