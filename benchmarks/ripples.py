@@ -23,14 +23,13 @@ sys.path.insert(0, str(ROOT))
 
 import helio_jax as hx  # noqa: E402
 from benchmarks.rows import Row, row, write  # noqa: E402
-from benchmarks.shapes import Member  # noqa: E402
+from benchmarks.several_scans import PITCH, displaced  # noqa: E402
+from benchmarks.shapes import Member, window  # noqa: E402
 from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.micrograph import MicrographSet  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import load_scene  # noqa: E402
 
-PITCH = 24.0
-"""Distance of pixels [um]."""
 ATOMS = 500_000.0
 """Per pixel, of all scans together."""
 AZIMUTHS = 90.0, 210.0, 330.0
@@ -74,22 +73,17 @@ class Rippled:
             top = rng.uniform(0.3, 0.6) * width
             hills += top * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * width**2))
         waves = SLOPE / np.hypot(*wave) * np.cos(wave[0] * x + wave[1] * y + rng.uniform(0.0, 2.0 * math.pi))
-        drawn = cls(axis, hills, wave, reach)
-        window = drawn.window(x, y)
-        return cls(axis, np.sqrt(window) * hills + window * waves, wave, reach)
+        inside = window(x, y, reach)
+        return cls(axis, np.sqrt(inside) * hills + inside * waves, wave, reach)
 
     @property
     def wavelength(self) -> float:
         """In pixels."""
         return 2.0 * math.pi / float(np.hypot(*self.wave)) / PITCH
 
-    def window(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return 1 in the centre, 0 beyond the ripples, smoothly."""
-        return np.cos(0.5 * math.pi * np.minimum(np.hypot(x, y) / self.reach, 1.0)) ** 2
-
     def recorded(self, n: int, azimuths: tuple[float, ...], rotations: tuple[float, ...], seed: int) -> MicrographSet:
         """Trace n x n pixels under detectors at some azimuths, the sample rotated; noise of a total dose."""
-        top = max(float(self.height.max()), 0.0)
+        top = float(self.height.max())
         aperture = {"polar_deg": 35.0, "half_angle_deg": 6.0}
         raster = {"nx": n, "ny": n, "pixel_size_um": PITCH, "pitch": "sample"}
         tables = {
@@ -103,8 +97,7 @@ class Rippled:
         }
         with tempfile.TemporaryDirectory() as folder:
             scene = load_scene(Member("ripples", tables, map=(self.axis, self.axis, self.height)).write(Path(folder)))
-            found = pipeline.record(scene, pipeline.simulate(scene))
-        return found if isinstance(found, MicrographSet) else MicrographSet((found,))
+            return MicrographSet(pipeline.record(scene, pipeline.simulate(scene)).stacks)
 
     def recovered(self, rec: hx.Reconstruction) -> float:
         """Compute the share of the amplitude that a reconstruction has, in phase."""
@@ -112,7 +105,7 @@ class Rippled:
         down, along = np.gradient(self.height, self.axis, self.axis)
         slopes = np.stack([along, down], -1)
         true = RegularGridInterpolator((self.axis, self.axis), slopes, "cubic", bounds_error=False, fill_value=0.0)
-        weight = self.window(x, y) * np.exp(-1j * (self.wave[0] * x + self.wave[1] * y))
+        weight = window(x, y, self.reach) * np.exp(-1j * (self.wave[0] * x + self.wave[1] * y))
         found = -rec.normals[..., :2] / rec.normals[..., 2:]
         own, whole = (np.nansum(weight[..., None] * s, (0, 1)) @ self.wave for s in (found, true((y, x))))
         return float((own / whole).real)
@@ -124,15 +117,13 @@ def rows_of(rng: np.random.Generator, n: int, settings: ReconstructSettings, see
     off = np.vstack([np.zeros(2), rng.normal(0.0, PITCH, (len(ROTATIONS) - 1, 2))])
     three = sample.recorded(n, AZIMUTHS, (0.0,), seed)
     one = sample.recorded(n, AZIMUTHS[:1], ROTATIONS, seed)
-    displaced = MicrographSet(
-        tuple(s.replace(x=s.x + d[0], y=s.y + d[1]) for s, d in zip(one.stacks, off, strict=True))
-    )
-    fitted, _ = hx.reconstruct_scans(displaced, settings=settings, motions="fitted")
+    wrong = displaced(one, off)
+    fitted, _ = hx.reconstruct_scans(wrong, settings=settings, motions="fitted")
     out = []
     for name, rec, is_kept in (
         ("three detectors", hx.reconstruct(three.stacks[0], settings=settings), True),
         ("one, aligned", hx.reconstruct(one, settings=settings), True),
-        ("one, a pixel off", hx.reconstruct(displaced, settings=settings), False),
+        ("one, a pixel off", hx.reconstruct(wrong, settings=settings), False),
         ("one, motions fitted", fitted, True),
     ):
         share = sample.recovered(rec)

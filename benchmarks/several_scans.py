@@ -27,7 +27,7 @@ from helio_jax.alignment.resample import is_lit  # noqa: E402
 from helio_jax.inverse.linear import MIN_IMAGES  # noqa: E402
 from helio_jax.inverse.settings import ReconstructSettings  # noqa: E402
 from helio_jax.measure.sample_grid import resample_heights  # noqa: E402
-from helio_jax.micrograph import MicrographSet, MicrographStack  # noqa: E402
+from helio_jax.micrograph import MicrographSet  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 from helio_jax.workflows.several_scans import stage_motions  # noqa: E402
@@ -116,7 +116,7 @@ def crystal(rng: np.random.Generator, n: int, settings: ReconstructSettings, num
     rows.append(row("3", f"{what}, motions known", said(errors), "<= 3 %", errors[0] <= 0.03))
     shifts = rng.normal(0.0, 1.5 * PITCH, (len(scans.stacks), 2))
     shifts[0] = 0.0
-    wrong = MicrographSet(tuple(_displaced(s, d) for s, d in zip(scans.stacks, shifts, strict=True)))
+    wrong = displaced(scans, shifts)
     rec, joined = hx.reconstruct_scans(wrong, settings=settings, motions="fitted")
     off = [
         math.dist(np.add(m.shift, -d), s.shift)
@@ -128,9 +128,10 @@ def crystal(rng: np.random.Generator, n: int, settings: ReconstructSettings, num
     return rows
 
 
-def _displaced(stack: MicrographStack, shift: np.ndarray) -> MicrographStack:
-    """Return a scan whose stage states positions that are off by a shift [um]."""
-    return stack.replace(x=stack.x + shift[0], y=stack.y + shift[1])
+def displaced(scans: MicrographSet, shifts: np.ndarray) -> MicrographSet:
+    """Return scans whose stage states positions that are off by shifts [scan, 2], um."""
+    pairs = zip(scans.stacks, shifts, strict=True)
+    return MicrographSet(tuple(s.replace(x=s.x + shift[0], y=s.y + shift[1]) for s, shift in pairs))
 
 
 def main() -> None:

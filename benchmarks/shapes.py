@@ -283,7 +283,7 @@ def _grid(scan: Scan, rng: Rng, reach: float) -> tuple[np.ndarray, np.ndarray, n
     return (x, y, *np.meshgrid(x, y))
 
 
-def _window(x: np.ndarray, y: np.ndarray, reach: float) -> np.ndarray:
+def window(x: np.ndarray, y: np.ndarray, reach: float) -> np.ndarray:
     """Return 1 inside, 0 beyond a reach from the centre, smoothly."""
     r = np.hypot(x, y) / reach
     return np.where(r < 1.0, np.cos(0.5 * math.pi * np.minimum(r, 1.0)) ** 2, 0.0)
@@ -319,7 +319,7 @@ def smooth(rng: Rng, scan: Scan) -> Member:
         for _ in range(int(rng.integers(2, 6))):
             p, s = rng.uniform(-0.22, 0.22, 2) * scan.field, rng.uniform(0.05, 0.1) * scan.field
             height += rng.uniform(-0.6, 1.0) * np.exp(-((gx - p[0]) ** 2 + (gy - p[1]) ** 2) / (2 * s**2))
-        height *= _window(gx, gy, reach) ** 0.25
+        height *= window(gx, gy, reach) ** 0.25
     elif kind == "pyramid":
         height = np.maximum(0.0, 1.0 - np.maximum(np.abs(u), np.abs(v)) / w)
     elif kind == "cone":
@@ -332,9 +332,9 @@ def smooth(rng: Rng, scan: Scan) -> Member:
         sides = [2.5 * (1.0 - (u * math.cos(a) + v * math.sin(a)) / w) for a in np.arange(5) * 2 * math.pi / 5]
         height = np.maximum(0.0, np.min(planes + sides, axis=0))
     elif kind == "rough":
-        height = (_rough(rng, gx.shape, rng.uniform(12, 30)) - 0.5) * _window(gx, gy, reach) ** 0.5
+        height = (_rough(rng, gx.shape, rng.uniform(12, 30)) - 0.5) * window(gx, gy, reach) ** 0.5
     else:
-        height = np.sin(2 * math.pi * u / (rng.uniform(0.15, 0.4) * scan.field)) * _window(gx, gy, reach)
+        height = np.sin(2 * math.pi * u / (rng.uniform(0.15, 0.4) * scan.field)) * window(gx, gy, reach)
     sign = -1.0 if rng.random() < 0.3 else 1.0
     height = sign * height * relief / max(np.ptp(height), 1e-9)
     return _mapped(x, y, height, about={"kind": ("hollow " if sign < 0 else "") + kind})

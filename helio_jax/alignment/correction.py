@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from helio_jax.alignment.resample import smooth
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch, robust_std
 from helio_jax.block_fit import eliminate
@@ -166,7 +167,7 @@ class _Linearised:
         at = use.any(0)
         if not at.any():
             raise _undetermined(0)
-        smoothed = np.stack([_smoothed(i, known, smoothing) for i, known in zip(images, is_known, strict=True)])
+        smoothed = np.stack([smooth(i, known, smoothing) for i, known in zip(images, is_known, strict=True)])
         down, along = (g[:, at] for g in np.gradient(smoothed, y, x, axis=(1, 2)))
         scale = 0.5 * float(max(np.ptp(x), np.ptp(y)))
         turn_x, turn_y = (g[at] / scale for g in np.meshgrid(x, y))
@@ -240,12 +241,6 @@ def _without_noise(information: np.ndarray, noise: np.ndarray) -> np.ndarray:
     share, ways = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, noise).T))
     turned = root @ ways
     return turned @ np.diag(np.maximum(1.0 - share, LEAST_TRUE)) @ turned.T
-
-
-def _smoothed(image: np.ndarray, is_known: np.ndarray, smoothing: float) -> np.ndarray:
-    """Smooth an image over its known pixels [pixels]."""
-    weight = ndimage.gaussian_filter(is_known.astype(float), smoothing)
-    return ndimage.gaussian_filter(np.where(is_known, image, 0.0), smoothing) / np.maximum(weight, 1e-6)
 
 
 def _check_determined(information: np.ndarray, n_pixels: int) -> None:
