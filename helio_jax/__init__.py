@@ -170,10 +170,14 @@ calibration/          background, gain, drift and noise; instruments by known sh
   known_model         detection probability of a known object's scan (JAX)
   known_scan          one scan of a known object: data, unknowns
   known_start         where on the raster the object lies
+  known_pixels        on which part every pixel lies
   common_errors       errors that scan lines or tiles of pixels share
   known_shape         the fit of an instrument to known shapes
   shared_background   background of a campaign: joined from calibrated scans, predicted for another one
   known_report        table, chi-square by region, verdict, instrument with covariance
+  mask_model          what a ball on a flat shows whatever the scattering law (JAX)
+  mask_directions     directions of the apertures by the outlines of ball and masks
+  mask_report         their table, verdict, instrument
 alignment/            rotated scans onto one raster; orientation of arrays
   align               entry: a set of scans -> one stack
   correction          correction of a motion where heights move pixels
@@ -233,6 +237,7 @@ figures/              pictures
   interactive         interactive views; the only door to plotly
   agreement           simulation against measurement
   known_shape         residuals of a calibration by known shapes
+  mask_directions     outlines of ball and masks in the micrographs, residuals
   before_after        a scan before and after calibration
   notebook            thumbnail and table of a record
   micrograph_page     page of micrographs and apertures

@@ -13,7 +13,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from helio_jax.arrays import robust_std
+from helio_jax.robust import cauchy_weight
 
+TILE = 6
+"""Side of the tiles [pixels] within which residuals may be correlated."""
 _CHANCE = 2.0
 """Standard deviations by which the scatter of groups must exceed that of noise for them to have errors of their own."""
 
@@ -113,3 +116,45 @@ def common_std(mean: np.ndarray, total: np.ndarray, is_sure: bool = False) -> np
                 excess = 0.0
         out.append(np.sqrt(max(excess, 0.0)))
     return np.array(out)
+
+
+def enlargement(
+    shapes: list[tuple[int, ...]],
+    weights: list[np.ndarray],
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    inverse: np.ndarray,
+    limit: float,
+) -> tuple[float, float]:
+    """Compute chi-square per datum, and the factor by which correlated residuals enlarge the standard deviations.
+
+    Residuals may be correlated within tiles of `TILE` x `TILE` pixels, all detectors: the covariance of J^T r is then
+    the sum over tiles of (J^T r)(J^T r)^T, to be compared with J^T J. The factor is the root of the mean ratio.
+
+    Args:
+        shapes: (detector, y, x) of the scans.
+        weights: robust weights of the data used, per scan [datum].
+        jacobian, residual: of the data of all scans, weighted [datum, unknown], [datum].
+        inverse: covariance of the unknowns before it is enlarged.
+        limit: of the robust weights [standard deviations].
+
+    Source: White, Econometrica 48 (1980) 817; clusters: Liang and Zeger, Biometrika 73 (1986) 13.
+    """
+    weight = np.concatenate(weights)
+    effective = max(float(weight.sum()) - np.trace(np.eye(len(inverse)) - inverse), 1.0)
+    # robust weights make even the mean square of normal noise less than 1
+    node, share = np.polynomial.hermite_e.hermegauss(40)
+    normal = cauchy_weight(node, limit)
+    expected = float(np.sum(share * normal * node**2) / np.sum(share * normal))
+    chi_square = float(residual @ residual) / effective / expected
+    total, first = np.zeros_like(inverse), 0
+    for k, ny, nx in shapes:
+        rows = slice(first, first + k * ny * nx)
+        first = rows.stop
+        score = (jacobian[rows] * residual[rows, None]).reshape(k, ny, nx, -1).sum(0)
+        for i in range(0, ny, TILE):
+            for j in range(0, nx, TILE):
+                of_tile = score[i : i + TILE, j : j + TILE].sum((0, 1))
+                total += np.outer(of_tile, of_tile)
+    ratio = np.trace(inverse @ total) / max(np.trace(inverse @ (jacobian.T @ jacobian)), 1e-12)
+    return chi_square, float(np.sqrt(ratio))

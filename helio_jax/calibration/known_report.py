@@ -7,6 +7,7 @@ import numpy as np
 
 from helio_jax.arrays import robust_std
 from helio_jax.calibration.known_shape import KnownFit
+from helio_jax.calibration.mask_directions import MaskFit
 from helio_jax.calibration.shared_background import campaign_readout
 from helio_jax.campaign import CampaignLaw
 from helio_jax.geometry_prior import geometry_covariance
@@ -37,7 +38,7 @@ class Row(NamedTuple):
     is_determined: bool
 
 
-def table(fit: KnownFit) -> list[Row]:
+def table(fit: KnownFit | MaskFit) -> list[Row]:
     """List the unknowns of instrument and objects."""
     columns = zip(fit.names, fit.units, fit.values.tolist(), fit.stds.tolist(), strict=True)
     priors = zip(fit.stated_values.tolist(), fit.priors.tolist(), strict=True)
@@ -72,6 +73,15 @@ def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
                 }
             )
     return out
+
+
+def far_from_stated(fit: KnownFit | MaskFit) -> list[str]:
+    """State which unknowns came out far from what is stated, measured by their priors."""
+    return [
+        f"{row.name} is {abs(row.pull):.1f} prior standard deviations from what is stated"
+        for row in table(fit)
+        if abs(row.pull) > FAR and not row.name.startswith("object")
+    ]
 
 
 def regions(fit: KnownFit, number: int) -> dict[str, np.ndarray]:
@@ -146,9 +156,7 @@ def verdict(fit: KnownFit) -> list[str]:
         )
     if not fit.is_converged:
         out.append(f"the fit has not converged in {fit.rounds} rounds: raise max_rounds")
-    for row in table(fit):
-        if abs(row.pull) > FAR and not row.name.startswith("object"):
-            out.append(f"{row.name} is {abs(row.pull):.1f} prior standard deviations from what is stated")
+    out += far_from_stated(fit)
     loose = [row.name for row in table(fit) if not row.is_determined]
     if loose:
         out.append(f"not determined, known by the prior alone: {', '.join(loose)}")
@@ -163,6 +171,17 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     as uncertain as these scans' was before. What the model lacked on these objects, root mean square over detectors and
     scans, it is taken to lack on others, too (`Uncertainty.discrepancy`).
     """
+    found, covariance = geometry_uncertainty(fit)
+    found["discrepancy"] = math.sqrt(np.mean(np.square(error_shares(fit))))
+    uncertainty = Uncertainty(**found)
+    signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)
+    readout = campaign_readout(fit, signals)
+    tables = {"uncertainty": uncertainty, "covariance": covariance, "readout": readout, "law": campaign_law(fit)}
+    return fit.instrument.model_copy(update=tables)
+
+
+def geometry_uncertainty(fit: KnownFit | MaskFit) -> tuple[dict[str, float], Covariance]:
+    """Return what is unknown of a fitted instrument's geometry, for [uncertainty] and [covariance] of its file."""
     n = fit.n_shared
     std = dict(zip(fit.names[:n], fit.stds[:n].tolist(), strict=True))
     size = np.sqrt(np.diag(fit.covariance[:n, :n]))
@@ -186,13 +205,8 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
         "polar_deg": min(polar, 30.0),
         "azimuth_deg": min(azimuth, 30.0),
         "tilt_deg": max([stated.tilt_deg, *tilts]),
-        "discrepancy": math.sqrt(np.mean(np.square(error_shares(fit)))),
     }
-    uncertainty = Uncertainty(**{name: float(f"{value:.4g}") for name, value in found.items()})
-    signals = np.array([row["substrate_signal"] for row in readout_rows(fit)]).reshape(len(fit.scans), -1)
-    readout = campaign_readout(fit, signals)
-    found = {"uncertainty": uncertainty, "covariance": covariance, "readout": readout, "law": campaign_law(fit)}
-    return fit.instrument.model_copy(update=found)
+    return {name: float(f"{value:.4g}") for name, value in found.items()}, covariance
 
 
 def campaign_law(fit: KnownFit) -> CampaignLaw | None:

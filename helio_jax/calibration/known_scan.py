@@ -7,9 +7,18 @@ import numpy as np
 from helio_jax.calibration.known_model import ScanModel
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.noise_model import estimate_noise, find_spikes
-from helio_jax.calibration.unknowns import Columns, KnownShapeSettings, Unknown, object_unknowns, readout_columns
+from helio_jax.calibration.unknowns import (
+    OBJECT,
+    PLATE,
+    Columns,
+    KnownShapeSettings,
+    Unknown,
+    object_unknowns,
+    readout_columns,
+)
 from helio_jax.errors import SceneError
 from helio_jax.forward.optics import Optics, Raster
+from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 
 SPIKE = 6.0
@@ -97,6 +106,35 @@ def prepare_scan(stack: MicrographStack, known: KnownObject, settings: KnownShap
         0.5 * np.array([np.ptp(stack.x), np.ptp(stack.y)]),
         stack.dwell,
         stack.unit,
+    )
+
+
+def one_instrument(stacks: list[MicrographStack]) -> Instrument:
+    """Return the instrument that scans state.
+
+    Raises:
+        SceneError: they state different ones.
+    """
+    stated = stacks[0].instrument
+    for stack in stacks[1:]:
+        if stack.instrument.detector != stated.detector or stack.instrument.plate != stated.plate:
+            raise SceneError(
+                f"{stack.name}: its instrument is not that of {stacks[0].name}: a joint calibration needs one "
+                "instrument; import all scans with the same --instrument"
+            )
+    return stated
+
+
+def moved_instrument(stated: Instrument, unknowns: np.ndarray) -> Instrument:
+    """Move an instrument by the unknowns of a scan [unknown], um and rad."""
+    plate, aim = np.split(unknowns[: -len(OBJECT)], [len(PLATE)])
+    return stated.moved(
+        aim.reshape(2, -1).T,
+        float(plate[4]),
+        plate_shift=(float(plate[0]), float(plate[1])),
+        scale=1.0 + float(plate[2]),
+        rotation=float(plate[3]),
+        incidence=float(plate[5]),
     )
 
 

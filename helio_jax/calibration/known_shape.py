@@ -14,7 +14,16 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from helio_jax.arrays import pitch, robust_std
-from helio_jax.calibration.common_errors import Groups, common_std, group_means, scan_lines, tiles, whitened
+from helio_jax.calibration.common_errors import (
+    TILE,
+    Groups,
+    common_std,
+    enlargement,
+    group_means,
+    scan_lines,
+    tiles,
+    whitened,
+)
 from helio_jax.calibration.known_model import (
     Multiple,
     Seen,
@@ -27,35 +36,28 @@ from helio_jax.calibration.known_model import (
     see,
 )
 from helio_jax.calibration.known_objects import KnownObject
+from helio_jax.calibration.known_pixels import CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
 from helio_jax.calibration.known_scan import (
     KnownScan,
     Layout,
     expected_counts,
     linear_start,
+    moved_instrument,
+    one_instrument,
     prepare_scan,
     stride_for,
     thinned,
 )
 from helio_jax.calibration.known_start import started
 from helio_jax.calibration.unknowns import KnownShapeSettings, instrument_unknowns
-from helio_jax.errors import GuardError, SceneError
+from helio_jax.errors import GuardError
 from helio_jax.forward.optics import Raster
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.robust import cauchy_weight
 
-OUTLINE = 0.6, 0.3, 0.15
-"""Scale of the logistic function by which a pixel changes from object to substrate, over the pitch of a raster of at
-most `FIRST_PIXELS` pixels a side: in the first rounds and all later ones. A wide outline finds the object from farther
-away, a narrow one places it better. Data of a pixel that is closer to an outline than this are left out: its masks and
-its multiple scattering change too fast with the object's place for a linear step, and differ between the parts. They
-still tell on which part it lies."""
-TILE = 6
-"""Side of the tiles [pixels] within which residuals may be correlated."""
 TILES_ACROSS = 6
 """Tiles across an object within which the model's error is the same, if each of them has `TILE` pixels or more."""
-CONVERGED = 0.1
-"""The fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
 NEAR = 1.0
 """Errors of the model are estimated when no unknown changes by more standard deviations in a round: before, misfit is
 that of the unknowns. Then they are held: estimated again from residuals that they have shaped, they only grow."""
@@ -241,11 +243,11 @@ class _Fit:
                 self.multiple[i] = self._scattered_again(number, i, at, seen, instrument)
             step = _outline_pitch(scan)
             self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * step
-            used = scan.is_used & ~_ring(scan, own, seen, self.settings)
+            used = scan.is_used & ~near_foot(scan, own, seen.distance, self.settings)
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             self.outlined[i] = used.any(0)
-            is_beside = log_share.max(0) < -np.logaddexp(0.0, -self.width[i] / (OUTLINE[0] * step))
+            is_beside = is_beside_outline(log_share, self.width[i] / (OUTLINE[0] * step))
             # once the outline is narrow, such a pixel stays out: else it may go in and out for ever
             self.is_beside[i] = is_beside | (self.is_beside[i] & (number >= len(OUTLINE)))
             self.used[i] = used & ~self.is_beside[i]
@@ -253,7 +255,8 @@ class _Fit:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
                 mean = np.sum(np.exp(log_share)[:, None] * value, 0)
                 self.linear[i] = linear_start(scan, mean, inverse, self.settings)
-            self.member[i] = _membership(scan, used, self.linear[i], value, log_share, self.settings)
+            modelled = np.stack([expected_counts(scan, self.linear[i], image) for image in value])
+            self.member[i] = membership(scan, used, modelled, log_share, self.settings)
             image = np.sum(self.member[i][:, None] * value, 0)
             misfit = np.where(self.used[i], scan.counts - expected_counts(scan, self.linear[i], image), np.nan)
             scale = max(1.0, float(robust_std(misfit / scan.sigma)))
@@ -298,53 +301,12 @@ class _Fit:
 
     def fitted(self) -> Instrument:
         """Move the instrument by the present unknowns."""
-        plate, aim = np.split(self.layout.of_scan(0, self.x)[: -len(self.scans[0].own)], [6])
-        return self.stated.moved(
-            aim.reshape(2, -1).T,
-            float(plate[4]),
-            plate_shift=(float(plate[0]), float(plate[1])),
-            scale=1.0 + float(plate[2]),
-            rotation=float(plate[3]),
-            incidence=float(plate[5]),
-        )
+        return moved_instrument(self.stated, self.layout.of_scan(0, self.x))
 
 
 def _outline_pitch(scan: KnownScan) -> float:
     """Return the pitch that the outline's scale refers to [um]; at a finer one the fit would creep, not step."""
     return stride_for(scan, FIRST_PIXELS) * pitch(scan.model.raster.y)
-
-
-def _ring(scan: KnownScan, own: dict[str, float], seen: Seen, settings: KnownShapeSettings) -> np.ndarray:
-    """Find the ring about the foot of a ball that is left out [y, x]."""
-    if settings.leave_out_ring is None or scan.known.kind != "ball":
-        return np.zeros(seen.height.shape, bool)
-    low, high = settings.leave_out_ring
-    foot = np.sqrt(max(own["height"] * (2.0 * own["radius"] - own["height"]), 0.0))
-    return (seen.distance > low * foot) & (seen.distance < high * foot)
-
-
-def _membership(
-    scan: KnownScan,
-    used: np.ndarray,
-    linear: np.ndarray,
-    value: np.ndarray,
-    log_share: np.ndarray,
-    settings: KnownShapeSettings,
-) -> np.ndarray:
-    """Compute the probability that a pixel lies on each part, by its data and by where the outline is [part, y, x].
-
-    A detector that no part explains, as with dust, makes no difference: residuals count as in the fit, robustly.
-
-    Source: expectation step of a mixture: Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1.
-    """
-    limit = settings.robust_limit
-    loss = np.zeros(log_share.shape)
-    for m, image in enumerate(value):
-        residual = (scan.counts - expected_counts(scan, linear, image)) / scan.sigma
-        loss[m] = np.sum(np.where(used, limit**2 * np.log1p((residual / limit) ** 2), 0.0), 0)
-    weight = log_share - 0.5 * loss
-    weight = np.exp(weight - weight.max(0))
-    return weight / weight.sum(0)
 
 
 def _tiles_of(seen: Seen) -> Groups:
@@ -375,13 +337,7 @@ def fit_known_shapes(
         SceneError: the scans have different instruments, or a scan cannot be fitted.
         GuardError: nothing can be determined.
     """
-    stated = stacks[0].instrument
-    for stack in stacks[1:]:
-        if stack.instrument.detector != stated.detector or stack.instrument.plate != stated.plate:
-            raise SceneError(
-                f"{stack.name}: its instrument is not that of {stacks[0].name}: a joint calibration needs one "
-                "instrument; import all scans with the same --instrument"
-            )
+    stated = one_instrument(stacks)
     scans = [prepare_scan(s, k, settings) for s, k in zip(stacks, known, strict=True)]
     if all(scan.known.kind == "flat" for scan in scans):
         raise GuardError(
@@ -445,7 +401,9 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     jacobian, residual = fit.derivatives(z), fit.residuals(z)
     inverse = np.linalg.inv(jacobian.T @ jacobian)
     n_data = sum(scan.counts.size for scan in fit.scans)
-    chi_square, correlated = _misfit(fit, jacobian[:n_data], residual[:n_data], inverse)
+    shapes, used = [scan.counts.shape for scan in fit.scans], zip(fit.weights, fit.used, strict=True)
+    data = jacobian[:n_data], residual[:n_data], inverse
+    chi_square, correlated = enlargement(shapes, [w[u] for w, u in used], *data, fit.settings.robust_limit)
     inflation = max(1.0, np.sqrt(chi_square), correlated)
     n = len(fit.x)
     # outlines and priors are no data: the residuals say nothing about them
@@ -475,32 +433,3 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
         residuals, expected, fit.weights, seen, fit.lines, fit.model_error, chi_square, float(inflation), rounds,
         is_converged,
     )  # fmt: skip
-
-
-def _misfit(fit: _Fit, jacobian: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> tuple[float, float]:
-    """Compute chi-square per datum, and the factor by which correlated residuals enlarge the standard deviations.
-
-    Residuals may be correlated within tiles of `TILE` x `TILE` pixels, all detectors: the covariance of J^T r is then
-    the sum over tiles of (J^T r)(J^T r)^T, to be compared with J^T J. The factor is the root of the mean ratio.
-
-    Source: White, Econometrica 48 (1980) 817; clusters: Liang and Zeger, Biometrika 73 (1986) 13.
-    """
-    weight = np.concatenate([w[u] for w, u in zip(fit.weights, fit.used, strict=True)])
-    effective = max(float(weight.sum()) - np.trace(np.eye(len(inverse)) - inverse), 1.0)
-    # robust weights make even the mean square of normal noise less than 1
-    node, share = np.polynomial.hermite_e.hermegauss(40)
-    normal = cauchy_weight(node, fit.settings.robust_limit)
-    expected = float(np.sum(share * normal * node**2) / np.sum(share * normal))
-    chi_square = float(residual @ residual) / effective / expected
-    total, first = np.zeros_like(inverse), 0
-    for scan in fit.scans:
-        k, ny, nx = scan.counts.shape
-        rows = slice(first, first + scan.counts.size)
-        first = rows.stop
-        score = (jacobian[rows] * residual[rows, None]).reshape(k, ny, nx, -1).sum(0)
-        for i in range(0, ny, TILE):
-            for j in range(0, nx, TILE):
-                of_tile = score[i : i + TILE, j : j + TILE].sum((0, 1))
-                total += np.outer(of_tile, of_tile)
-    ratio = np.trace(inverse @ total) / max(np.trace(inverse @ (jacobian.T @ jacobian)), 1e-12)
-    return chi_square, float(np.sqrt(ratio))

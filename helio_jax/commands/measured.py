@@ -204,6 +204,9 @@ def calibrate(
         list[str] | None,
         typer.Option(help='Calibrate the instrument by objects of this shape, "ball radius=1000" (one per scan)'),
     ] = None,
+    masks: Annotated[
+        bool, typer.Option("--masks", help="With --known: directions by the outlines of ball and masks alone.")
+    ] = False,
     drift: Annotated[bool, typer.Option(help="Subtract slow drift, and leave its residual to the fit.")] = True,
     lines: Annotated[bool, typer.Option(help="Leave offsets of single scan lines to the fit.")] = True,
     noise_model: Annotated[bool, typer.Option(help="Estimate the variance as a + b counts.")] = True,
@@ -222,10 +225,13 @@ def calibrate(
     from helio_jax.errors import SceneError
 
     if known:
-        _calibrate_known(stacks, output, known, set_options(settings, leave_out_ring=leave_out_ring), as_json)
+        changes = set_options(settings, leave_out_ring=leave_out_ring)
+        _calibrate_known(stacks, output, known, masks, changes, as_json)
         return
-    if len(stacks) > 1 or leave_out_ring is not None or output.suffix.lower() == ".toml":
-        raise SceneError("several scans, --leave-out-ring and an instrument file (.toml) need --known SHAPE: add it")
+    if len(stacks) > 1 or masks or leave_out_ring is not None or output.suffix.lower() == ".toml":
+        raise SceneError(
+            "several scans, --masks, --leave-out-ring and an instrument file (.toml) need --known SHAPE: add it"
+        )
     stack = stacks[0]
     from helio_jax.workflows.pipeline import calibrate_file
 
@@ -259,21 +265,23 @@ def calibrate(
     print(f"{output}\n{output.with_suffix('.png')}")
 
 
-def _calibrate_known(stacks: list[Path], output: Path, known: list[str], changes: dict, as_json: bool) -> None:
+def _calibrate_known(
+    stacks: list[Path], output: Path, known: list[str], masks: bool, changes: dict, as_json: bool
+) -> None:
     """Calibrate an instrument by known shapes, and print what was found."""
     from helio_jax.errors import SceneError
     from helio_jax.workflows.calibrate_known import calibrate_known_files
 
     if output.suffix.lower() != ".toml":
         raise SceneError(f"--known writes an instrument file: give -o the suffix .toml, got {str(output)!r}")
-    with Bar("calibrating by known shapes") as bar:
-        found = calibrate_known_files(stacks, output, known, report=bar, **changes)
+    with Bar("calibrating by masks" if masks else "calibrating by known shapes") as bar:
+        found = calibrate_known_files(stacks, output, known, masks=masks, report=bar, **changes)
     if as_json:
         print(json.dumps(found))
         return
-    from helio_jax.figures.summary import known_shape_lines
+    from helio_jax.figures.summary import known_shape_lines, mask_lines
 
-    print("\n".join(known_shape_lines(found)))
+    print("\n".join((mask_lines if masks else known_shape_lines)(found)))
 
 
 @app.command()

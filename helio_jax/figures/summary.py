@@ -4,7 +4,7 @@ Rows of (label, text) for `helio info`, for the end of `helio simulate` and `hel
 plain text: um, deg.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -275,13 +275,8 @@ def _made_rows(provenance: Any) -> Rows:
 
 def known_shape_lines(record: Mapping[str, Any]) -> list[str]:
     """Format what `calibrate_known_files` returns for a terminal."""
-    rows, readout, chi = record["table"], record["readout"], record["regions"]
-    width = max(len(row["name"]) for row in rows)
-    out = [f"  {'':<{width}} {'value':>10} {'s.d.':>9} {'stated':>10} {'prior s.d.':>10} {'pull':>6}"]
-    for row in rows:
-        numbers = f"{row['value']:>10.5g} {row['std']:>9.3g} {row['stated']:>10.5g} {row['prior']:>10.3g}"
-        loose = "" if row["is_determined"] else "  not determined"
-        out.append(f"  {row['name']:<{width}} {numbers} {row['pull']:>6.1f} {row['unit']}{loose}")
+    readout, chi = record["readout"], record["regions"]
+    out = _parameter_lines(record["table"])
     out += ["", "  detector       substrate's signal       offset     lines     noise   (counts)"]
     for row in readout:
         out.append(
@@ -295,3 +290,23 @@ def known_shape_lines(record: Mapping[str, Any]) -> list[str]:
     out += ["", f"  robust chi-square {record['robust_chi_square']:.2f} per pixel; {record['rounds']} rounds"]
     out += [f"  {sentence}" for sentence in record["verdict"]]
     return out + list(record["files"])
+
+
+def mask_lines(record: Mapping[str, Any]) -> list[str]:
+    """Format what `calibrate_known_files` returns of directions by masks for a terminal."""
+    out = ["directions of the apertures as the spot sees them; pull: (value - stated) / s.d."]
+    out += [*_parameter_lines(record["directions"]), "", "all unknowns; pull: (value - stated) / prior s.d."]
+    out += _parameter_lines(record["table"])
+    out += ["", f"  robust chi-square {record['robust_chi_square']:.2f} per pixel; {record['rounds']} rounds"]
+    return [*out, *(f"  {sentence}" for sentence in record["verdict"]), *record["files"]]
+
+
+def _parameter_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Format a table of fitted parameters."""
+    width = max(len(row["name"]) for row in rows)
+    out = [f"  {'':<{width}} {'value':>10} {'s.d.':>9} {'stated':>10} {'prior s.d.':>10} {'pull':>6}"]
+    for row in rows:
+        numbers = f"{row['value']:>10.5g} {row['std']:>9.3g} {row['stated']:>10.5g} {row['prior']:>10.3g}"
+        loose = "" if row["is_determined"] else "  not determined"
+        out.append(f"  {row['name']:<{width}} {numbers} {row['pull']:>6.1f} {row['unit']}{loose}")
+    return out

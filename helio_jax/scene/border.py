@@ -2,11 +2,13 @@
 
 `extend_border`: the border falls to the substrate, a terrace continues level. An image often ends on a flank. The
 surface beyond it is not imaged but scatters atoms into the image. Continued at the height of the border, it would lie
-above the true substrate, nearer to the apertures, and scatter too much. `mirror_border`: relief goes on as it is
-inside, as that of a rough or wavy surface or a wall across the image does.
+above the true substrate, nearer to the apertures, and scatter too much. `continue_border`: relief goes on as it is
+inside, mirrored as that of a wall across the image (`mirror_border`), or with the image's autocorrelation as that of a
+rough or wavy surface (`predict_border`): whichever would have predicted the image's own margin better.
 """
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter1d, map_coordinates, median_filter
 
 MAX_TERRACE_SLOPE = 0.2
@@ -24,6 +26,12 @@ _CONTOUR_PIXELS = 10
 _MIN_COHERENCE, _MIN_CROSSING = 0.5, 0.3
 """Contours have a direction where the eigenvalues of the structure tensor differ by more than this share of their sum;
 they cross the border where its sine exceeds this."""
+_KNOWN_PIXELS = 31
+"""Largest number of rows and columns from which a surface is predicted; a larger image is thinned."""
+_NOISE = 0.01
+"""Share of the variance of the heights that is taken for noise."""
+_MARGIN = 8
+"""The image's margin that has to be predicted from inside is this fraction of its shorter side; at least 2 pixels."""
 
 
 def extend_border(
@@ -64,6 +72,67 @@ def _extend_columns(
             for field, ring in zip(fields, rings, strict=True)
         )
     return fields  # type: ignore[return-value]
+
+
+def continue_border(z: np.ndarray, pitch: tuple[float, float], level: float, pixels: int) -> np.ndarray:
+    """Continue relief beyond the border by so many pixels, as it is inside [y + 2 pixels, x + 2 pixels].
+
+    Args:
+        z: heights [y, x], um.
+        pitch: dy, dx of the raster, um.
+        level: height of the substrate, um.
+        pixels: fewer than there are rows and columns.
+    """
+    margin = min(z.shape) // _MARGIN
+    mirrored = mirror_border(z, pitch, level, pixels)
+    if margin < 2:
+        return mirrored
+    inside = z[margin:-margin, margin:-margin]
+    tried = mirror_border(inside, pitch, level, margin), predict_border(inside, margin)
+    as_mirrored, as_predicted = (float(np.mean((found - z) ** 2)) for found in tried)
+    return mirrored if as_mirrored <= as_predicted else predict_border(z, pixels)
+
+
+def predict_border(z: np.ndarray, pixels: int) -> np.ndarray:
+    """Continue heights as a stationary random surface of the image's autocorrelation [y + 2 pixels, x + 2 pixels].
+
+    Heights beyond the border are the best linear prediction from those inside, within their range: waves go on as
+    waves, rough relief falls to the mean height over its correlation length.
+
+    Args:
+        z: heights [y, x], um.
+        pixels: to be added on every side.
+
+    Source: Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949); kriging.
+    """
+    mean, (ny, nx) = float(np.mean(z)), z.shape
+    spectrum = np.abs(np.fft.rfft2(z - mean, (2 * ny, 2 * nx))) ** 2
+    correlation = np.fft.irfft2(spectrum, (2 * ny, 2 * nx))  # biased: positive definite, 0 beyond the image's size
+    if correlation[0, 0] <= 0.0:
+        return np.pad(z, pixels, mode="edge")
+    correlation = correlation / correlation[0, 0]
+    stride = -(-max(z.shape) // _KNOWN_PIXELS)
+
+    def between(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Compute the correlation of points of a grid with those known [point, known]."""
+        of_rows = np.subtract.outer(rows, known_rows)[:, None, :, None]
+        of_columns = np.subtract.outer(columns, known_columns)[None, :, None, :]
+        found = np.where(
+            (np.abs(of_rows) < ny) & (np.abs(of_columns) < nx),
+            correlation[of_rows % (2 * ny), of_columns % (2 * nx)],
+            0.0,
+        )
+        return found.reshape(rows.size * columns.size, -1)
+
+    known_rows, known_columns = np.arange(0, ny, stride), np.arange(0, nx, stride)
+    inside = between(known_rows, known_columns) + _NOISE * np.eye(known_rows.size * known_columns.size)
+    weight = cho_solve(cho_factor(inside), (z - mean)[::stride, ::stride].ravel())
+    rows, columns = (np.arange(-pixels, n + pixels + stride, stride) for n in z.shape)
+    coarse = np.stack([between(rows[i : i + 1], columns) @ weight for i in range(rows.size)])
+    at = np.meshgrid(*(np.arange(n + 2 * pixels) / stride for n in z.shape), indexing="ij")
+    out = np.clip(mean + map_coordinates(coarse, at, order=1, mode="nearest"), z.min(), z.max())
+    out[pixels : pixels + ny, pixels : pixels + nx] = z
+    return out
 
 
 def mirror_border(z: np.ndarray, pitch: tuple[float, float], level: float, pixels: int) -> np.ndarray:

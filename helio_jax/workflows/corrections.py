@@ -24,7 +24,7 @@ from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
-from helio_jax.scene.border import extend_border, mirror_border
+from helio_jax.scene.border import continue_border, extend_border
 from helio_jax.scene.hidden_side import occluded_vertices, with_cavities
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import surface_body
@@ -47,10 +47,10 @@ MAX_SMOOTHING_STEP = 0.5
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
 for the test of a result, which is to be traced even where it is bad."""
-CONTINUATIONS = "level", "mirrored"
-"""How the surface goes on beyond a free border: `extend_border`, `mirror_border`."""
-MIRRORED = 0.5
-"""Share of the image that is mirrored at each border."""
+CONTINUATIONS = "level", "relief"
+"""How the surface goes on beyond a free border: `extend_border`, `continue_border`."""
+CONTINUED = 0.5
+"""Share of the image by which relief goes on beyond each border."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
 
@@ -320,8 +320,8 @@ class _Raster:
         substrate = self.flat_surroundings
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
-            if way == "mirrored":
-                at, behind = self.mirrored(at, behind, level)
+            if way == "relief":
+                at, behind = self.continued(at, behind, level)
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
         pixel = self.pixels(at[0].shape)
         if has_walls:
@@ -373,14 +373,14 @@ class _Raster:
         """Compute the surface points of heights [y, x] that are seen at positions x, y of the raster [um]."""
         return x - height * self.view_shift[0], y - height * self.view_shift[1], height
 
-    def mirrored(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
-        """Mirror a grid at the image's border; the occluded side of what is added stays on the sheet along the beam."""
-        n = int(MIRRORED * min(self.x.shape))
+    def continued(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
+        """Continue a grid's relief beyond the image; the occluded side of what is added stays on the beam's sheet."""
+        n = int(CONTINUED * min(self.x.shape))
         dx, dy = self.pitches
         x, y = np.meshgrid(
             *(p[0] + step * np.arange(-n, p.size + n) for p, step in ((self.x[0], dx), (self.y[:, 0], dy)))
         )
-        z = mirror_border(at[2], (dy, dx), level, n)
+        z = continue_border(at[2], (dy, dx), level, n)
         wide = self.surface(x, y, z)
         moved = wide[0].copy(), wide[1].copy(), z.copy()
         for field, inner in zip(moved, behind, strict=True):
