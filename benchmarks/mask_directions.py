@@ -1,4 +1,4 @@
-"""Directions of the apertures by the outlines of ball and masks alone, on twins made by the tracer (issue 32, row 4).
+"""Directions of the apertures by the outlines of ball and masks alone, on twins made by the tracer.
 
 python benchmarks/mask_directions.py [--instruments N] [--first SEED] [--pixels N] [--tiny]
 

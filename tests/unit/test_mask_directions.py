@@ -144,15 +144,16 @@ def test_directions_are_found(twin, fit, bshem):
 
 @pytest.mark.slow
 def test_gain_offset_and_law_make_no_difference(twin, fit):
-    """Other gains and offsets give the same directions to 1 % of their deviation. No chance is involved.
+    """Other gains and offsets give the same directions within one standard deviation.
 
-    Catches a level, an offset or a prior that is not in units of the signal.
+    Not exactly: the fit ends where a round changes it little, and single pixels at the outline may change sides.
+    Catches a level, an offset or a prior that is not in units of the signal. No chance is involved.
     """
     stack, _ = twin
     gain = np.array([0.3, 5.0, 1.0])[:, None, None]
     other = stack.replace(counts=stack.counts * gain + 7000.0, variance=stack.variance * gain**2)
     found = fit_masks([other], [KnownObject.parse(BALL)], SETTINGS)
-    assert np.abs(found.directions - fit.directions).max() < 0.05 * fit.direction_stds.min()
+    assert np.all(np.abs(found.directions - fit.directions) < fit.direction_stds)
 
 
 @pytest.mark.slow
