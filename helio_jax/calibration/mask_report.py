@@ -49,19 +49,23 @@ def robust_chi_square(fit: MaskFit) -> float:
 def verdict(fit: MaskFit) -> list[str]:
     """State in sentences what the masks contradict, and what they do not determine."""
     rows, out = direction_rows(fit), []
+    chi, far = robust_chi_square(fit), far_from_stated(fit)
+    if far:
+        out.append(
+            f"the outlines fit no instrument within its priors, do not trust these directions: {'; '.join(far)}; "
+            "dust or a crevice at the ball's foot?"
+        )
     for row in rows:
         if row["is_determined"] and abs(row["pull"]) > FAR:
             out.append(
                 f"the masks contradict the instrument file: {row['name']} is {row['value']:.1f} +- {row['std']:.1f} "
                 f"deg, the file states {row['stated']:.1f}"
             )
-    chi = robust_chi_square(fit)
     if chi > LARGE_CHI_SQUARE or fit.inflation > INFLATED:
         out.append(
             f"the model does not explain all of the scans: robust chi-square {chi:.2f} per pixel; standard deviations "
-            f"are enlarged {fit.inflation:.2f} times; dust or a crevice at the foot? leave it out by --leave-out-ring"
+            f"are enlarged {fit.inflation:.2f} times; what lies at the foot can be left out by --leave-out-ring"
         )
-    out += far_from_stated(fit)
     if not fit.is_converged:
         out.append(f"the fit has not converged in {fit.rounds} rounds: raise max_rounds")
     loose = [row["name"] for row in rows if not row["is_determined"]]

@@ -1,5 +1,6 @@
 """Directions by the outlines of ball and masks: closed forms, a traced twin, what the estimator must not depend on."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -136,6 +137,8 @@ def test_directions_are_found(twin, fit, bshem):
         assert row["is_determined"], row
     assert max(abs(row["stated"] - value) for row, value in zip(rows, true, strict=True)) > 4.0
     assert any("masks contradict the instrument file: polar of" in text for text in verdict(fit))
+    far = dataclasses.replace(fit, values=np.where(np.array(fit.names) == "incidence", 40.0, fit.values))
+    assert "do not trust" in verdict(far)[0] and not any("do not trust" in text for text in verdict(fit))
     assert fit.is_converged and 0.7 < fit.chi_square < 1.6  # the twin's own noise adds to the stated one
     written = instrument_by_masks(fit)
     assert np.asarray(directions_of(Optics.of(written))).ravel() == pytest.approx(fit.directions.ravel(), abs=1e-6)
