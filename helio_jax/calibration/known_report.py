@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from helio_jax.arrays import robust_std
+from helio_jax.calibration.known_scan import InstrumentFit
 from helio_jax.calibration.known_shape import KnownFit
-from helio_jax.calibration.mask_directions import MaskFit
 from helio_jax.calibration.shared_background import campaign_readout
 from helio_jax.campaign import CampaignLaw
 from helio_jax.geometry_prior import geometry_covariance
@@ -38,7 +38,7 @@ class Row(NamedTuple):
     is_determined: bool
 
 
-def table(fit: KnownFit | MaskFit) -> list[Row]:
+def table(fit: InstrumentFit) -> list[Row]:
     """List the unknowns of instrument and objects."""
     columns = zip(fit.names, fit.units, fit.values.tolist(), fit.stds.tolist(), strict=True)
     priors = zip(fit.stated_values.tolist(), fit.priors.tolist(), strict=True)
@@ -75,7 +75,7 @@ def readout_rows(fit: KnownFit) -> list[dict[str, Any]]:
     return out
 
 
-def far_from_stated(fit: KnownFit | MaskFit) -> list[str]:
+def far_from_stated(fit: InstrumentFit) -> list[str]:
     """State which unknowns came out far from what is stated, measured by their priors."""
     return [
         f"{row.name} is {abs(row.pull):.1f} prior standard deviations from what is stated"
@@ -180,7 +180,7 @@ def calibrated_instrument(fit: KnownFit) -> Instrument:
     return fit.instrument.model_copy(update=tables)
 
 
-def geometry_uncertainty(fit: KnownFit | MaskFit) -> tuple[dict[str, float], Covariance]:
+def geometry_uncertainty(fit: InstrumentFit) -> tuple[dict[str, float], Covariance]:
     """Return what is unknown of a fitted instrument's geometry, for [uncertainty] and [covariance] of its file."""
     n = fit.n_shared
     std = dict(zip(fit.names[:n], fit.stds[:n].tolist(), strict=True))

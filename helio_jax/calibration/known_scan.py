@@ -157,6 +157,14 @@ class Layout:
             self.place.append(np.array([*range(self.n_shared), *range(start, start + len(own))]))
             self.unknowns += [scan.own[i] for i in own]
             self.scan_of += [number] * len(own)
+        several = len(scans) > 1
+        self.names = [
+            u.name + (f" in {scans[k].name}" if several and k >= 0 else "")
+            for u, k in zip(self.unknowns, self.scan_of, strict=True)
+        ]
+        self.units = [u.unit for u in self.unknowns]
+        self.priors = np.array([u.prior for u in self.unknowns])
+        self.stated = np.array([u.stated for u in self.unknowns])
         self.scale = np.array([u.prior * u.factor for u in self.unknowns])
         self.start = [
             np.array([0.0 if i < n else u.stated * u.factor for i, u in enumerate(unknowns)]) for unknowns in self.all
@@ -197,3 +205,28 @@ def linear_start(scan: KnownScan, model: np.ndarray, inverse: np.ndarray, settin
 def expected_counts(scan: KnownScan, linear: np.ndarray, model: np.ndarray) -> np.ndarray:
     """Compute the readings [detector, y, x] of linear unknowns [detector, column] at probabilities [detector, y, x]."""
     return linear[:, 0, None, None] * model + np.tensordot(linear[:, 1:], scan.columns.modes, 1)
+
+
+@dataclass(frozen=True)
+class InstrumentFit:
+    """An instrument that was fitted to scans of known objects.
+
+    Attributes:
+        instrument: as fitted; `stated`: as given.
+        scans: the data.
+        names, units, stated_values, priors, values, stds: of the free unknowns, in the units shown.
+        covariance: of the free unknowns over their prior standard deviations, enlarged for misfit.
+        n_shared: of them are those of the instrument, the first ones.
+    """
+
+    instrument: Instrument
+    stated: Instrument
+    scans: list[KnownScan]
+    names: list[str]
+    units: list[str]
+    stated_values: np.ndarray
+    priors: np.ndarray
+    values: np.ndarray
+    stds: np.ndarray
+    covariance: np.ndarray
+    n_shared: int

@@ -38,6 +38,7 @@ from helio_jax.calibration.known_model import (
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.known_pixels import CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
 from helio_jax.calibration.known_scan import (
+    InstrumentFit,
     KnownScan,
     Layout,
     expected_counts,
@@ -80,15 +81,10 @@ object's."""
 
 
 @dataclass(frozen=True)
-class KnownFit:
+class KnownFit(InstrumentFit):
     """Result of the fit.
 
-    Attributes:
-        instrument: as fitted; `stated`: as given.
-        scans: the data.
-        names, units, stated_values, priors, values, stds: of the free unknowns, in the units shown.
-        covariance: of the free unknowns over their prior standard deviations, inflated.
-        n_shared: of them are those of the instrument, the first ones.
+    Attributes (those of `InstrumentFit`, and):
         linear: of every scan, gain and the columns [detector, column].
         linear_covariance: of these, detector by detector [detector, column, column], per scan.
         residuals: in standard deviations, NaN where not used [detector, y, x], per scan.
@@ -102,17 +98,6 @@ class KnownFit:
         rounds, is_converged: of the fit.
     """
 
-    instrument: Instrument
-    stated: Instrument
-    scans: list[KnownScan]
-    names: list[str]
-    units: list[str]
-    stated_values: np.ndarray
-    priors: np.ndarray
-    values: np.ndarray
-    stds: np.ndarray
-    covariance: np.ndarray
-    n_shared: int
     linear: list[np.ndarray]
     linear_covariance: list[np.ndarray]
     residuals: list[np.ndarray]
@@ -409,13 +394,8 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
     # outlines and priors are no data: the residuals say nothing about them
     informed = jacobian[:n_data].T @ jacobian[:n_data] / inflation**2 + jacobian[n_data:].T @ jacobian[n_data:]
     covariance = np.linalg.inv(informed)
-    std, u = np.sqrt(np.diag(covariance)), fit.layout.unknowns
-    several = len(fit.scans) > 1
-    names = [
-        a.name + (f" in {fit.scans[k].name}" if several and k >= 0 else "")
-        for a, k in zip(u, fit.layout.scan_of, strict=True)
-    ]
-    prior, stated = np.array([a.prior for a in u]), np.array([a.stated for a in u])
+    std = np.sqrt(np.diag(covariance))
+    prior, stated = fit.layout.priors, fit.layout.stated
     linear_covariance = []
     for first, size in zip(fit.offsets[:-1], fit.prior, strict=True):
         own = covariance[first : first + size.size, first : first + size.size].reshape(*size.shape, *size.shape)
@@ -427,7 +407,7 @@ def _result(fit: _Fit, rounds: int, is_converged: bool) -> KnownFit:
         residuals.append(np.where(fit.used[i], (scan.counts - expected[-1]) / scan.sigma, np.nan))
         seen.append(see(scan.model, at))
     return KnownFit(
-        fit.fitted(), fit.stated, fit.scans, names, [a.unit for a in u], stated, prior, stated + prior * fit.x,
+        fit.fitted(), fit.stated, fit.scans, fit.layout.names, fit.layout.units, stated, prior, stated + prior * fit.x,
         prior * std[:n], covariance[:n, :n], fit.layout.n_shared, fit.linear,
         linear_covariance,
         residuals, expected, fit.weights, seen, fit.lines, fit.model_error, chi_square, float(inflation), rounds,

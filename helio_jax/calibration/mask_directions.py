@@ -21,7 +21,14 @@ from helio_jax.calibration.common_errors import enlargement
 from helio_jax.calibration.known_model import see
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.known_pixels import CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
-from helio_jax.calibration.known_scan import KnownScan, Layout, moved_instrument, one_instrument, prepare_scan
+from helio_jax.calibration.known_scan import (
+    InstrumentFit,
+    KnownScan,
+    Layout,
+    moved_instrument,
+    one_instrument,
+    prepare_scan,
+)
 from helio_jax.calibration.known_start import started
 from helio_jax.calibration.mask_model import (
     N_COLUMNS,
@@ -46,15 +53,10 @@ _STEPS, _TOLERANCE = 15, 1e-5
 
 
 @dataclass(frozen=True)
-class MaskFit:
+class MaskFit(InstrumentFit):
     """Result of the fit.
 
-    Attributes:
-        instrument: as fitted; `stated`: as given.
-        scans: the data.
-        names, units, stated_values, priors, values, stds: of the free unknowns, in the units shown.
-        covariance: of the free unknowns over their prior standard deviations, enlarged.
-        n_shared: of them are those of the instrument, the first ones.
+    Attributes (those of `InstrumentFit`, and):
         directions, direction_stds, direction_priors: polar angle and azimuth of the apertures as the spot sees them,
             their standard deviations after and before the fit [detector, 2], rad; `stated_directions`: as given.
         residuals: in standard deviations, NaN where not used [detector, y, x], per scan.
@@ -65,17 +67,6 @@ class MaskFit:
         rounds, is_converged: of the fit.
     """
 
-    instrument: Instrument
-    stated: Instrument
-    scans: list[KnownScan]
-    names: list[str]
-    units: list[str]
-    stated_values: np.ndarray
-    priors: np.ndarray
-    values: np.ndarray
-    stds: np.ndarray
-    covariance: np.ndarray
-    n_shared: int
     directions: np.ndarray
     direction_stds: np.ndarray
     direction_priors: np.ndarray
@@ -299,17 +290,12 @@ def _result(
     inflation = max(1.0, np.sqrt(chi_square), correlated)
     # outlines and priors are no data: the residuals say nothing about them
     informed = jacobian[:n_data].T @ jacobian[:n_data] / inflation**2 + jacobian[n_data:].T @ jacobian[n_data:]
-    covariance, unknowns = np.linalg.inv(informed), layout.unknowns
+    covariance = np.linalg.inv(informed)
     at, free, place = layout.of_scan(0, x), layout.free[0], layout.place[0]
     found, slopes = directions(fit.scans[0].model, at)
     ways = slopes[..., free] * layout.scale[place]
     own = covariance[np.ix_(place, place)]
-    several = len(scans) > 1
-    names = [
-        a.name + (f" in {scans[k].name}" if several and k >= 0 else "")
-        for a, k in zip(unknowns, layout.scan_of, strict=True)
-    ]
-    prior, given = np.array([a.prior for a in unknowns]), np.array([a.stated for a in unknowns])
+    prior, given = layout.priors, layout.stated
     residuals, expected, visible = [], [], []
     for i, (scan, solved) in enumerate(zip(fit.scans, fit.solved(x), strict=True)):
         share, _, log_share = columns(scan.model, layout.of_scan(i, x), 0.0)
@@ -318,7 +304,7 @@ def _result(
         misfit = (scan.scan.counts - solved.expected) / scan.scan.sigma
         residuals.append(np.where(scan.used, misfit, np.nan))
     return MaskFit(
-        moved_instrument(stated, at), stated, scans, names, [a.unit for a in unknowns], given, prior, given + prior * x,
+        moved_instrument(stated, at), stated, scans, layout.names, layout.units, given, prior, given + prior * x,
         prior * np.sqrt(np.diag(covariance)), covariance, layout.n_shared,
         found, np.sqrt(np.einsum("kai,ij,kaj->ka", ways, own, ways)), np.sqrt(np.sum(ways**2, -1)),
         directions(fit.scans[0].model, layout.start[0])[0],

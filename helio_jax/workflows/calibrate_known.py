@@ -135,6 +135,7 @@ def _written_masks(fit: MaskFit, shapes: Sequence[str], output: Path, picture: P
     what = f"Directions by helio calibrate --masks --known {' '.join(map(repr, shapes))} on {names}."
     about = f"By geometry alone: no scattering law, gain or offset. Standard deviations x {fit.inflation:.2f}."
     where = "sample_distance_um is that of these scans' stage height. [covariance]: how the errors belong together."
-    write_calibrated(mask_report.instrument_by_masks(fit), output, "\n".join((what, about, where)))
+    said = [f"{sentence[0].upper()}{sentence[1:]}." for sentence in mask_report.verdict(fit)]
+    write_calibrated(mask_report.instrument_by_masks(fit), output, "\n".join((what, about, *said, where)))
     save_mask_directions(fit, picture)
     return mask_report.as_record(fit) | {"files": [str(output), str(picture)]}

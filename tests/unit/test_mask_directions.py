@@ -171,6 +171,7 @@ def test_files_are_written(twin, tmp_path):
         [tmp_path / "a.h5"], output, [BALL], masks=True, max_rounds=1, pedestal=0.0, drift=0.0
     )
     assert load_instrument(output).covariance is not None
+    assert "not converged" in output.read_text()  # whoever reads the file sees what the terminal said
     assert (tmp_path / "masks.png").stat().st_size > 10_000
     assert [row["unit"] for row in found["directions"]] == ["deg"] * 6
     assert "not converged" in " ".join(found["verdict"])
