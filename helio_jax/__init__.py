@@ -50,6 +50,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   body                Body: triangles and spheres with material names
   border              continuation of a surface beyond its image
   wall_grid           grid of heights whose walls are half-way between pixels
+  wall_outlines       smooth outlines of walls between pixels
   scattering          the [material] tables: scattering laws
   mtl                 scattering laws in the .mtl file of an OBJ mesh
   plates              plates from mesh files

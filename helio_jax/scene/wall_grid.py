@@ -4,15 +4,14 @@ Triangles between the points of two pixels make a ramp of a wall, one pixel wide
 wall is somewhere between the points: half-way on the average. Every pixel is given eight more points, just inside its
 own square, and only pixels that no wall parts share their heights.
 
-The sides of the squares would make stairs of a wall at an angle to the raster, with up to 1.4 times its area, which
-sends too much to a detector on its side. So the outline of a wall is smoothed, as a signal along it by the low-pass
-filter of Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995 (eqs 9 to 11), which neither
-shrinks nor grows what it encloses.
+The sides of the squares make stairs of a wall at an angle to the raster: the points move to a smooth outline
+(`wall_outlines`).
 """
 
 import numpy as np
 
 from helio_jax.arrays import WALL_PITCHES
+from helio_jax.scene.wall_outlines import shift_to_outlines
 
 GAP = 1e-3
 """How far from the half-way line the points on both sides of it are [pixels]."""
@@ -20,15 +19,6 @@ LEVEL_COSINE = 0.87
 """Least z of the unit normal at the rim of a wall: it falls by less than 30 degrees."""
 LEAST_JUMP = 2.0
 """By how much the slope between neighbours that a wall parts exceeds the next ones."""
-SMOOTHING = 0.5, -0.51
-"""Factors of the low-pass filter of outlines, applied in turn: its pass band ends at ripples of 11 pixels ..."""
-PASSES = 40
-"""... and after so many turns those of 4 pixels have half their height."""
-MAX_SHIFT, MAX_CORNER_SHIFT = 0.4, 0.25
-"""Points of an outline move no farther along each axis [pixels]; the second holds where the squares' sides turn."""
-MOST_HALVINGS = 4
-"""So often the shift of a corner is halved that lies within the triangle of a pixel and the middles of two sides."""
-
 Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
 """x, y, z of points [y, x], um."""
 
@@ -106,7 +96,7 @@ def refined_grid(
     Arguments and results as those of `with_upright_walls`, walls as from `wall_links`.
     """
     (x, y, z), (tx, ty) = grid, beam_shift
-    shift = _shift_of_outlines(wall_x, wall_y)
+    shift = shift_to_outlines(wall_x, wall_y)
     height, is_foot = _refined_heights(z, wall_x, wall_y, shift)
     lines = np.ix_(*((2 * np.arange(3 * n - 2) + 1) // 3 for n in z.shape))
     place_y, place_x = (
@@ -120,53 +110,6 @@ def refined_grid(
         for new, start, end in zip(fine, grid, behind, strict=True)
     )
     return fine, (moved_x, moved_y, moved_z), owner
-
-
-def _shift_of_outlines(wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:
-    """Compute by how much points move along y and x for smooth outlines of walls [2, 2 y - 1, 2 x - 1], pixels.
-
-    On a lattice of half pixels: pixels at even rows and columns, middles of their sides at odd columns or rows. An
-    outline runs through the middles and the corners of the sides that are walls. Where it ends or branches it stays.
-    """
-    ny, nx = wall_x.shape[0], wall_y.shape[1]
-    is_wall = np.zeros((2 * ny - 1, 2 * nx - 1), bool)
-    is_wall[::2, 1::2], is_wall[1::2, ::2] = wall_x, wall_y
-    is_wall[1::2, 1::2] = wall_x[1:] | wall_x[:-1] | wall_y[:, 1:] | wall_y[:, :-1]
-    shift = np.zeros((2, *is_wall.shape))
-    before, after = np.s_[:-1], np.s_[1:]
-    beside = [((before, np.s_[:]), (after, np.s_[:])), ((np.s_[:], before), (np.s_[:], after))]
-    steps = [(to, at, way) for to, at in beside for to, at, way in ((to, at, 0.5), (at, to, -0.5))]
-    n, turn = np.zeros(is_wall.shape), np.zeros(shift.shape)
-    for axis, (to, at, way) in zip((0, 0, 1, 1), steps, strict=True):
-        n[to] += is_wall[at]
-        turn[axis][to] += 0.5 * way * is_wall[at]
-    is_free = is_wall & (n == 2.0)
-    for factor in PASSES * SMOOTHING:
-        mean = turn.copy()
-        for to, at, _ in steps:
-            mean[:, *to] += 0.5 * np.where(is_wall[at], shift[:, *at], 0.0)
-        shift += factor * np.where(is_free, mean - shift, 0.0)
-    limit = np.where(np.any(turn != 0.0, axis=0), MAX_CORNER_SHIFT, MAX_SHIFT)
-    shift = np.clip(shift, -limit, limit)
-    for _ in range(MOST_HALVINGS):
-        shift[:, 1::2, 1::2] *= np.where(_is_folded(shift), 0.5, 1.0)
-    return shift
-
-
-def _is_folded(shift: np.ndarray) -> np.ndarray:
-    """Find the corners that lie within the triangle of a pixel and the middles of its sides there [y - 1, x - 1].
-
-    `shift` as from `_shift_of_outlines`.
-    """
-    place = shift + 0.5 * np.indices(shift.shape[1:])
-    corner = place[:, 1::2, 1::2]
-    out = np.zeros(corner.shape[1:], bool)
-    rows, columns = ({0: np.s_[1::2], -1: np.s_[:-1:2], 1: np.s_[2::2]} for _ in range(2))
-    for sy, sx in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        center, one, other = (place[:, rows[y], columns[x]] for y, x in ((sy, sx), (sy, 0), (0, sx)))
-        (ay, ax), (by, bx), (cy, cx) = (to - one for to in (other, corner, center))
-        out |= (ay * bx - ax * by) * (ay * cx - ax * cy) > 0.0
-    return out
 
 
 def _needed(wall_x: np.ndarray, wall_y: np.ndarray) -> np.ndarray:

@@ -46,8 +46,8 @@ def test_far_points_around_the_image_are_no_wall():
 def test_walls_stand_half_way():
     """A block with a wall along the raster and a corner: its levels are kept, and its edges are where pixels meet.
 
-    To a tenth of a pixel, for the outline is smoothed about its corner. Rejects a ramp from point to point: its heights
-    are between the levels.
+    To an eighth of a pixel, for the outline is smoothed about its corner. Rejects a ramp from point to point: its
+    heights are between the levels.
     """
     is_high = (X > 9.0) & (Y > 5.0)
     for refine in (used, refined):
@@ -55,15 +55,15 @@ def test_walls_stand_half_way():
         assert set(np.unique(z)) == {0.0, 20.0}
         assert np.array_equal(z > 0.0, is_high.ravel()[number])
         on_raster = x + SHIFT[0] * z, y + SHIFT[1] * z
-        assert on_raster[0][z > 0].min() == pytest.approx(9.0, abs=0.1 * PITCH)
-        assert on_raster[1][z > 0].min() == pytest.approx(5.0, abs=0.1 * PITCH)
+        assert on_raster[0][z > 0].min() == pytest.approx(9.0, abs=0.125 * PITCH)
+        assert on_raster[1][z > 0].min() == pytest.approx(5.0, abs=0.125 * PITCH)
     assert z.shape == (34, 43)
     assert np.array_equal(z[::3, ::3], 20.0 * is_high)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 7.0, 18.4, 30.0, 45.0, 71.0])
 def test_wall_at_an_angle_is_straight(angle_deg):
-    """A straight wall: its area to 5 %, no face turned over, and no pixel on the wrong side.
+    """A straight wall: its area to 2.5 %, no face turned over, and no pixel on the wrong side.
 
     Rejects the sides of the pixels, whose area is 1.07 to 1.41 times as large at 7 to 45 degrees (1.37 at 30).
     """
@@ -72,7 +72,7 @@ def test_wall_at_an_angle_is_straight(angle_deg):
     is_high = (x - 19.8) * way[0] + (y - 20.3) * way[1] > 0.0
     at = x, y, 10.0 * is_high
     area, is_upright, z, (fine, number) = faces_of(at)
-    assert area[is_upright].sum() / 10.0 == pytest.approx(40.0 / max(way), rel=0.05)
+    assert area[is_upright].sum() / 10.0 == pytest.approx(40.0 / max(way), rel=0.025)
     assert z[~is_upright].min() > 0.0
     assert np.array_equal(fine[2] > 5.0, is_high.ravel()[number])
 
