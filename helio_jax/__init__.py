@@ -124,6 +124,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edge_place          where an upper edge lies between the pixels
   band_fit            length of the band beside an edge, and the height from it
   mask_patches        surface patches between steps, and their levels
+  patch_outlines      outlines of patches by the signals beside them
   dash_lines          lines of isolated dark pixels, which no chance explains
   low_wall            signal across a low wall that may slope
   low_steps           heights of steps whose bands are shorter than a pixel

@@ -30,6 +30,7 @@ from helio_jax.inverse.mask_edges import (
     variance_of,
 )
 from helio_jax.inverse.mask_patches import find_patches, likeness, sides_of, solve_levels
+from helio_jax.inverse.patch_outlines import with_outlines_moved
 from helio_jax.inverse.step_records import BandRow, Patch, Step, Steps
 from helio_jax.inverse.wall_signal import Opening, WallSignal, opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
@@ -331,7 +332,8 @@ def _patches(measured: list[_Measured], images: Images, levels: SignalLevels) ->
     walls = [m for m in measured if m.step.is_used or (m.step.p_wall > CERTAIN_WALL and m.jump > 0.0)]
     heights = np.array([m.jump for m in walls])
     alike = likeness(images.signal, images.variance, np.any(levels.is_dark, axis=0))
-    return find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
+    patch = find_patches([m.edge for m in walls], heights, images.place, images.side, alike)
+    return with_outlines_moved(patch, images.signal, images.variance, images.lit)
 
 
 def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
