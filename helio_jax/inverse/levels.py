@@ -31,7 +31,9 @@ worse may be true as well."""
 MOST_FITS = 2
 """So many surfaces with a region at its measured level are fitted shortly."""
 _LEVEL_STEPS = 5
-"""Evaluations by which the best level is refined."""
+"""Evaluations by which the best level of a kind of relief is refined ..."""
+HOPELESS = 2.0
+"""... unless its misfit is so many times that of the best kind."""
 
 _UNPREDICTED = 1e100
 """Stands for an infinite misfit, of which no parabola can be made."""
@@ -186,11 +188,14 @@ class _RegionSearch:
         """Find the best level of each kind of relief: its misfit and surface, each surface once."""
         heights = self.region.heights(self.surroundings, self.pitch, self.max_width)
         levels, out = [height - self.surroundings for height in heights], {}
-        for kind in RELIEFS + (WALLS if any(self.beam_shift) else ()):
-            tried = sorted(self.shifts(levels) if kind == "as fitted" else levels)
-            i = int(np.argmin([self.misfit_at(level, kind) for level in tried]))
+        kinds = RELIEFS + (WALLS if any(self.beam_shift) else ())
+        levels_of = {kind: sorted(self.shifts(levels) if kind == "as fitted" else levels) for kind in kinds}
+        misfits = {kind: [self.misfit_at(level, kind) for level in tried] for kind, tried in levels_of.items()}
+        limit = HOPELESS * min(min(found) for found in misfits.values())
+        for kind, tried in levels_of.items():
+            i = int(np.argmin(misfits[kind]))
             best = tried[i]
-            if len(tried) > 1:
+            if len(tried) > 1 and misfits[kind][i] < limit:
                 at = lambda level, kind=kind: self.misfit_at(level, kind)  # noqa: E731
                 _, found = least_between(at, tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)], _LEVEL_STEPS)
                 best = min((best, found), key=at)

@@ -26,7 +26,7 @@ MIN_PIXELS = 3
 """Fewer pixels show no height."""
 MAX_LEVEL_SLOPE = 0.3
 """Steeper pixels of a region do not count for its level: they are its wall."""
-LEAST_SHARE = 0.005
+LEAST_SHARE = 0.01
 """Smaller patches, in shares of the image, are tried at no levels but measured ones: a search takes as long for them as
 for others, and they are mostly no patches."""
 PLACES = -0.3, 0.0, 0.3
