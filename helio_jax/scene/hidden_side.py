@@ -5,7 +5,7 @@ faces the plate and would scatter atoms there that a real cavity keeps.
 """
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from helio_jax.arrays import WALL_PITCHES, distance_to_end, nearest_known
 from helio_jax.scene.body import Body
@@ -17,6 +17,8 @@ _LEAST_RISE = 1.0
 """A neighbour that is higher by so many pitches belongs to what casts the shadow."""
 _MIN_NORMAL_Z = 0.5
 """Lower limit of the normal's z when the height at the foot of a wall is extrapolated: a wall counts as 60 degrees."""
+_TURN_PIXELS = 2.0
+"""Standard deviation of the Gaussian average from which a wall's direction is taken [pixels]."""
 
 
 def occluded_vertices(
@@ -57,14 +59,69 @@ def occluded_vertices(
     return x - back_x, y - back_y, z + rise
 
 
+def undercut_vertices(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, lean: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Estimate the hidden side of walls that a beam along the normal grazes, for `with_cavities`.
+
+    Such a beam sees none of a wall, whether it is vertical or leans over its foot, as that of a mushroom or the lower
+    half of a ball does. The foot is moved below the wall's top, square to the wall, by a share of the wall's height,
+    and at most half-way through what stands there.
+
+    Args:
+        x, y, z: sample-frame positions [y, x], um, seen along z.
+        lean: run of the wall under its top over its height; 0: vertical.
+
+    Returns:
+        x, y, z with the moved points [y, x], um.
+    """
+    pitch = tuple(float(np.abs(np.diff(at, axis=axis)).mean()) for axis, at in ((0, y), (1, x)))
+    fall = _fall(z, np.ones((3, 3), bool))
+    foot = np.nonzero(fall > WALL_PITCHES * max(pitch))
+    if not foot[0].size:
+        return x, y, z
+    smooth = gaussian_filter(z, _TURN_PIXELS)
+    uphill = np.stack([np.gradient(smooth, step, axis=axis)[foot] for axis, step in enumerate(pitch)])
+    uphill /= np.maximum(np.hypot(*uphill), np.finfo(float).tiny)
+    back = lean * fall[foot]
+    free = _way_below_top(z, foot, uphill, fall[foot], pitch, float(back.max(initial=0.0)))
+    back = np.minimum(back, 0.5 * free)
+    moved_x, moved_y = x.copy(), y.copy()
+    moved_x[foot] += back * uphill[1]
+    moved_y[foot] += back * uphill[0]
+    return moved_x, moved_y, z
+
+
+def _way_below_top(
+    z: np.ndarray,
+    foot: tuple[np.ndarray, ...],
+    uphill: np.ndarray,
+    fall: np.ndarray,
+    pitch: tuple[float, ...],
+    reach: float,
+) -> np.ndarray:
+    """Compute how far from a foot the surface stays above half of the wall [foot], um, up to twice the reach."""
+    step, way = 0.5 * min(pitch), np.zeros(fall.size)
+    is_below = np.ones(fall.size, bool)
+    for n in range(1, int(2.0 * reach / step) + 2):
+        at = [index + n * step * u / p for index, u, p in zip(foot, uphill, pitch, strict=True)]
+        height = map_coordinates(z, at, order=1, mode="nearest")
+        # within a pixel of its foot the wall itself is crossed
+        is_below &= (height > z[foot] + 0.5 * fall) | (n * step < 1.5 * max(pitch))
+        way[is_below] = n * step
+    return way
+
+
+def _fall(z: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Compute the fall to every point from the highest of some of its neighbours [y, x], um; `beside` [3, 3]."""
+    return np.maximum(maximum_filter(z, footprint=beside, mode="nearest") - z, 0.0)
+
+
 def _fall_from_before(z: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]) -> np.ndarray:
     """Compute the fall to every point from the highest neighbour before or beside it along the beam [y, x], um."""
-    room, fall = np.pad(z, 1, mode="edge"), np.zeros(z.shape)
-    for dy, dx in np.ndindex(3, 3):
-        way = (1 - dx) * pitch[1] * beam_shift[0] + (1 - dy) * pitch[0] * beam_shift[1]
-        if way > -_ALONG * max(pitch) * np.hypot(*beam_shift):
-            fall = np.maximum(fall, room[dy : dy + z.shape[0], dx : dx + z.shape[1]] - z)
-    return fall
+    dy, dx = np.mgrid[:3, :3]
+    way = (1 - dx) * pitch[1] * beam_shift[0] + (1 - dy) * pitch[0] * beam_shift[1]
+    return _fall(z, way > -_ALONG * max(pitch) * np.hypot(*beam_shift))
 
 
 def _free_way(

@@ -1,9 +1,9 @@
 """Smooth outlines of walls between pixels.
 
 The sides of the pixels make stairs of a wall at an angle to the raster. They have up to 1.4 times its area, which sends
-too much to a detector on its side, and hide too much from pixels beside it. An outline is smoothed as a signal along it,
-by the low-pass filter of Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995 (eqs 9 to 11),
-which neither shrinks nor grows what it encloses.
+too much to a detector on its side, and hide too much from pixels beside it. An outline is smoothed as a signal along
+it, by the low-pass filter of Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995 (eqs 9 to
+11), which neither shrinks nor grows what it encloses.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ PASSES = 200
 MAX_SHIFT, MAX_CORNER_SHIFT = 0.4, 0.35
 """Points of an outline move no farther along each axis [pixels]; the second holds where the sides of pixels turn."""
 LEAST_AREA = 0.005
-"""The quadrangle of a pixel, the middles of two sides and the corner between them is a triangle and at least so much more
-[pixels]. Other corners go to the line between their neighbours along the outline ..."""
+"""The quadrangle of a pixel, the middles of two sides and the corner between them is larger than the triangle without
+the corner by so much [pixels]. Other corners go to the line between their neighbours along the outline ..."""
 LEAST_TURN = 0.05
 """... and by this share of the way from there to where the sides meet."""
 
@@ -71,9 +71,13 @@ def _neighbours(is_wall: np.ndarray) -> csr_array:
 
 
 def _is_folded(shift: np.ndarray) -> np.ndarray:
-    """Find corners that lie within the triangle of a pixel and the middles of its sides there, or nearly [y - 1, x - 1].
+    """Find corners that add less than `LEAST_AREA` to the triangle of a pixel and the middles of two sides.
 
-    `shift` as from `shift_to_outlines`.
+    Args:
+        shift: as from `shift_to_outlines`.
+
+    Returns:
+        [y - 1, x - 1].
     """
     place = shift + 0.5 * np.indices(shift.shape[1:])
     corner = place[:, 1::2, 1::2]

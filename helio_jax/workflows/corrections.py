@@ -1,9 +1,13 @@
 """What a surface does beyond direct single scattering, for the fit: the tracer and the horizon march joined.
 
 `make_predictor` gives the callable that `reconstruct` asks for. Masks come from the horizon march, which takes what
-lies behind a rim for a sheet along the beam; multiple scattering is traced (or computed by radiosity). The side that
-the beam does not see may stand anywhere between that sheet and below the rim: both terms are predicted at two places
-(`OCCLUDED_NODES`), their mean is expected, and half their difference is one unknown of the fit.
+lies behind a rim for a sheet along the beam; where the surface has walls they come from rays to its mesh, for the march
+makes stairs of walls. Multiple scattering is traced (or computed by radiosity).
+
+Where the hidden side stands is one unknown of the fit: both terms are predicted at two places. What an oblique beam
+does not see lies between the sheet and below the rim (`OCCLUDED_NODES`): the mean is expected, half the difference is
+the standard deviation. What a beam along the normal does not see is a wall, vertical or leaning over its foot
+(`UNDERCUTS`): the vertical one is expected.
 """
 
 import math
@@ -25,7 +29,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.border import continue_border, extend_border
-from helio_jax.scene.hidden_side import occluded_vertices, with_cavities
+from helio_jax.scene.hidden_side import occluded_vertices, undercut_vertices, with_cavities
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import surface_body
 from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
@@ -38,6 +42,9 @@ from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 OCCLUDED_NODES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
 """Where the occluded side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
 Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
+UNDERCUTS = 0.0, 0.4
+"""Where the hidden side of walls is put if the beam falls in along the normal: run under the top, over the height. The
+first is expected, the second one standard deviation from it."""
 RAYS = 8
 """Paths per pixel and branch."""
 SMOOTH_PATHS = 40
@@ -148,23 +155,29 @@ def make_predictor(
                 for way in either_way
             ]
         )
-        traced, found = list(images.mean(0)), images.mean((0, 1))
-        surroundings = 0.5 * (images[1] - images[0]).mean(0) if len(images) > 1 else None
+        expected = raster.shares if len(sides) > 1 else np.ones(1)
+        traced, surroundings = images.mean(0), None
+        if len(images) > 1:
+            surroundings = 0.5 * np.tensordot(expected, images[1] - images[0], 1)
         if masks_by == "rays":
-            masked, freed = 0.0, [side.masked(np.ones(height.shape, bool)) for side in sides]
+            masked = [side.masked(np.ones(height.shape, bool)) for side in sides]
         else:
-            masked = masking_corrections(surface, optics, Raster.of(stack)).masked
-            if len(sides) == 1:
-                return Corrections(masked, found, None, smooth_normals, surroundings)
-            is_masked = np.any(masked != 0.0, axis=(0, 1))
-            sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
-            freed = [side.masked(is_masked) - sheet for side in sides]
-        if len(sides) == 1:
-            return Corrections(freed[0], found, None, smooth_normals, surroundings)
-        normal = np.moveaxis(normals, -1, 0)
-        either = [m - single_scattering(f, normal) for m, f in zip(traced, freed, strict=True)]
-        occluded = 0.5 * np.subtract(*either)
-        return Corrections(masked + np.mean(freed, axis=0), found, occluded, smooth_normals, surroundings)
+            by_march = masking_corrections(surface, optics, Raster.of(stack)).masked
+            is_masked = np.any(by_march != 0.0, axis=(0, 1))
+            if sides[0].has_walls:
+                masked = [side.masked(is_masked) for side in sides]
+            elif len(sides) == 1:
+                masked = [by_march]
+            else:
+                sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
+                masked = [by_march + side.masked(is_masked) - sheet for side in sides]
+        occluded = None
+        if len(sides) > 1:
+            normal = np.moveaxis(normals, -1, 0)
+            either = [m - single_scattering(f, normal) for m, f in zip(traced, masked, strict=True)]
+            occluded = raster.deviation * np.subtract(*either)
+        masks, found = (np.tensordot(expected, np.array(images), 1) for images in (masked, traced))
+        return Corrections(masks, found, occluded, smooth_normals, surroundings)
 
     return predict
 
@@ -197,10 +210,10 @@ def _surroundings(instrument: Instrument) -> float:
 
 @dataclass(frozen=True)
 class SurfaceHypothesis:
-    """A surface whose occluded side stands at one place: a point for every pixel, and the mesh through them.
+    """A surface whose hidden side stands at one place: a point for every pixel, and the mesh through them.
 
     `beam_x`, `beam_y` are the beam positions at which the points are illuminated [y, x], um; `pixel` numbers the pixels
-    to which the points of the mesh's grid belong.
+    to which the points of the mesh's grid belong; `has_walls`: whether the mesh has walls between pixels.
     """
 
     raster: "_Raster"
@@ -210,6 +223,7 @@ class SurfaceHypothesis:
     body: Body
     pixel: np.ndarray
     intersector: Intersector
+    has_walls: bool
 
     def multiple(
         self,
@@ -309,14 +323,14 @@ class _Raster:
         return CONTINUATIONS[:1] if self.has_flat_surroundings else CONTINUATIONS
 
     def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
-        """Make the surface with its occluded side at a share of the way back, continued in one of `CONTINUATIONS`.
+        """Make the surface with its hidden side at a place (`hidden`), continued in one of `CONTINUATIONS`.
 
         Walls are half-way between the pixels, unless most of what is occluded lies behind round bodies.
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
-        behind = occluded_vertices(*at, normals, shift, share)
-        has_walls = has_level_rims(height, normals, self.is_occluded(height, normals))
+        behind = self.hidden(at, normals, share)
+        may_be_walls = has_level_rims(height, normals, self.is_occluded(height, normals))
         substrate = self.flat_surroundings
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
@@ -324,7 +338,8 @@ class _Raster:
                 at, behind = self.continued(at, behind, level)
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
         pixel = self.pixels(at[0].shape)
-        if has_walls:
+        n_points = at[0].size
+        if may_be_walls:
             at, behind, number = with_upright_walls(at, behind, shift)
             pixel = pixel[number]
         body = with_cavities(surface_body(*at, **substrate), at, behind)
@@ -333,7 +348,31 @@ class _Raster:
             at + (own - view) * height
             for at, own, view in zip((self.x, self.y), self.instrument.beam_shift, shift, strict=True)
         )
-        return SurfaceHypothesis(self, beam_x, beam_y, Hits.on_mesh(point, normal), body, pixel, Intersector(body))
+        has_walls, hits = at[0].size > n_points, Hits.on_mesh(point, normal)
+        return SurfaceHypothesis(self, beam_x, beam_y, hits, body, pixel, Intersector(body), has_walls)
+
+    @property
+    def places(self) -> tuple[float, ...]:
+        """Places at which the hidden side is predicted."""
+        return OCCLUDED_NODES if any(self.view_shift) else UNDERCUTS
+
+    @property
+    def shares(self) -> np.ndarray:
+        """Shares of these places in what is expected."""
+        share = np.array([0.5, 0.5] if any(self.view_shift) else [1.0, 0.0])[: len(self.places)]
+        return share / share.sum()
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the hidden side, in units of the difference between the first and the second place."""
+        return 0.5 if any(self.view_shift) else -1.0
+
+    def hidden(self, at: Grid, normals: np.ndarray, place: float) -> Grid:
+        """Put the hidden side of a grid at a place: a share of the way from the beam's sheet to the vertical below the
+        rim, or where the beam falls in along the normal the run of an undercut over its height."""
+        if any(self.view_shift):
+            return occluded_vertices(*at, normals, self.view_shift, place)
+        return undercut_vertices(*at, place)
 
     @property
     def pitches(self) -> tuple[float, float]:
@@ -388,12 +427,12 @@ class _Raster:
         return wide, moved
 
     def sides(self, height: np.ndarray, normals: np.ndarray, way: str = "level") -> list[SurfaceHypothesis]:
-        """Make the surface with its occluded side at all `OCCLUDED_NODES`; a single one if the beam sees all of it."""
-        shares = OCCLUDED_NODES if self.is_occluded(height, normals).any() else (0.0,)
-        return [self.side(height, normals, share, way) for share in shares]
+        """Make the surface with its hidden side at all `places`; a single one if the beam sees all of it."""
+        places = self.places if self.is_occluded(height, normals).any() else (0.0,)
+        return [self.side(height, normals, place, way) for place in places]
 
     def is_occluded(self, height: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Find the pixels at the foot of a side that the beam does not see [y, x]."""
         at = self.surface(self.x, self.y, height)
-        below_rim = occluded_vertices(*at, normals, self.view_shift, 1.0)
+        below_rim = self.hidden(at, normals, 1.0)
         return np.any([a != b for a, b in zip(at, below_rim, strict=True)], axis=0)
