@@ -57,9 +57,8 @@ def _unlike(inside: np.ndarray, signal: np.ndarray, variance: np.ndarray, lit: n
     """
     known = np.isfinite(signal) & np.isfinite(variance)
     is_used = inside & known.all(0)
-    size = (WINDOW, WINDOW)
-    count = uniform_filter(is_used.astype(float), size, mode="constant")
-    total = np.array([uniform_filter(np.where(is_used, s, 0.0), size, mode="constant") for s in signal])
+    count = uniform_filter(is_used.astype(float), WINDOW, mode="constant")
+    total = np.array([uniform_filter(np.where(is_used, s, 0.0), WINDOW, mode="constant") for s in signal])
     with np.errstate(divide="ignore", invalid="ignore"):
         square = (signal - total / count) ** 2 / (variance + (MODEL_ERROR * lit[:, None, None]) ** 2)
         mean = np.sum(np.where(known, square, 0.0), 0) / known.sum(0)

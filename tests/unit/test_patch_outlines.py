@@ -10,7 +10,7 @@ LIT = np.array([100.0, 100.0, 100.0])
 
 
 def images(is_high, rng, snr):
-    """Signals of a mesa on a ground: masked in a band to the right of it for one detector, glow around it for others."""
+    """Make signals of a mesa on a ground: a mask to the right of it for one detector, glow around it for the others."""
     band = np.roll(is_high, 6, axis=1) & ~is_high
     distance = np.min([np.hypot(Y - y, X - x) for y, x in np.argwhere(is_high)], axis=0)
     glow = np.where(is_high, 0.0, np.exp(-distance / 6.0))
