@@ -50,7 +50,7 @@ def occluded_vertices(
         for axis, at, shift in zip((0, 1), (y, x), beam_shift[::-1], strict=True)
     )
     fall = _fall_from_before(z, beam_shift, pitch)
-    drop = np.where(fall > WALL_PITCHES * max(pitch), fall, 0.0)
+    drop = np.where(is_foot(z, beam_shift, pitch), fall, 0.0)
     if not drop.any():
         return x, y, z
     back = np.minimum(share * drop * along, _free_way(z, fall > _LEAST_RISE * max(pitch), beam_shift, pitch))
@@ -60,31 +60,36 @@ def occluded_vertices(
 
 
 def undercut_vertices(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, lean: float
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, lean: float, beam_shift: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimate the hidden side of walls that a beam along the normal grazes, for `with_cavities`.
+    """Estimate the side of walls that lean over their feet, for `with_cavities`.
 
-    Such a beam sees none of a wall, whether it is vertical or leans over its foot, as that of a mushroom or the lower
-    half of a ball does. The foot is moved below the wall's top, square to the wall, by a share of the wall's height,
-    and at most half-way through what stands there.
+    The beam does not see whether such a wall is vertical or leans, as that of a mushroom or the lower half of a ball
+    does. The foot is moved below the wall's top, square to the wall, by a share of the wall's height, and at most
+    half-way through what stands there.
 
     Args:
-        x, y, z: sample-frame positions [y, x], um, seen along z.
+        x, y, z: sample-frame positions [y, x], um, as for `surface_body`.
         lean: run of the wall under its top over its height; 0: vertical.
+        beam_shift: `Instrument.beam_shift` of the grid.
 
     Returns:
         x, y, z with the moved points [y, x], um.
     """
-    pitch = tuple(float(np.abs(np.diff(at, axis=axis)).mean()) for axis, at in ((0, y), (1, x)))
-    fall = _fall(z, np.ones((3, 3), bool))
-    foot = np.nonzero(fall > WALL_PITCHES * max(pitch))
+    pitch = tuple(
+        float(np.abs(np.diff(at + z * shift, axis=axis)).mean())
+        for axis, at, shift in zip((0, 1), (y, x), beam_shift[::-1], strict=True)
+    )
+    foot = np.nonzero(is_foot(z, beam_shift, pitch))
     if not foot[0].size:
         return x, y, z
+    fall = _fall_from_before(z, beam_shift, pitch)[foot]
     smooth = gaussian_filter(z, _TURN_PIXELS)
     uphill = np.stack([np.gradient(smooth, step, axis=axis)[foot] for axis, step in enumerate(pitch)])
     uphill /= np.maximum(np.hypot(*uphill), np.finfo(float).tiny)
-    back = lean * fall[foot]
-    free = _way_below_top(z, foot, uphill, fall[foot], pitch, float(back.max(initial=0.0)))
+    back = lean * fall
+    along = np.array(beam_shift[::-1]) @ uphill
+    free = _way_below_top(z, foot, uphill, fall, along, pitch, float(back.max(initial=0.0)))
     back = np.minimum(back, 0.5 * free)
     moved_x, moved_y = x.copy(), y.copy()
     moved_x[foot] += back * uphill[1]
@@ -92,15 +97,24 @@ def undercut_vertices(
     return moved_x, moved_y, z
 
 
+def is_foot(z: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]) -> np.ndarray:
+    """Find the points at the foot of a side that the beam does not see [y, x]; `pitch` along y and x, um."""
+    return _fall_from_before(z, beam_shift, pitch) > WALL_PITCHES * max(pitch)
+
+
 def _way_below_top(
     z: np.ndarray,
     foot: tuple[np.ndarray, ...],
     uphill: np.ndarray,
     fall: np.ndarray,
+    along: np.ndarray,
     pitch: tuple[float, ...],
     reach: float,
 ) -> np.ndarray:
-    """Compute how far from a foot the surface stays above half of the wall [foot], um, up to twice the reach."""
+    """Compute how far from below a rim the surface stays above half of the wall [foot], um, up to twice the reach.
+
+    `along`: beam shift towards the rim [foot]; a side that an oblique beam sees is wide on the raster, not below it.
+    """
     step, way = 0.5 * min(pitch), np.zeros(fall.size)
     is_below = np.ones(fall.size, bool)
     for n in range(1, int(2.0 * reach / step) + 2):
@@ -108,29 +122,29 @@ def _way_below_top(
         height = map_coordinates(z, at, order=1, mode="nearest")
         # within a pixel of its foot the wall itself is crossed
         is_below &= (height > z[foot] + 0.5 * fall) | (n * step < 1.5 * max(pitch))
-        way[is_below] = n * step
-    return way
-
-
-def _fall(z: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Compute the fall to every point from the highest of some of its neighbours [y, x], um; `beside` [3, 3]."""
-    return np.maximum(maximum_filter(z, footprint=beside, mode="nearest") - z, 0.0)
+        here = n * step - along * (height - z[foot] - fall)
+        way[is_below] = here[is_below]
+    return np.maximum(way, 0.0)
 
 
 def _fall_from_before(z: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]) -> np.ndarray:
-    """Compute the fall to every point from the highest neighbour before or beside it along the beam [y, x], um."""
+    """Compute the fall to every point from the highest neighbour before or beside it along the beam [y, x], um.
+
+    Along the normal all neighbours are beside it.
+    """
     dy, dx = np.mgrid[:3, :3]
     way = (1 - dx) * pitch[1] * beam_shift[0] + (1 - dy) * pitch[0] * beam_shift[1]
-    return _fall(z, way > -_ALONG * max(pitch) * np.hypot(*beam_shift))
+    beside = way >= -_ALONG * max(pitch) * np.hypot(*beam_shift)
+    return np.maximum(maximum_filter(z, footprint=beside, mode="nearest") - z, 0.0)
 
 
 def _free_way(
-    z: np.ndarray, is_foot: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]
+    z: np.ndarray, is_near: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]
 ) -> np.ndarray:
-    """Compute how far back along the beam a point at a wall's foot stays at that wall or below its top [y, x], um."""
-    is_top = z > z[nearest_known(is_foot)] + _LEAST_RISE * max(pitch)
+    """Compute how far back along the beam a point beside a wall stays at that wall or below its top [y, x], um."""
+    is_top = z > z[nearest_known(is_near)] + _LEAST_RISE * max(pitch)
     x, y = (-shift / np.hypot(*beam_shift) for shift in beam_shift)
-    way = distance_to_end(is_foot | is_top, (x, y), (pitch[0], pitch[1]))
+    way = distance_to_end(is_near | is_top, (x, y), (pitch[0], pitch[1]))
     return np.maximum(way - 0.5 * min(pitch), 0.0)
 
 

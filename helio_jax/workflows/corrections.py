@@ -4,17 +4,14 @@
 lies behind a rim for a sheet along the beam; where the surface has walls they come from rays to its mesh, for the march
 makes stairs of walls. Multiple scattering is traced (or computed by radiosity).
 
-Where the hidden side stands is one unknown of the fit: both terms are predicted at two places. What an oblique beam
-does not see lies between the sheet and below the rim (`OCCLUDED_NODES`): the mean is expected, half the difference is
-the standard deviation. What a beam along the normal does not see is a wall, vertical or leaning over its foot
-(`UNDERCUTS`): the vertical one is expected.
+Where the hidden side stands is one unknown of the fit: both terms are predicted at two places of it (`HiddenSide`).
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,7 +26,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.body import Body
 from helio_jax.scene.border import continue_border, extend_border
-from helio_jax.scene.hidden_side import occluded_vertices, undercut_vertices, with_cavities
+from helio_jax.scene.hidden_side import is_foot, occluded_vertices, undercut_vertices, with_cavities
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import surface_body
 from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
@@ -39,12 +36,6 @@ from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment, trace_pixels
 from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 
-OCCLUDED_NODES = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
-"""Where the occluded side is put, as shares of the way from the sheet along the beam to below the rim: the nodes of
-Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is linear in it."""
-UNDERCUTS = 0.0, 0.4
-"""Where the hidden side of walls is put if the beam falls in along the normal: run under the top, over the height. The
-first is expected, the second one standard deviation from it."""
 RAYS = 8
 """Paths per pixel and branch."""
 SMOOTH_PATHS = 40
@@ -60,6 +51,36 @@ CONTINUED = 0.5
 """Share of the image by which relief goes on beyond each border."""
 LIFT_PIXELS = 0.1
 """How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]."""
+
+
+class HiddenSide(NamedTuple):
+    """Two places at which the side that the beam does not see may stand.
+
+    Attributes:
+        places: where the foot is; `is_below_limb`: shares of the way from the beam's sheet to the vertical below the
+            rim; else the run from that vertical under the rim, over the height.
+        shares: of the two predictions in what is expected.
+        deviation: one standard deviation, in units of the difference between the first and the second prediction.
+        has_walls: whether the rims are those of walls, not limbs of round bodies.
+        is_below_limb: see `places`.
+    """
+
+    places: tuple[float, ...]
+    shares: tuple[float, ...]
+    deviation: float
+    has_walls: bool = False
+    is_below_limb: bool = False
+
+
+LIMB = HiddenSide((0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)), (0.5, 0.5), 0.5, is_below_limb=True)
+"""Behind the limb of a round body an oblique beam leaves any side between its sheet and the vertical below the limb:
+the nodes of Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is
+linear."""
+WALL = HiddenSide((0.0, 0.4), (1.0, 0.0), -1.0, has_walls=True)
+"""Below a level rim a wall is expected to be vertical; one standard deviation from that it leans over its foot by 0.4
+of its height, as that of a mushroom or a re-entrant block does. A beam along the normal sees no wall."""
+UNDERSIDE = WALL._replace(has_walls=False)
+"""The same below the limb of a round body for a beam along the normal."""
 
 
 def make_predictor(
@@ -144,7 +165,8 @@ def make_predictor(
     ) -> Corrections:
         """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
         height = surface.height
-        either_way = [raster.sides(smooth, smooth_normals, way) for way in raster.continuations]
+        hidden = raster.hidden_side(smooth, smooth_normals)
+        either_way = [raster.sides(smooth, smooth_normals, hidden, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
@@ -155,7 +177,7 @@ def make_predictor(
                 for way in either_way
             ]
         )
-        expected = raster.shares if len(sides) > 1 else np.ones(1)
+        expected = np.array(hidden.shares if len(sides) > 1 else (1.0,))
         traced, surroundings = images.mean(0), None
         if len(images) > 1:
             surroundings = 0.5 * np.tensordot(expected, images[1] - images[0], 1)
@@ -169,13 +191,13 @@ def make_predictor(
             elif len(sides) == 1:
                 masked = [by_march]
             else:
-                sheet = raster.side(smooth, smooth_normals, 0.0).masked(is_masked)
+                sheet = raster.side(smooth, smooth_normals, LIMB, 0.0).masked(is_masked)
                 masked = [by_march + side.masked(is_masked) - sheet for side in sides]
         occluded = None
         if len(sides) > 1:
             normal = np.moveaxis(normals, -1, 0)
             either = [m - single_scattering(f, normal) for m, f in zip(traced, masked, strict=True)]
-            occluded = raster.deviation * np.subtract(*either)
+            occluded = hidden.deviation * np.subtract(*either)
         masks, found = (np.tensordot(expected, np.array(images), 1) for images in (masked, traced))
         return Corrections(masks, found, occluded, smooth_normals, surroundings)
 
@@ -322,15 +344,16 @@ class _Raster:
         """Ways in which the surface may go on beyond the image."""
         return CONTINUATIONS[:1] if self.has_flat_surroundings else CONTINUATIONS
 
-    def side(self, height: np.ndarray, normals: np.ndarray, share: float, way: str = "level") -> SurfaceHypothesis:
-        """Make the surface with its hidden side at a place (`hidden`), continued in one of `CONTINUATIONS`.
+    def side(
+        self, height: np.ndarray, normals: np.ndarray, hidden: HiddenSide, place: float, way: str = "level"
+    ) -> SurfaceHypothesis:
+        """Make the surface with its hidden side at a place, continued in one of `CONTINUATIONS`.
 
         Walls are half-way between the pixels, unless most of what is occluded lies behind round bodies.
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
-        behind = self.hidden(at, normals, share)
-        may_be_walls = has_level_rims(height, normals, self.is_occluded(height, normals))
+        behind = self.moved(at, normals, hidden, place)
         substrate = self.flat_surroundings
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
@@ -339,7 +362,7 @@ class _Raster:
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
         pixel = self.pixels(at[0].shape)
         n_points = at[0].size
-        if may_be_walls:
+        if hidden.has_walls:
             at, behind, number = with_upright_walls(at, behind, shift)
             pixel = pixel[number]
         body = with_cavities(surface_body(*at, **substrate), at, behind)
@@ -351,28 +374,20 @@ class _Raster:
         has_walls, hits = at[0].size > n_points, Hits.on_mesh(point, normal)
         return SurfaceHypothesis(self, beam_x, beam_y, hits, body, pixel, Intersector(body), has_walls)
 
-    @property
-    def places(self) -> tuple[float, ...]:
-        """Places at which the hidden side is predicted."""
-        return OCCLUDED_NODES if any(self.view_shift) else UNDERCUTS
+    def hidden_side(self, height: np.ndarray, normals: np.ndarray) -> HiddenSide:
+        """Decide whether walls or round bodies hide a part of the surface from the beam."""
+        if has_level_rims(height, normals, self.is_occluded(height)):
+            return WALL
+        return LIMB if any(self.view_shift) else UNDERSIDE
 
-    @property
-    def shares(self) -> np.ndarray:
-        """Shares of these places in what is expected."""
-        share = np.array([0.5, 0.5] if any(self.view_shift) else [1.0, 0.0])[: len(self.places)]
-        return share / share.sum()
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the hidden side, in units of the difference between the first and the second place."""
-        return 0.5 if any(self.view_shift) else -1.0
-
-    def hidden(self, at: Grid, normals: np.ndarray, place: float) -> Grid:
-        """Put the hidden side of a grid at a place: a share of the way from the beam's sheet to the vertical below the
-        rim, or where the beam falls in along the normal the run of an undercut over its height."""
-        if any(self.view_shift):
+    def moved(self, at: Grid, normals: np.ndarray, hidden: HiddenSide, place: float) -> Grid:
+        """Put the hidden side of a grid at a place (`HiddenSide.places`)."""
+        if hidden.is_below_limb:
             return occluded_vertices(*at, normals, self.view_shift, place)
-        return undercut_vertices(*at, place)
+        below_rim = occluded_vertices(*at, normals, self.view_shift, 1.0)
+        under = undercut_vertices(*at, place, self.view_shift)
+        x, y, z = (rim + new - old for rim, new, old in zip(below_rim, under, at, strict=True))
+        return x, y, z
 
     @property
     def pitches(self) -> tuple[float, float]:
@@ -426,13 +441,13 @@ class _Raster:
             field[n:-n, n:-n] = inner
         return wide, moved
 
-    def sides(self, height: np.ndarray, normals: np.ndarray, way: str = "level") -> list[SurfaceHypothesis]:
-        """Make the surface with its hidden side at all `places`; a single one if the beam sees all of it."""
-        places = self.places if self.is_occluded(height, normals).any() else (0.0,)
-        return [self.side(height, normals, place, way) for place in places]
+    def sides(
+        self, height: np.ndarray, normals: np.ndarray, hidden: HiddenSide, way: str = "level"
+    ) -> list[SurfaceHypothesis]:
+        """Make the surface with its hidden side at both places; a single one if the beam sees all of it."""
+        places = hidden.places if self.is_occluded(height).any() else hidden.places[:1]
+        return [self.side(height, normals, hidden, place, way) for place in places]
 
-    def is_occluded(self, height: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def is_occluded(self, height: np.ndarray) -> np.ndarray:
         """Find the pixels at the foot of a side that the beam does not see [y, x]."""
-        at = self.surface(self.x, self.y, height)
-        below_rim = self.hidden(at, normals, 1.0)
-        return np.any([a != b for a, b in zip(at, below_rim, strict=True)], axis=0)
+        return is_foot(height, self.view_shift, self.pitches[::-1])

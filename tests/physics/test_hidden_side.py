@@ -64,14 +64,17 @@ def test_something_is_unseen_whichever_way_the_beam_comes(azimuth_deg, bshem):
     counts = np.ones((len(bshem.detector), 21, 21))
     stack = MicrographStack(counts, axis, axis, instrument, variance=counts, n_rays=1.0)
     x, y = np.meshgrid(axis, axis)
-    height = np.where(np.maximum(np.abs(x), np.abs(y)) < 130.0, 300.0, 0.0)
-    normals = np.broadcast_to([0.0, 0.0, 1.0], (21, 21, 3))
+    along = x * np.cos(np.deg2rad(azimuth_deg)) + y * np.sin(np.deg2rad(azimuth_deg))
+    across = np.sqrt(np.maximum(np.hypot(x, y) ** 2 - along**2, 0.0))
+    # the beam sees the front as a ramp
+    height = np.where((across < 130.0) & (along < 130.0), np.clip((along + 290.0) / TAN30, 0.0, 300.0), 0.0)
+    is_front = (height > 0.0) & (height < 300.0)
+    to_beam = [-np.cos(np.deg2rad(azimuth_deg)), -np.sin(np.deg2rad(azimuth_deg)), 0.0]
+    normals = np.where(is_front[..., None], to_beam, [0.0, 0.0, 1.0])
     occluded = make_predictor(stack, 300_000, 3000.0)(height, normals).occluded
     assert occluded is not None
-    strength = np.abs(occluded).sum(0)
-    along = x * np.cos(np.deg2rad(azimuth_deg)) + y * np.sin(np.deg2rad(azimuth_deg))
-    middle = np.hypot(x, y) ** 2 - along**2 < 100.0**2
-    behind, before = (strength[middle & (side > 130.0) & (side < 290.0)].mean() for side in (along, -along))
+    strength, middle = np.abs(occluded).sum(0), across < 100.0
+    behind, before = (strength[middle & part].mean() for part in ((along > 130.0) & (along < 250.0), along < -300.0))
     assert behind > 5.0 * before
 
 
@@ -167,9 +170,9 @@ def test_masks_in_the_lee(case):
 def test_foot_on_a_wall():
     """A slot so deep that the beam meets its far wall only: the wall's foot is in the lee of the near rim.
 
-    Means over 13 rows in the middle, of every column of the wall: the true multiple scattering is what is predicted, to
-    within two deviations of the unseen side and 5 % of the flat's signal. Measured: 1.1 deviations off. Rejects the
-    sheet along the beam, of which no side is unseen (30 to 100 % of the flat's signal off).
+    Means over 13 rows in the middle, of every column of the wall: the true multiple scattering, 50 to 120 % of the
+    flat's signal, is what is predicted for a vertical near wall, to 12 % of that signal. Measured: 10 %. Rejects the
+    sheet along the beam (30 to 100 % off).
     """
     overrides = {"sample.width_um": 240.0, "sample.depth_um": 480.0, "sample.azimuth_deg": 90.0, "trace.rays": 256}
     overrides |= {"sample.length_um": 400.0, "scan.nx": 41, "scan.ny": 61, "scan.center_um": [3.0, 4.0]}
@@ -183,9 +186,8 @@ def test_foot_on_a_wall():
     single, multiple = (part / stack.n_rays for part in (stack.by_order[0], stack.by_order[1:].sum(0)))
     flat = np.median(single[:, :10], axis=(1, 2))[:, None]
     error = (predicted.multiple - multiple)[:, rows].mean(1)[:, on_wall] / flat
-    allowed = 2.0 * np.abs(predicted.occluded[:, rows].mean(1)[:, on_wall]) / flat + 0.05
     assert on_wall.sum() == 24
-    assert np.all(np.abs(error) < allowed), (error / allowed).round(2)
+    assert np.all(np.abs(error) < 0.12), error.round(2)
 
 
 def test_beside_a_mesa_with_walls_along_the_beam(tmp_path, monkeypatch):
@@ -204,7 +206,6 @@ def test_beside_a_mesa_with_walls_along_the_beam(tmp_path, monkeypatch):
     stack = pipeline.simulate(scene, seed=3)
     truth = true_surface(scene, stack.x, stack.y)
     assert stack.by_order is not None and stack.n_rays is not None
-    monkeypatch.setattr(corrections, "OCCLUDED_NODES", (1.0,))
     predicted = make_predictor(stack, 2_000_000, 6000.0)(truth.height, truth.normals).multiple
     single, multiple = (part / stack.n_rays for part in (stack.by_order[0], stack.by_order[1:].sum(0)))
     flat = np.median(single[:, :5], axis=(1, 2))
@@ -268,7 +269,7 @@ def test_ground_beside_a_ball_seen_along_the_normal(tmp_path, monkeypatch):
     zone = (truth.height < 1.0) & (limb > 0.0) & (limb < 100.0)
     error = {}
     for lean in (0.0, 0.21):
-        monkeypatch.setattr(corrections, "UNDERCUTS", (lean, lean))
+        monkeypatch.setattr(corrections, "UNDERSIDE", corrections.UNDERSIDE._replace(places=(lean, lean)))
         predicted = make_predictor(stack, 2_000_000, 6000.0)(truth.height, truth.normals).multiple
         error[lean] = np.abs((predicted - multiple)[:, zone].mean(1) / flat).max()
     assert error[0.21] < 0.02 and error[0.0] > 2.0 * error[0.21], error
