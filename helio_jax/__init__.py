@@ -304,6 +304,7 @@ workflows/            what joins the stages
   scene_errors        validation errors as sentences
   scene_warnings      probable mistakes that the built sample shows
   corrections         predicted masking and multiple scattering for the fit
+  surface_hypotheses  meshes of a surface, with hypotheses for what the beam does not see and for what lies beyond
   calibrate_rotated   calibration of aligned rotated scans
   calibrate_known     calibration of an instrument by known shapes
   known_scene         the scene of a known object, for the tracer

@@ -11,7 +11,7 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.hidden_side import occluded_vertices, undercut_vertices, with_cavities
 from helio_jax.scene.sample import check_body
 from helio_jax.scene.surfaces import first_hit_spheres, surface_body
-from helio_jax.workflows import corrections, pipeline
+from helio_jax.workflows import pipeline, surface_hypotheses
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_surface
@@ -269,7 +269,7 @@ def test_ground_beside_a_ball_seen_along_the_normal(tmp_path, monkeypatch):
     zone = (truth.height < 1.0) & (limb > 0.0) & (limb < 100.0)
     error = {}
     for lean in (0.0, 0.21):
-        monkeypatch.setattr(corrections, "UNDERSIDE", corrections.UNDERSIDE._replace(places=(lean, lean)))
+        monkeypatch.setattr(surface_hypotheses, "UNDERSIDE", surface_hypotheses.UNDERSIDE._replace(places=(lean, lean)))
         predicted = make_predictor(stack, 2_000_000, 6000.0)(truth.height, truth.normals).multiple
         error[lean] = np.abs((predicted - multiple)[:, zone].mean(1) / flat).max()
     assert error[0.21] < 0.02 and error[0.0] > 2.0 * error[0.21], error
