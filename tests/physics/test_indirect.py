@@ -17,6 +17,7 @@ from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.run import first_hits
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.scene_file import load_scene
+from helio_jax.workflows.surface_hypotheses import LIMB
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 SIDE = Detector(name="side", polar_deg=40.0, half_angle_deg=10.0)
@@ -83,9 +84,9 @@ def predictions(name: str, **changes):
     hits = first_hits(Intersector(scene.build_body()), scene.instrument, grid_x.ravel(), grid_y.ravel())
     height, normals = hits.point[:, 2].reshape(grid_x.shape), hits.normal.reshape(*grid_x.shape, 3)
     stack = MicrographStack(np.zeros((3, *height.shape)), x, y, scene.instrument)
-    about = "helio_jax.workflows.corrections."
+    about = "helio_jax.workflows.surface_hypotheses."
     with (  # as radiosity has them: the sheet along the beam, walls as ramps from pixel to pixel
-        mock.patch(about + "OCCLUDED_NODES", (0.0, 0.0)),
+        mock.patch(about + "LIMB", LIMB._replace(places=(0.0, 0.0))),
         mock.patch(about + "has_level_rims", lambda *_: False),
     ):
         traced, ours = (
