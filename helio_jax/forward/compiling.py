@@ -4,6 +4,7 @@
 (jaxlib 0.10). Where XLA does not know the option, it is left out. `batched_in_chunks`: so that batches fit the cache.
 """
 
+import os
 from collections.abc import Callable
 from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
@@ -17,6 +18,10 @@ R = TypeVar("R")
 _OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 CHUNK = 1 << 17
 """Most numbers of a result that are computed at a time in a batch, unless one element of the batch has more."""
+
+if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+    # XLA has a thread for every core: a callback to the host would wait for ever for large arguments on a single one
+    os.environ.setdefault("NPROC", "2")
 
 
 @cache
