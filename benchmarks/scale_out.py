@@ -25,9 +25,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.rows import Row, row, update, write  # noqa: E402
+from helio_jax.cpus import n_cpus  # noqa: E402
 from helio_jax.formats.parts import Parts  # noqa: E402
 from helio_jax.trace.job import Job  # noqa: E402
-from helio_jax.trace.run import n_cpus  # noqa: E402
 from helio_jax.trace.scan import Executor  # noqa: E402
 from helio_jax.workflows import pipeline  # noqa: E402
 from helio_jax.workflows.checkpoint import CheckpointedRun  # noqa: E402

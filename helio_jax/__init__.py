@@ -25,6 +25,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
   validity            the rule of is_valid: reasons, limits, words
   settings            base class of all settings tables
   drawable            plot(), short repr, notebook view and to_xarray() of the records
+  cpus                how many CPUs this process may use
   kernel              how inner loops are compiled (numba)
   robust              the robust weight
   block_fit           least squares with per-pixel unknowns eliminated

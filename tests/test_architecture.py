@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
-    {"errors", "spelling", "validity", "texts"},
+    {"errors", "spelling", "validity", "texts", "cpus"},
     {"arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
     {"detector", "campaign"},
     {"instrument"},

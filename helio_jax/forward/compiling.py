@@ -13,13 +13,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from helio_jax.cpus import n_cpus
+
 P = ParamSpec("P")
 R = TypeVar("R")
 _OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 CHUNK = 1 << 17
 """Most numbers of a result that are computed at a time in a batch, unless one element of the batch has more."""
 
-if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+if n_cpus() == 1:
     # XLA has a thread for every core: a callback to the host would wait for ever for large arguments on a single one
     os.environ.setdefault("NPROC", "2")
 

@@ -7,7 +7,6 @@ Source: horizons of height fields: Max, Vis. Comput. 4 (1988) 109.
 """
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.arrays import WALL_PITCHES
+from helio_jax.cpus import n_cpus
 from helio_jax.kernel import kernel
 
 OUTSIDE, IS_SAMPLE = -1e9, -1e8
@@ -161,7 +161,7 @@ def find_horizons(height: np.ndarray, slices: np.ndarray, tail: float, pitch: np
     def search(start: int, stop: int) -> None:
         _search_slices(height, top, steepest, slices, tail, pitch, tall, beyond, found, start, stop)
 
-    n, n_threads = n_images * n_slices, os.cpu_count() or 1
+    n, n_threads = n_images * n_slices, n_cpus()
     if found.size < _THREADED or n_threads == 1:
         search(0, n)
         return found

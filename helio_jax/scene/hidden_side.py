@@ -45,12 +45,9 @@ def occluded_vertices(
     along = float(np.hypot(*beam_shift))
     if not along:
         return x, y, z
-    pitch = tuple(
-        float(np.abs(np.diff(at + z * shift, axis=axis)).mean())
-        for axis, at, shift in zip((0, 1), (y, x), beam_shift[::-1], strict=True)
-    )
+    pitch = _raster_pitch(x, y, z, beam_shift)
     fall = _fall_from_before(z, beam_shift, pitch)
-    drop = np.where(is_foot(z, beam_shift, pitch), fall, 0.0)
+    drop = np.where(fall > WALL_PITCHES * max(pitch), fall, 0.0)
     if not drop.any():
         return x, y, z
     back = np.minimum(share * drop * along, _free_way(z, fall > _LEAST_RISE * max(pitch), beam_shift, pitch))
@@ -76,14 +73,12 @@ def undercut_vertices(
     Returns:
         x, y, z with the moved points [y, x], um.
     """
-    pitch = tuple(
-        float(np.abs(np.diff(at + z * shift, axis=axis)).mean())
-        for axis, at, shift in zip((0, 1), (y, x), beam_shift[::-1], strict=True)
-    )
-    foot = np.nonzero(is_foot(z, beam_shift, pitch))
+    pitch = _raster_pitch(x, y, z, beam_shift)
+    fall = _fall_from_before(z, beam_shift, pitch)
+    foot = np.nonzero(fall > WALL_PITCHES * max(pitch))
     if not foot[0].size:
         return x, y, z
-    fall = _fall_from_before(z, beam_shift, pitch)[foot]
+    fall = fall[foot]
     smooth = gaussian_filter(z, _TURN_PIXELS)
     uphill = np.stack([np.gradient(smooth, step, axis=axis)[foot] for axis, step in enumerate(pitch)])
     uphill /= np.maximum(np.hypot(*uphill), np.finfo(float).tiny)
@@ -100,6 +95,14 @@ def undercut_vertices(
 def is_foot(z: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]) -> np.ndarray:
     """Find the points at the foot of a side that the beam does not see [y, x]; `pitch` along y and x, um."""
     return _fall_from_before(z, beam_shift, pitch) > WALL_PITCHES * max(pitch)
+
+
+def _raster_pitch(x: np.ndarray, y: np.ndarray, z: np.ndarray, beam_shift: tuple[float, float]) -> tuple[float, ...]:
+    """Compute the pitch along y and x of the raster on which an oblique beam sees the points [y, x], um."""
+    return tuple(
+        float(np.abs(np.diff(at + z * shift, axis=axis)).mean())
+        for axis, at, shift in zip((0, 1), (y, x), beam_shift[::-1], strict=True)
+    )
 
 
 def _way_below_top(

@@ -19,6 +19,7 @@ LEVEL_COSINE = 0.87
 """Least z of the unit normal at the rim of a wall: it falls by less than 30 degrees."""
 LEAST_JUMP = 2.0
 """By how much the slope between neighbours that a wall parts exceeds the next ones."""
+
 Grid = tuple[np.ndarray, np.ndarray, np.ndarray]
 """x, y, z of points [y, x], um."""
 
@@ -98,6 +99,7 @@ def refined_grid(
     (x, y, z), (tx, ty) = grid, beam_shift
     shift = shift_to_outlines(wall_x, wall_y)
     height, is_foot = _refined_heights(z, wall_x, wall_y, shift)
+    # the points of two pixels on both sides of a half-way line are one of the grid of half pixels
     lines = np.ix_(*((2 * np.arange(3 * n - 2) + 1) // 3 for n in z.shape))
     place_y, place_x = (
         _refined_places(place) + float(np.diff(place, axis=axis).min()) * shift[axis][lines]

@@ -4,7 +4,6 @@ A block is a pure function of the experiment and its pixels, and blocks are join
 bit the same for any number of threads. `scan` traces whole scans.
 """
 
-import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from helio_jax.cpus import n_cpus
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.instrument import Effusive, Instrument, Plate
 from helio_jax.scene.body import COSINE, Body
@@ -37,11 +37,6 @@ MAX_LOST = 1e-4
 T = TypeVar("T")
 Progress = Callable[[int, int], None]
 """Called with (pixels done, pixels in total)."""
-
-
-def n_cpus() -> int:
-    """Return the number of CPUs that this process may use, e.g. those that a batch system allocated."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def paths_of(settings: TraceSettings) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.cpus import n_cpus
 from helio_jax.errors import MissingDependencyError, SceneError, StoppedRun
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
 from helio_jax.scene.body import Body
@@ -26,7 +27,7 @@ from helio_jax.scene.scan import PositionList
 from helio_jax.scene.scene import Scene
 from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.job import Job, Unit
-from helio_jax.trace.run import Progress, check_rays, in_order, n_cpus
+from helio_jax.trace.run import Progress, check_rays, in_order
 from helio_jax.trace.settings import TraceSettings
 from helio_jax.trace.tally import FATES
 from helio_jax.trace.units import UnitResult, join_pieces, result_shapes, trace_unit, unit_tasks, view_experiment

@@ -58,8 +58,8 @@ def make_predictor(
     The surface is continued to a square of side `substrate_um`, or as far beyond each border as `_surroundings` says:
     with a `flat` border by the flat z = 0, tilted if a prediction is given its slopes (in radiosity never); with a
     `free` one in both ways of `scene/border.py` (in radiosity by the flat, too). Their mean is expected, and half their
-    difference is one more unknown of the fit. `masks_by` rays, masks are traced on the mesh instead of computed by the
-    horizon march, for a test of the result that shares neither with the fit.
+    difference is one more unknown of the fit. `masks_by` rays, all masks are traced on the mesh, for a test of the
+    result; a fit computes them by the horizon march, but shares those of the mesh where the surface has walls.
 
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. All of the sample scatters by
     the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law. Radiosity knows
@@ -155,7 +155,7 @@ def make_predictor(
             normal = np.moveaxis(normals, -1, 0)
             either = [m - single_scattering(f, normal) for m, f in zip(traced, masked, strict=True)]
             occluded = hidden.deviation * np.subtract(*either)
-        masks, found = (np.tensordot(expected, np.array(images), 1) for images in (masked, traced))
+        masks, found = (np.tensordot(expected, np.array(of_sides), 1) for of_sides in (masked, traced))
         return Corrections(masks, found, occluded, smooth_normals, surroundings)
 
     return predict

@@ -38,22 +38,22 @@ class HiddenSide(NamedTuple):
     """Two places at which the side that the beam does not see may stand.
 
     Attributes:
-        places: where the foot is; `is_below_limb`: shares of the way from the beam's sheet to the vertical below the
-            rim; else the run from that vertical under the rim, over the height.
+        places: where the foot is. `is_share`: share of the way from the sheet along the beam to the vertical below the
+            rim; else by how much the side leans inwards from that vertical: run over height.
         shares: of the two predictions in what is expected.
         deviation: one standard deviation, in units of the difference between the first and the second prediction.
         has_walls: whether the rims are those of walls, not limbs of round bodies.
-        is_below_limb: see `places`.
+        is_share: see `places`.
     """
 
     places: tuple[float, ...]
     shares: tuple[float, ...]
     deviation: float
     has_walls: bool = False
-    is_below_limb: bool = False
+    is_share: bool = False
 
 
-LIMB = HiddenSide((0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)), (0.5, 0.5), 0.5, is_below_limb=True)
+LIMB = HiddenSide((0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)), (0.5, 0.5), 0.5, is_share=True)
 """Behind the limb of a round body an oblique beam leaves any side between its sheet and the vertical below the limb:
 the nodes of Gauss's rule for a share of which nothing is known. Mean and deviation are exact where the signal is
 linear."""
@@ -187,7 +187,7 @@ class ScanRaster:
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
-        behind = self.moved(at, normals, hidden, place)
+        behind = self.with_hidden_side(at, normals, hidden, place)
         substrate = self.flat_surroundings
         if not self.has_flat_surroundings:
             level, substrate = substrate_level(height), {}
@@ -214,9 +214,9 @@ class ScanRaster:
             return WALL
         return LIMB if any(self.view_shift) else UNDERSIDE
 
-    def moved(self, at: Grid, normals: np.ndarray, hidden: HiddenSide, place: float) -> Grid:
+    def with_hidden_side(self, at: Grid, normals: np.ndarray, hidden: HiddenSide, place: float) -> Grid:
         """Put the hidden side of a grid at a place (`HiddenSide.places`)."""
-        if hidden.is_below_limb:
+        if hidden.is_share:
             return occluded_vertices(*at, normals, self.view_shift, place)
         below_rim = occluded_vertices(*at, normals, self.view_shift, 1.0)
         under = undercut_vertices(*at, place, self.view_shift)
