@@ -162,12 +162,16 @@ def make_predictor(
 
 
 def _joined(parts: list[Corrections], detectors: list[list[int]]) -> Corrections:
-    """Join the corrections of several beams, whose detectors these are; seen straight down nothing is occluded."""
+    """Join the corrections of several beams on one surface, whose detectors these are."""
     order = np.argsort(np.concatenate(detectors))
-    masked, multiple = (np.concatenate([getattr(p, name) for p in parts])[order] for name in ("masked", "multiple"))
-    surroundings = [p.surroundings for p in parts if p.surroundings is not None]
-    around = np.concatenate(surroundings)[order] if surroundings else None
-    return Corrections(masked, multiple, None, parts[0].normals, around)
+
+    def joined(images: list[np.ndarray | None]) -> np.ndarray | None:
+        known = [image for image in images if image is not None]
+        return np.concatenate(known)[order] if known else None
+
+    names = "masked", "multiple", "occluded", "surroundings"
+    found = {name: joined([getattr(part, name) for part in parts]) for name in names}
+    return Corrections(normals=parts[0].normals, **found)
 
 
 def _mean(albedo: np.ndarray) -> float:
