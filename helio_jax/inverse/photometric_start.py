@@ -33,7 +33,7 @@ def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normal
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     corrections = predict(surface.height, normals, **patches.known)
     sigma = prediction_std(corrections, normals, settings.refine)
-    masked, multiple = linearised_in_normal(corrections, normals)
+    masked, multiple = linearised_in_normal(corrections, normals, optics)
     visible = form_factor(optics, surface.height) - masked
     spread = variance + sigma**2
     (a, b), _ = solve_known_albedo(signal - multiple, spread, visible, normals, stack.instrument.beam_shift)

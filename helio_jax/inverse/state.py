@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.forward.compiling import compiled
+from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
@@ -117,7 +118,9 @@ class FitState:
         return FitState(surface, self.parameters.replaced(lines=lines), self.residuals[:, *thin], held)
 
 
-def linearised_in_normal(corrections: Corrections, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def linearised_in_normal(
+    corrections: Corrections, normals: np.ndarray, optics: Optics
+) -> tuple[np.ndarray, np.ndarray]:
     """Make masks and multiple scattering a linear model of the own normal, about the corrections' or given ones.
 
     The slope of multiple scattering is added to the masked form factor and changes nothing at the facet's own normal:
@@ -127,9 +130,10 @@ def linearised_in_normal(corrections: Corrections, normals: np.ndarray) -> tuple
     Args:
         corrections: of a surface.
         normals: its unit normals [y, x, 3].
+        optics: of the scan.
     """
     up = (normals if corrections.normals is None else corrections.normals)[..., 2]
-    slope = normal_slope(corrections.multiple, up)
+    slope = normal_slope(corrections.multiple, up, substrate_signal(optics))
     masked = np.array(corrections.masked)
     masked[:, 2] += slope
     return masked, corrections.multiple + slope * up
@@ -156,7 +160,7 @@ def _largest_change(image: np.ndarray) -> np.ndarray:
 def _held(problem: FitProblem, corrections: Corrections, surface: Surface, parameters: Parameters) -> Held:
     """Derive what a solve needs of corrections made for a surface, without responses."""
     normals, moved = surface.normals(problem.shift), problem.moves(parameters)
-    masked, intercept = linearised_in_normal(corrections, normals)
+    masked, intercept = linearised_in_normal(corrections, normals, problem.optics)
     albedo = problem.patches_at(parameters).albedo
     variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)

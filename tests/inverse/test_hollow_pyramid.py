@@ -12,12 +12,13 @@ SLOPE = np.tan(np.arccos(STEEP_FACET))
 
 
 def test_response_to_the_own_normal_has_no_step():
-    """M / (1 - n_z) where that is steep; nothing where level; no step."""
-    up, multiple = np.linspace(0.5, 1.0, 5001), np.ones((1, 5001))
-    found = normal_slope(multiple, up)
+    """M / (1 - n_z) where that is steep; nothing where level; no step; never more than half of the level signal."""
+    up, multiple = np.linspace(0.5, 1.0, 5001)[None], np.ones((1, 1, 5001))
+    found = normal_slope(multiple, up, np.array([40.0]))
     steep = up < STEEP_FACET
-    np.testing.assert_allclose(found[0, steep], 1.0 / (1.0 - up[steep]), rtol=1e-12)
-    assert np.abs(np.diff(found[0])).max() < 0.1 and found[0, -1] == 0.0
+    np.testing.assert_allclose(found[0][steep], 1.0 / (1.0 - up[steep]), rtol=1e-12)
+    assert np.abs(np.diff(found)).max() < 0.1 and found[0, 0, -1] == 0.0
+    np.testing.assert_array_equal(normal_slope(multiple, up, np.array([6.0])), np.minimum(found, 3.0))
 
 
 SCENE = f"""

@@ -147,14 +147,14 @@ def test_known_albedo_solution_is_exact_even_with_two_images(bshem):
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
-def test_corrections_about_a_normal_change_nothing_there():
+def test_corrections_about_a_normal_change_nothing_there(bshem):
     """The linear model of the own normal is exact at that normal and darkens a facet that turns towards level."""
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(4, 5, 3)) + [0, 0, 2]
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     multiple = rng.uniform(0, 1, (3, 4, 5))
     was = Corrections(rng.normal(size=(3, 3, 4, 5)), multiple)
-    near = Corrections(*linearised_in_normal(was, normals))
+    near = Corrections(*linearised_in_normal(was, normals, Optics.of(bshem)))
     value = lambda c, n: c.multiple - np.einsum("kiyx,yxi->kyx", c.masked, n)  # noqa: E731
     assert np.allclose(value(near, normals), value(was, normals))
     level = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
