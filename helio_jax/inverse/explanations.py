@@ -59,6 +59,9 @@ HOPELESS = 2.0
 """Pits are given up where they leave so many times the misfit of an unknown instrument's best fit."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
+AT_REST = 0.1
+"""Fits with free gains whose last iteration changed the heights by more, rms over the relief, are not kept: along what
+the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
 HELD = 1e-4
 """Gains and offsets that are held have this share of their prior standard deviation."""
 
@@ -274,15 +277,15 @@ class _Fits:
 
         With a free border, gains and offsets have much the same effect as tilt and relief: what the model lacks moved
         gains of a right instrument by several per cent, and tilted the heights with them. They are then held as stated;
-        only where free ones improve one solve by `GAIN` they are fitted, too, and kept if that improves the fit by it.
-        The error bars include them in either case.
+        only where free ones improve one solve by `GAIN` they are fitted, too, and kept if that fit comes to rest
+        (`AT_REST`) and improves on the other by it. The error bars include them in either case.
         """
         problem = self.pose(surface, *known)
         if self.settings.border == "flat" or problem.is_instrument_unknown:
-            return self._fit(surface, smoothed, *known)
+            return self._unbiased(self._fit(surface, smoothed, *known))
         held = with_held_readout(self.settings)
         patches, region, anchors = (*known, None, None)[:3]
-        fit = self._fit(surface, smoothed, patches, region, anchors, held)
+        fit = self._unbiased(self._fit(surface, smoothed, patches, region, anchors, held))
         parameters = readout_as_stated(fit.parameters)
         as_held, state = fit.problem, replace(fit.state, parameters=parameters)
         fit = replace(fit, problem=problem, parameters=parameters, state=state)
@@ -293,16 +296,24 @@ class _Fits:
             return fit
         try:
             free = self._fit(state.surface, smoothed, *known)
+            if not free.is_interrupted and free.changes[-1] > AT_REST * np.ptp(free.surface.height):
+                self.say("free gains and offsets are given up: that fit did not come to rest")
+                return fit
+            free = self._unbiased(free)
             return free if improvement(self.residuals(fit), self.residuals(free)) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")
             return fit
 
     def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
-        """Fit once; arguments as those of `fitted`."""
+        """Fit once, the bias by noise left in; arguments as those of `fitted`."""
         fit, _ = with_backtracking(
             lambda start: fit_heights(self.pose(start, *known), start, self.predict, self.report), surface, smoothed
         )
+        return fit
+
+    def _unbiased(self, fit: Fit) -> Fit:
+        """Subtract the bias by noise where every fit needs that."""
         return without_noise_bias(fit, self.report) if self.subtracts_bias_at_once else fit
 
     @property
@@ -442,10 +453,11 @@ class _Fits:
             patches = patches.keeping(patches.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
-        if best.number is None:
+        if best.number is None and not best.n_steps:
             return self.from_steps(patches)
-        surface = best.fit.state.surface
-        return best._replace(fit=self.fitted(surface, surface, patches, best.number))
+        problem, surface = best.fit.problem, best.fit.state.surface  # levels that were found hold here, too
+        region = problem.region if best.number is None else best.number
+        return best._replace(fit=self.fitted(surface, surface, patches, region, problem.anchors))
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:
