@@ -253,8 +253,8 @@ def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Correcti
     """Return the reconstruction and its time in seconds, with changed corrections."""
     chosen = settings_of(scene, refine)
 
-    def make_predict(n_rays: int, has_deviation: bool = True):
-        predict = make_predictor(stack, n_rays, chosen.refine.substrate_um, has_deviation=has_deviation)
+    def make_predict(n_rays: int, **how: bool):
+        predict = make_predictor(stack, n_rays, chosen.refine.substrate_um, **how)
         return lambda *surface, **known: change(predict(*surface, **known))
 
     start = time.perf_counter()
