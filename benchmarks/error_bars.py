@@ -105,7 +105,7 @@ def fit(counts: np.ndarray, variance: np.ndarray, instrument: Instrument, settin
     nothing = Corrections.none(counts.shape)
     axis = raster(counts.shape[1])
     stack = MicrographStack(counts, axis, axis, instrument, variance=variance, n_rays=n_rays)
-    return reconstruct_stack(stack, settings, lambda _, **how: lambda *surface, **known: nothing)
+    return reconstruct_stack(stack, settings, lambda _: lambda *surface, **known: nothing)
 
 
 def batches(n: int, size: int) -> Iterator[range]:

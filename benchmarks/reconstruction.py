@@ -253,8 +253,8 @@ def changed(scene: SceneFile, stack: MicrographStack, change: Callable[[Correcti
     """Return the reconstruction and its time in seconds, with changed corrections."""
     chosen = settings_of(scene, refine)
 
-    def make_predict(n_rays: int, **how: bool):
-        predict = make_predictor(stack, n_rays, chosen.refine.substrate_um, **how)
+    def make_predict(n_rays: int):
+        predict = make_predictor(stack, n_rays, chosen.refine.substrate_um)
         return lambda *surface, **known: change(predict(*surface, **known))
 
     start = time.perf_counter()
