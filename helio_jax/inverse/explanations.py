@@ -9,6 +9,7 @@ images about as well as the one that is kept is undecided.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -39,7 +40,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square, squares
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.shadow_steps import find_shadow_step
-from helio_jax.inverse.state import FitState, MakePredict, Predict
+from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
@@ -95,7 +96,7 @@ class Explanation(NamedTuple):
 def explain(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    make_predict: MakePredict,
+    make_predict: Callable[[int], Predict],
     report: Report | None,
     start: np.ndarray | None = None,
 ) -> Explanation:
@@ -151,7 +152,7 @@ class _Fits:
 
     stack: MicrographStack
     settings: ReconstructSettings
-    make_predict: MakePredict
+    make_predict: Callable[[int], Predict]
     report: Report | None
 
     @property
@@ -191,13 +192,8 @@ class _Fits:
 
     @cached_property
     def predict_trial(self) -> Predict:
-        """As precise as the test of a fit needs it."""
+        """As precise as a search and the test of a fit need it."""
         return self.make_predict(self.settings.refine.search_paths(self.n_pixels))
-
-    @cached_property
-    def predict_search(self) -> Predict:
-        """As precise as a search needs it, the hidden side as expected."""
-        return self.make_predict(self.settings.refine.search_paths(self.n_pixels), has_deviation=False)
 
     def pose(
         self,
@@ -233,12 +229,12 @@ class _Fits:
     def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
         """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
         problem = self.pose(surface, patches)
-        return residuals_of_state(problem, FitState.at(problem, surface), self.predict_search)
+        return residuals_of_state(problem, FitState.at(problem, surface), self.predict_trial)
 
     def short_fit(self, surface: Surface, patches: AlbedoPatches) -> tuple[float, Surface]:
         """Compute the misfit (`misfit`) after a short fit from a surface, and the surface fitted."""
         try:
-            return short_fit(self.pose(surface, patches), surface, self.predict_search)
+            return short_fit(self.pose(surface, patches), surface, self.predict_trial)
         except PredictionError:
             return math.inf, surface
 
@@ -403,7 +399,7 @@ class _Fits:
             self.stack,
             self.settings,
             relief,
-            self.predict_search,
+            self.predict_trial,
             lambda surface: self.misfit(surface, none),
             self.say,
         )

@@ -60,13 +60,13 @@ UNUSED = "the anchors, {n} in number, were not used: {why}"
 if TYPE_CHECKING:
     from helio_jax.inverse.anchors import Anchors
     from helio_jax.inverse.fit import Fit, Report
-    from helio_jax.inverse.state import MakePredict
+    from helio_jax.inverse.state import Predict
 
 
 def reconstruct_stack(
     stack: MicrographStack,
     settings: ReconstructSettings,
-    make_predict: "MakePredict | None" = None,
+    make_predict: "Callable[[int], Predict] | None" = None,
     report: "Report | None" = None,
     trace: Trace | None = None,
     start: np.ndarray | None = None,

@@ -32,9 +32,6 @@ Predict = Callable[..., Corrections]
 """(heights [y, x] um, unit normals [y, x, 3]) -> Corrections; the instrument is given, too, where it is unknown, and by
 their names the albedo [y, x] where it is not 1, the law where it is not the cosine law, and the slopes of the substrate
 along x and y where it may be tilted. The corrections are per albedo of the own pixel."""
-MakePredict = Callable[..., Predict]
-"""(number of paths, has_deviation = True) -> Predict; without `has_deviation` it predicts no `occluded`, but in less
-time."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,6 @@ def make_predictor(
     multiple: Literal["traced", "radiosity"] = "traced",
     border: Literal["flat", "free"] = "flat",
     masks_by: Literal["horizon", "rays"] = "horizon",
-    has_deviation: bool = True,
 ) -> Callable[..., Corrections]:
     """Return a function that predicts masks and multiple scattering of a surface, by the stack's or another instrument.
 
@@ -60,9 +59,7 @@ def make_predictor(
     with a `flat` border by the flat z = 0, tilted if a prediction is given its slopes (in radiosity never); with a
     `free` one in both ways of `scene/border.py` (in radiosity by the flat, too). Their mean is expected, and half their
     difference is one more unknown of the fit. `masks_by` rays, all masks are traced on the mesh, for a test of the
-    result; a fit computes them by the horizon march, but shares those of the mesh where the surface has walls. Without
-    `has_deviation`, for searches that hold the hidden side as expected, `occluded` is None, and a second place of that
-    side that has no share in what is expected is not traced: half the time beside walls.
+    result; a fit computes them by the horizon march, but shares those of the mesh where the surface has walls.
 
     Seeds are fixed, so that successive predictions differ by the surface, not by noise. All of the sample scatters by
     the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law. Radiosity knows
@@ -126,7 +123,6 @@ def make_predictor(
         """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
         height = surface.height
         hidden = raster.hidden_side(smooth, smooth_normals)
-        hidden = hidden if has_deviation else hidden.expected
         either_way = [raster.sides(smooth, smooth_normals, hidden, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
@@ -155,7 +151,7 @@ def make_predictor(
                 sheet = raster.side(smooth, smooth_normals, LIMB, 0.0).masked(is_masked)
                 masked = [by_march + side.masked(is_masked) - sheet for side in sides]
         occluded = None
-        if has_deviation and len(sides) > 1:
+        if len(sides) > 1:
             normal = np.moveaxis(normals, -1, 0)
             either = [m - single_scattering(f, normal) for m, f in zip(traced, masked, strict=True)]
             occluded = hidden.deviation * np.subtract(*either)

@@ -12,7 +12,7 @@ from helio_jax.forward.optics import Optics
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.state import MakePredict, Predict
+from helio_jax.inverse.state import Predict
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.workflows.calibrate_rotated import calibrate_rotated
@@ -254,12 +254,12 @@ class _Reconstructing:
         warnings = (*rec.warnings, *of_calibration, *_law_warnings(stack, self.settings))
         return replace(rec, provenance={**rec.provenance, **this_run()}, warnings=warnings)
 
-    def _make_predict(self, stack: MicrographStack) -> MakePredict:
+    def _make_predict(self, stack: MicrographStack) -> Callable[[int], Predict]:
         refine = self.settings.refine
 
-        def make_predict(n_rays: int, has_deviation: bool = True) -> Predict:
+        def make_predict(n_rays: int) -> Predict:
             about = {"multiple": refine.multiple, "border": self.settings.border, "workers": self.workers}
-            return make_predictor(stack, n_rays, refine.substrate_um, **about, has_deviation=has_deviation)
+            return make_predictor(stack, n_rays, refine.substrate_um, **about)
 
         return make_predict
 

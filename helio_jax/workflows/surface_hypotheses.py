@@ -7,7 +7,6 @@ free border (`CONTINUATIONS`).
 
 import math
 from dataclasses import dataclass, replace
-from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,13 +51,6 @@ class HiddenSide(NamedTuple):
     deviation: float
     has_walls: bool = False
     is_share: bool = False
-
-    @property
-    def expected(self) -> "HiddenSide":
-        """Without places that have no share in what is expected."""
-        is_used = [share > 0.0 for share in self.shares]
-        places, shares = (tuple(compress(values, is_used)) for values in (self.places, self.shares))
-        return self._replace(places=places, shares=shares)
 
 
 LIMB = HiddenSide((0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)), (0.5, 0.5), 0.5, is_share=True)

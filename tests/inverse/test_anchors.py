@@ -268,7 +268,7 @@ def hills(tmp_path_factory):
     stack = found.only().replace(instrument=found.only().instrument.model_copy(update={"uncertainty": Uncertainty()}))
     fast = {"bias_pairs": 0, "photometric_rounds": 2, "albedo_patches": False, "objects": False, "rays": 100_000}
     settings = ReconstructSettings().changed(border="free", refine=fast)
-    fit = explain(stack, settings, lambda n, **how: make_predictor(stack, n, None, border="free", **how), None).fit
+    fit = explain(stack, settings, lambda n: make_predictor(stack, n, None, border="free"), None).fit
     seen = reconstruct(stack, "nearfield", border="free", samples=0, rounds=1, corrections=0)
     return fit, stack, load_truth(folder / "hills.toml", seen).height
 

@@ -42,7 +42,7 @@ def test_only_the_start_is_predicted_with_fewer_paths(bshem):
     stack = MicrographStack(counts, axis, axis, bshem, variance=counts, n_rays=35e3)
     used = []
 
-    def make_predict(asked, has_deviation=True):
+    def make_predict(asked):
         def predict(height, normals, **known):
             used.append(asked)
             return Corrections.none(counts.shape)
