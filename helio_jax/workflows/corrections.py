@@ -162,12 +162,17 @@ def make_predictor(
 
 
 def _joined(parts: list[Corrections], detectors: list[list[int]]) -> Corrections:
-    """Join the corrections of several beams on one surface, whose detectors these are."""
+    """Join the corrections of several beams on one surface, whose detectors these are.
+
+    What one beam predicts (`occluded`, `surroundings`) and another does not is 0 for the other.
+    """
     order = np.argsort(np.concatenate(detectors))
 
     def joined(images: list[np.ndarray | None]) -> np.ndarray | None:
-        known = [image for image in images if image is not None]
-        return np.concatenate(known)[order] if known else None
+        if all(image is None for image in images):
+            return None
+        filled = [np.zeros_like(p.multiple) if i is None else i for i, p in zip(images, parts, strict=True)]
+        return np.concatenate(filled)[order]
 
     names = "masked", "multiple", "occluded", "surroundings"
     found = {name: joined([getattr(part, name) for part in parts]) for name in names}

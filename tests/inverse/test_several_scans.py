@@ -14,10 +14,12 @@ from helio_jax.alignment.resample import is_lit, joined_instrument, resample
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.render import Corrections
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack
 from helio_jax.workflows import several_scans
+from helio_jax.workflows.corrections import _joined
 from helio_jax.workflows.scene_file import load_instrument, load_scene
 from helio_jax.workflows.truth import true_surface
 
@@ -67,6 +69,19 @@ def test_optics_of_several_beams_move_and_refuse_one_raster_frame():
     moved = optics.moved(incidence=math.radians(5.0))
     np.testing.assert_allclose(np.hypot(*np.asarray(moved.beam_shifts).T), math.tan(math.radians(50.0)))
     np.testing.assert_allclose(moved.beam_shift, 0.0)
+
+
+def test_a_beam_that_sees_all_has_no_hidden_side():
+    """Corrections of three detectors in two beams: detectors in order, 0 where the second beam hides nothing."""
+    image = np.arange(1.0, 4.0)[:, None, None] * np.ones((3, 2, 2))
+    form = image[:, None] * np.ones((3, 3, 2, 2))
+    normals = np.zeros((2, 2, 3))
+    oblique = Corrections(form[:2], image[:2], 5.0 * image[:2], normals)
+    steep = Corrections(form[2:], image[2:], None, normals)
+    found = _joined([oblique, steep], [[0, 2], [1]])
+    np.testing.assert_array_equal(found.multiple[:, 0, 0], [1.0, 3.0, 2.0])
+    np.testing.assert_array_equal(found.occluded[:, 0, 0], [5.0, 0.0, 10.0])
+    assert found.surroundings is None
 
 
 def test_shadow_has_the_length_of_geometry():
