@@ -60,8 +60,8 @@ HOPELESS = 2.0
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
 AT_REST = 0.1
-"""Fits with free gains whose last iteration changed the heights by more, rms over the relief, are not kept: along what
-the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
+"""Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
+gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
 HELD = 1e-4
 """Gains and offsets that are held have this share of their prior standard deviation."""
 
@@ -296,7 +296,7 @@ class _Fits:
             return fit
         try:
             free = self._fit(state.surface, smoothed, *known)
-            if not free.is_interrupted and free.changes[-1] > AT_REST * np.ptp(free.surface.height):
+            if not free.is_interrupted and free.changes[-1] > AT_REST * np.ptp(fit.surface.height):
                 self.say("free gains and offsets are given up: that fit did not come to rest")
                 return fit
             free = self._unbiased(free)

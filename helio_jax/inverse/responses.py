@@ -52,10 +52,10 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray, level: np.ndarray) -> np.
     """Estimate the fall of multiple scattering M per unit of a facet's vertical normal component [detector, y, x].
 
     A facet whose normal has the vertical part n_z sees level surroundings with the view factor (1 - n_z) / 2, so what
-    they send it changes by -M / (1 - n_z) per unit of n_z, and by no more than half of what reaches the detector from
-    them. Beside a ball or a wall M is larger than that view factor allows: it comes from above the facet's horizon, and
-    does not go where the facet is level. Without the limit the noise of normals beside spheres lowered the gains by 2 %
-    and raised the spheres by as much. Continuous: a threshold makes fits of facets near it cycle.
+    they send it changes by -M / (1 - n_z) per unit of n_z, by at most half of the substrate's signal. Beside a ball
+    or a wall M is larger than that view factor allows: most of it comes from above the substrate and remains where the
+    facet is level. Without the limit the noise of normals beside spheres lowered the gains by 2 % and raised the
+    spheres by as much. Continuous: a threshold makes fits of facets near it cycle.
 
     Args:
         multiple: multiple scattering M [detector, y, x].
@@ -150,7 +150,7 @@ def relief_responses(
     level = np.mean(coarse.height[is_substrate])
     with_level = _with_substrate_at(optics, level)
     plan = plan_radiosity(coarse.height - level, coarse.normals(shift), with_level, coarse_raster)
-    out = []
+    out, signal = [], substrate_signal(optics)
     smooth_changes = _relief_changes(smooth, raster, has_enough_images, distance)
     for i, (change, smooth_change) in enumerate(zip(changes, smooth_changes, strict=True)):
         with jax.enable_x64(True):
@@ -162,7 +162,7 @@ def relief_responses(
             value, slope = _multiple_change(at, along, *levels, optics, coarse_raster, plan)
         sharp, sharp_change = (jax.tree.map(lambda f: np.asarray(f)[thin], s) for s in (surface, change))
         vertical = _vertical_change(sharp, sharp_change, shift)
-        own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2], substrate_signal(optics)) * vertical
+        own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2], signal) * vertical
         out.append(Response(weights[i], masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
     return tuple(out)
 

@@ -123,9 +123,10 @@ def linearised_in_normal(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Make masks and multiple scattering a linear model of the own normal, about the corrections' or given ones.
 
-    The slope of multiple scattering is added to the masked form factor and changes nothing at the facet's own normal:
-    it only makes the iterations converge faster beside steep walls, where slope and multiple scattering depend on one
-    another (`responses.normal_slope`).
+    The slope of multiple scattering is added to the masked form factor and changes nothing at the normal of the
+    corrections. It makes the iterations converge faster beside steep walls, where slope and multiple scattering depend
+    on one another (`responses.normal_slope`). Corrections are made for denoised normals: the noise of the fitted ones
+    enters by this slope, and biases the gains where the slope is too large.
 
     Args:
         corrections: of a surface.

@@ -47,7 +47,7 @@ def occluded_vertices(
         return x, y, z
     pitch = _raster_pitch(x, y, z, beam_shift)
     fall = _fall_from_before(z, beam_shift, pitch)
-    drop = np.where(fall > WALL_PITCHES * max(pitch), fall, 0.0)
+    drop = np.where(_is_high(fall, pitch), fall, 0.0)
     if not drop.any():
         return x, y, z
     back = np.minimum(share * drop * along, _free_way(z, fall > _LEAST_RISE * max(pitch), beam_shift, pitch))
@@ -75,7 +75,7 @@ def undercut_vertices(
     """
     pitch = _raster_pitch(x, y, z, beam_shift)
     fall = _fall_from_before(z, beam_shift, pitch)
-    foot = np.nonzero(fall > WALL_PITCHES * max(pitch))
+    foot = np.nonzero(_is_high(fall, pitch))
     if not foot[0].size:
         return x, y, z
     fall = fall[foot]
@@ -94,7 +94,12 @@ def undercut_vertices(
 
 def is_foot(z: np.ndarray, beam_shift: tuple[float, float], pitch: tuple[float, ...]) -> np.ndarray:
     """Find the points at the foot of a side that the beam does not see [y, x]; `pitch` along y and x, um."""
-    return _fall_from_before(z, beam_shift, pitch) > WALL_PITCHES * max(pitch)
+    return _is_high(_fall_from_before(z, beam_shift, pitch), pitch)
+
+
+def _is_high(fall: np.ndarray, pitch: tuple[float, ...]) -> np.ndarray:
+    """Tell whether falls [um] are those of sides that the beam does not see, not of slopes."""
+    return fall > WALL_PITCHES * max(pitch)
 
 
 def _raster_pitch(x: np.ndarray, y: np.ndarray, z: np.ndarray, beam_shift: tuple[float, float]) -> tuple[float, ...]:
