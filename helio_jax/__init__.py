@@ -109,9 +109,11 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_bilateral bilateral normal integration
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
+  rims                where a dome, steepest at its rim, meets a level surface
   strain              how far a fit moves the instrument from what is stated
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   photometric_start   surfaces that a fit starts from
+  backtracking        a step halved until its surface can be traced
   objects             objects on a flat substrate: their outlines and levels
   pits                pits in a flat substrate: their outlines and levels
   levels              level search of regions behind depth jumps

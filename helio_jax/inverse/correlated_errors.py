@@ -89,7 +89,7 @@ class EdgeError:
         """Find the runs of edges at kinks of a surface; edges as from `edges.find_edges`."""
         shares, runs, n_runs = [], [], 0
         for edges, slope, axis in ((along_x, surface.slope_x, 1), (along_y, surface.slope_y, 0)):
-            share = kink_size(slope, axis) ** 2 / 12.0 / edges.sigma**2
+            share = np.minimum(kink_size(slope, axis) ** 2 / 12.0 / edges.sigma**2, 1.0)
             beside = np.zeros((3, 3), int)
             beside[:, 1] = 1
             number, n = label(share > KINKED, beside if axis == 1 else beside.T)  # type: ignore[misc]  # SciPy's stubs

@@ -389,7 +389,9 @@ def _edges_at(case: Case, noise: Any) -> Edges:
         previous, following = around(own.reshape(shape), axis)
         smooth.append(previous * following)
     (joined_x, weight_x), (joined_y, weight_y) = weights
-    return Edges(joined_x, joined_y, weight_x, weight_y, *smooth)
+    smooth_x, smooth_y = smooth
+    no_rims = jnp.zeros((ny, nx - 1)), jnp.zeros((ny - 1, nx))
+    return Edges(joined_x, joined_y, weight_x, weight_y, smooth_x, smooth_y, *no_rims)
 
 
 def _largest_change(image: jax.Array) -> jax.Array:

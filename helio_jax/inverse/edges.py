@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from helio_jax.forward.surface import along, around
+from helio_jax.inverse.rims import AxisRims
 from helio_jax.robust import cauchy_weight
 
 NOISE_FLOOR = 0.2
@@ -88,12 +89,21 @@ class AxisEdges:
     """The edges along one axis, as the next solve sees them.
 
     Attributes:
-        sigma: standard deviation of (height change / pitch) - (mean of the two slopes) on an edge without a jump.
+        gap: expected (height change / pitch) - (mean of the two slopes) on an edge without a jump.
+        sigma: its standard deviation.
         joined: weight that is left to the edge, 1: joined, 0: a depth jump.
+        is_rim: whether the edge is at a rim, or next to it (`rims`).
     """
 
+    gap: np.ndarray
     sigma: np.ndarray
     joined: np.ndarray
+    is_rim: np.ndarray
+
+    @property
+    def smooth(self) -> np.ndarray:
+        """Weight left to the edge where the surface may be smooth beyond its ends, too."""
+        return np.where(self.is_rim, 0.0, self.joined)
 
     @property
     def weight(self) -> np.ndarray:
@@ -110,7 +120,13 @@ def noise_of_edges(noise: float | np.ndarray, axis: int) -> float | np.ndarray:
 
 
 def find_edges(
-    height: np.ndarray, slope: np.ndarray, pitch: float, axis: int, noise: float | np.ndarray, cut: float
+    height: np.ndarray,
+    slope: np.ndarray,
+    pitch: float,
+    axis: int,
+    noise: float | np.ndarray,
+    cut: float,
+    rims: AxisRims | None = None,
 ) -> AxisEdges:
     """Find kinks and jumps in all edges along one axis.
 
@@ -125,6 +141,7 @@ def find_edges(
         axis: 0 (y) or 1 (x).
         noise: slope noise of one pixel, or of every pixel [y, x].
         cut: misfit, in standard deviations, at which an edge has lost three quarters of its weight.
+        rims: along this axis.
 
     Source: own derivation, tests/inverse/test_edges.py.
     """
@@ -132,8 +149,12 @@ def find_edges(
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
     own = noise_of_edges(noise, axis)
     sigma = np.sqrt((NOISE_FLOOR * own) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
-    misfit = trapezoid_gap(height, slope, pitch, axis) / sigma
-    return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2)
+    gap, is_rim = np.zeros_like(sigma), np.zeros(sigma.shape, bool)
+    if rims is not None:
+        gap, is_rim = rims.gap, rims.outline > 0
+        sigma = np.where(is_rim, np.hypot(NOISE_FLOOR * own, rims.sigma), sigma)
+    misfit = (trapezoid_gap(height, slope, pitch, axis) - gap) / sigma
+    return AxisEdges(gap, sigma, cauchy_weight(misfit, cut) ** 2, is_rim)
 
 
 def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float | np.ndarray, axis: int) -> np.ndarray:

@@ -27,6 +27,7 @@ from helio_jax.forward.surface import Surface, surface_of_heights
 from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, short_fit, without_noise_bias
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -34,7 +35,7 @@ from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.inverse.measured_steps import labelled, level_anchors, measured_regions, walls_of
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.parameters import Parameters
-from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo, with_backtracking
+from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square, squares

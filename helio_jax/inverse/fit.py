@@ -17,6 +17,7 @@ from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
@@ -25,7 +26,8 @@ from helio_jax.inverse.parameters import Parameters, smooth_albedo
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
-from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence
+from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence, edge_scale, surface_of
+from helio_jax.inverse.rims import find_rims
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
@@ -144,7 +146,7 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
     edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
     planes = part.priors.tilt * part.position
-    unfitted = _incidence_error(part, unknowns, fixed)
+    unfitted = _unfitted(part, there, unknowns, fixed)
     return LinearisedFit(linearise(unknowns, fixed), error, edge_error, planes, part, there, stride, unfitted)
 
 
@@ -153,6 +155,34 @@ def inflated(posterior: Posterior, state: FitState) -> Posterior:
     for names, min_ratio in INFLATING:
         posterior = posterior.inflated(state.parameters, names, min_ratio)
     return posterior
+
+
+def _unfitted(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
+    """Compute the change of the residuals of data and edges by uncertain numbers that are not fitted."""
+    of_data, of_edges = _incidence_error(problem, unknowns, fixed), _rim_errors(problem, state, unknowns, fixed)
+    if of_edges is None:
+        return of_data
+    of_edges = np.concatenate([np.zeros((problem.signal.size, of_edges.shape[1])), of_edges])
+    if of_data is None:
+        return of_edges
+    rest = np.zeros((len(of_edges) - len(of_data), of_data.shape[1]))
+    return np.hstack([np.concatenate([of_data, rest]), of_edges])
+
+
+def _rim_errors(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
+    """Compute what one standard deviation of every rim's steepness does to the edges [edge, outline]."""
+    rims = find_rims(state.surface, problem.pixel_noise)
+    outline = np.concatenate([along.outline.ravel() for along in rims])
+    if not outline.any():
+        return None
+    with jax.enable_x64(True):
+        scale = float(_edge_scale(*jax.tree.map(jnp.asarray, (unknowns, fixed))))
+    weight = scale * np.concatenate([np.ravel(w) for w in (fixed.edges.inverse_std_x, fixed.edges.inverse_std_y)])
+    change = -weight * np.concatenate([along.common.ravel() for along in rims])
+    return np.where(outline[:, None] == np.unique(outline[outline > 0]), change[:, None], 0.0)
+
+
+_edge_scale = compiled(lambda unknowns, fixed: edge_scale(surface_of(unknowns, fixed), unknowns.parameters, fixed))
 
 
 def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
@@ -222,7 +252,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     """
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
-    last_change = np.zeros(start.height.shape)
+    reached, last_change = None, np.zeros(start.height.shape)
     extrapolation = 1.0
     is_interrupted = False
     said = "start"
@@ -232,7 +262,8 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         try:
             if report:
                 report(number, s.max_rounds, said)
-            state = update_corrections(problem, state, predict)
+            state = _updated(problem, state, reached, predict)
+            reached = state.surface
             occluded = _occlusion_edges(problem, state) if number == n_fixed else None
             stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
             for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
@@ -262,6 +293,15 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         status=f"{status_of(changes, s.tolerance_um, is_interrupted)}; {found.status}",
         is_interrupted=is_interrupted,
     )
+
+
+def _updated(problem: FitProblem, state: FitState, reached: Surface | None, predict: Predict) -> FitState:
+    """Predict corrections at a state, or at one nearer to the surface that an iteration `reached` before it."""
+
+    def at(surface: Surface) -> FitState:
+        return update_corrections(problem, replace(state, surface=surface), predict)
+
+    return at(state.surface) if reached is None else with_backtracking(at, state.surface, reached)[0]
 
 
 def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:

@@ -5,10 +5,6 @@ are not known well, what they do to the signal becomes relief: about the measure
 solution with an albedo of its own in every pixel (`albedo_search`) is a start, too.
 """
 
-from collections.abc import Callable
-from typing import Any
-
-import jax
 import numpy as np
 
 from helio_jax.errors import PredictionError
@@ -16,15 +12,13 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.linear import PhotometricSolution, signal_of, solve_known_albedo
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict, linearised_in_normal, prediction_std
 from helio_jax.micrograph import MicrographStack
-
-MAX_BACKTRACKS = 3
-"""How often a starting surface is smoothed when masks and multiple scattering cannot be predicted for it."""
 
 
 def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
@@ -40,16 +34,6 @@ def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normal
     weight = np.ones(stack.shape[1:])
     height = integrate_slopes(a, b, raster.dx, raster.dy, "weighted", weight)
     return Surface(limited(level(height, settings, weight), optics), a, b)
-
-
-def with_backtracking(work: Callable[[Surface], Any], surface: Surface, smoothed: Surface) -> tuple[Any, Surface]:
-    """Run `work` on a surface; on PredictionError, halve the step towards a smoothed surface (`MAX_BACKTRACKS`)."""
-    for _ in range(MAX_BACKTRACKS):
-        try:
-            return work(surface), surface
-        except PredictionError:
-            surface = jax.tree.map(lambda rough, smooth: 0.5 * (rough + smooth), surface, smoothed)
-    return work(surface), surface
 
 
 def start_of_known_albedo(

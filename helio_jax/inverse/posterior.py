@@ -340,7 +340,7 @@ def sample_posterior(
         edge_error: what is assumed of the edges between pixels.
         sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
             instrument [3 * pixel + parameter, sum].
-        unfitted: change of the residuals of the data by one standard deviation of each number that is uncertain but not
+        unfitted: change of the first residuals by one standard deviation of each number that is uncertain but not
             fitted [residual, number]: a fit that takes it as stated answers to its error as to noise.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; numbers that are not fitted: Schmidt,

@@ -136,6 +136,7 @@ class Edges(eqx.Module):
         joined_x, joined_y: weight that is left to the edge, 1 joined, 0 a depth jump.
         inverse_std_x, inverse_std_y: factor from an edge's misfit to standard deviations, robustly weighted.
         smooth_x, smooth_y: weight of the fourth-order term of the slopes of every pixel [y, x].
+        gap_x, gap_y: expected misfits of the edges (`rims`).
     """
 
     joined_x: Any
@@ -144,6 +145,8 @@ class Edges(eqx.Module):
     inverse_std_y: Any
     smooth_x: Any
     smooth_y: Any
+    gap_x: Any
+    gap_y: Any
 
 
 class FixedTerms(eqx.Module):
@@ -345,7 +348,7 @@ def edge_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) 
     scale, e = edge_scale(surface, parameters, fixed), fixed.edges
     gap_x = trapezoid_gap(surface.height, fourth_order_slopes(surface.slope_x, e.smooth_x, 1), fixed.dx, 1)
     gap_y = trapezoid_gap(surface.height, fourth_order_slopes(surface.slope_y, e.smooth_y, 0), fixed.dy, 0)
-    return gap_x * e.inverse_std_x * scale, gap_y * e.inverse_std_y * scale
+    return (gap_x - e.gap_x) * e.inverse_std_x * scale, (gap_y - e.gap_y) * e.inverse_std_y * scale
 
 
 def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> jax.Array:

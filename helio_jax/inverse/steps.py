@@ -32,6 +32,7 @@ from helio_jax.inverse.residuals import (
     surface_of,
 )
 from helio_jax.inverse.responses import plane_changes
+from helio_jax.inverse.rims import find_rims
 from helio_jax.inverse.solver import CommonHeights, Solution, solve, whitened_parameters
 from helio_jax.inverse.state import FitState, Held
 from helio_jax.robust import cauchy_weight
@@ -96,9 +97,10 @@ def edges_of(
     problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[AxisEdges, AxisEdges]:
     """Find the edges of a surface along x and along y; those at walls or `occluded` count as depth jumps."""
+    rims_x, rims_y = find_rims(surface, problem.pixel_noise)
     found = (
-        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut),
-        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.pixel_noise, cut),
+        find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut, rims_x),
+        find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.pixel_noise, cut, rims_y),
     )
     for cuts in (problem.walls, occluded):
         if cuts is not None:
@@ -185,8 +187,10 @@ def freeze(
         along_y.joined,
         along_x.weight * strictness,
         along_y.weight * strictness,
-        smoothness_weight(along_x.joined, slope_x, problem.pixel_noise, 1),
-        smoothness_weight(along_y.joined, slope_y, problem.pixel_noise, 0),
+        smoothness_weight(along_x.smooth, slope_x, problem.pixel_noise, 1),
+        smoothness_weight(along_y.smooth, slope_y, problem.pixel_noise, 0),
+        along_x.gap,
+        along_y.gap,
     )
     free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))

@@ -10,9 +10,9 @@ from scipy.ndimage import gaussian_filter
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
 from helio_jax.inverse.measured_steps import measured_regions
-from helio_jax.inverse.photometric_start import with_backtracking
 from helio_jax.inverse.step_records import Patch
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
