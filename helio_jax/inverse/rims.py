@@ -23,6 +23,8 @@ N_DISTANCES = 24
 """Distances of the first pixel from the rim, equally likely, over which is averaged."""
 LEVEL = 0.25, 0.8
 """Largest slopes of the second and of the first pixel outside, over that of the first within."""
+LEVEL_STD = 2.5
+"""Largest median slope of the second pixels outside an outline, in standard deviations: rough surfaces have no rims."""
 LEAST_SLOPE = 4.0
 """Least slope of the first pixel within, in standard deviations."""
 WALL = 0.25
@@ -132,11 +134,12 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
         within[y, x] = True
     outlines, n_outlines = label(binary_dilation(within, np.ones((3, 3))), np.ones((3, 3)))  # type: ignore[misc]  # SciPy's stubs
     of = {way: outlines[y, x] for way, (y, x, *_) in found.items()}
-    beside = {way: rises(*known) for way, (_, _, *known, _) in found.items() if len(of[way])}
+    beside = {way: rises(*known) for way, (_, _, *known, _, _) in found.items() if len(of[way])}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
     for number in range(1, n_outlines + 1):
         mine = {way: np.flatnonzero(of[way] == number) for way in beside}
-        if (n := sum(map(len, mine.values()))) < LEAST_EDGES:
+        outside = np.concatenate([found[way][-1][i] for way, i in mine.items()])
+        if (n := len(outside)) < LEAST_EDGES or np.median(outside) > LEVEL_STD:
             continue
         evidence = np.sum([beside[way].evidence[:, i].sum(1) for way, i in mine.items()], axis=0)
         evidence = evidence * min(1.0, N_INDEPENDENT / n)
@@ -144,7 +147,7 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
             continue
         share = softmax(evidence)
         for (axis, sign), i in mine.items():
-            y, x, first, second, *_, outer = (a[i] for a in found[axis, sign])
+            y, x, first, second, _, _, outer, _ = (a[i] for a in found[axis, sign])
             b, level = beside[axis, sign], np.zeros((len(OFFSETS), len(i)))
             parts = (
                 (-1, 0.5 * outer, level, level + outer**2 / 12.0),
@@ -164,7 +167,8 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
 
     Returns:
         Their rows and columns; slopes of the first and the second pixel within, rising away from the rim, and their
-        standard deviations; that of the first pixel outside.
+        standard deviations; that of the first pixel outside; the size of that of the second pixel outside, in standard
+        deviations.
     """
     way = (slice(None), slice(None, None, sign)) if axis == 1 else (slice(None, None, sign), slice(None))
     turned = (lambda a: a[way]) if axis == 1 else (lambda a: a[way].T)
@@ -176,6 +180,6 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     is_rim &= (further > WALL * size) & (further < size + RISING * np.hypot(e[:, first], e[:, second]))
     row, column = np.nonzero(is_rim)
     at, after = (row, column + 2), (row, column + 3)
-    values = s[at], s[after], e[at], e[after], s[row, column + 1]
+    values = s[at], s[after], e[at], e[after], s[row, column + 1], (t / e)[row, column]
     along = column + 2 if sign > 0 else s.shape[1] - 1 - (column + 2)
     return (row, along, *values) if axis == 1 else (along, row, *values)
