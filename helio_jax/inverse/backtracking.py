@@ -8,7 +8,7 @@ import jax
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 
-MAX_BACKTRACKS = 3
+MAX_BACKTRACKS = 4
 """How often a surface is smoothed when masks and multiple scattering cannot be predicted for it."""
 
 

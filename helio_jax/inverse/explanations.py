@@ -120,7 +120,7 @@ def explain(
         if best.fit.is_interrupted:
             break
         try:
-            residuals = fits.residuals(best.fit) if residuals is None else residuals
+            residuals = fits.residuals_of_first(best.fit) if residuals is None else residuals
             right = fits.right_chi_square(residuals)
             contradicted = fits.contradicted(residuals, right)
             share = contradicted.mean()
@@ -242,6 +242,17 @@ class _Fits:
     def residuals(self, fit: Fit) -> np.ndarray:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
+
+    def residuals_of_first(self, fit: Fit) -> np.ndarray:
+        """Compute those of a first fit; as the fit itself had them where its surface cannot be traced.
+
+        Such a fit has found nothing that could be real: other explanations are tried all the more.
+        """
+        try:
+            return self.residuals(fit)
+        except PredictionError as e:
+            self.say(f"the first fit cannot be tested by tracing: {e}")
+            return fit.residuals
 
     def right_chi_square(self, residuals: np.ndarray) -> float:
         """Compute the chi-square of a right fit from the residuals of the best one so far [detector, y, x]."""

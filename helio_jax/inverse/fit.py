@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.errors import PredictionError
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
@@ -252,7 +253,8 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     """
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
-    reached, last_change = None, np.zeros(start.height.shape)
+    reached: FitState | None = None
+    last_change = np.zeros(start.height.shape)
     extrapolation = 1.0
     is_interrupted = False
     said = "start"
@@ -262,8 +264,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         try:
             if report:
                 report(number, s.max_rounds, said)
-            state = _updated(problem, state, reached, predict)
-            reached = state.surface
+            state = reached = _updated(problem, state, reached, predict)
             occluded = _occlusion_edges(problem, state) if number == n_fixed else None
             stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
             for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
@@ -273,6 +274,11 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             if not changes:
                 raise
             state, is_interrupted = replace(state, surface=before.surface), True
+            break
+        except PredictionError:
+            if reached is None:
+                raise
+            state = with_residuals(problem, reached)  # as far as the data can be predicted; it has not converged
             break
         change_before, last_change = last_change, state.surface.height - before.surface.height
         changes.append(float(np.sqrt(np.mean(last_change**2))))
@@ -295,13 +301,19 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     )
 
 
-def _updated(problem: FitProblem, state: FitState, reached: Surface | None, predict: Predict) -> FitState:
+def _updated(problem: FitProblem, state: FitState, reached: FitState | None, predict: Predict) -> FitState:
     """Predict corrections at a state, or at one nearer to the surface that an iteration `reached` before it."""
 
     def at(surface: Surface) -> FitState:
         return update_corrections(problem, replace(state, surface=surface), predict)
 
-    return at(state.surface) if reached is None else with_backtracking(at, state.surface, reached)[0]
+    return at(state.surface) if reached is None else with_backtracking(at, state.surface, reached.surface)[0]
+
+
+def with_residuals(problem: FitProblem, state: FitState) -> FitState:
+    """Compute the residuals of a state anew, its corrections held."""
+    residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
+    return replace(state, residuals=residuals)
 
 
 def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
@@ -335,10 +347,9 @@ def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:
     """
     problem = fit.problem
     state = replace(state, surface=problem.within_neighbours(state.surface))
-    residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
-    weight = cauchy_weight(residuals, problem.settings.robust_limits[-1])
-    state = replace(state, residuals=residuals)
-    return replace(fit, **_shown(problem, state), residuals=residuals, weight=weight, posterior=posterior)
+    state = with_residuals(problem, state)
+    weight = cauchy_weight(state.residuals, problem.settings.robust_limits[-1])
+    return replace(fit, **_shown(problem, state), residuals=state.residuals, weight=weight, posterior=posterior)
 
 
 def _shown(problem: FitProblem, state: FitState) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 Half balls, ellipsoids and caps rise in the edge that holds their rim by more than the trapezoid rule says: the slope at
 a distance t from the rim is c / sqrt(t + r), r = 0 where the tangent at the rim is vertical, r = infinity where the
 slope is constant (a cone, a wall). Where in its edge a rim lies, and how steep the rim itself is, follows to some
-extent from the slopes of the first two pixels within; what is left open of r is common to a whole outline. The first
-pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
+extent from the slopes of the first two pixels within; what they do not tell of r is common to a whole outline.
+
+The first pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, label
@@ -117,6 +118,31 @@ def rises(first: np.ndarray, second: np.ndarray, first_std: np.ndarray, second_s
     return RimEdges(*(np.array(part) for part in zip(*per_offset, strict=True)))
 
 
+class _Candidates(NamedTuple):
+    """First pixels within rims, seen along an axis in one direction; slopes rise away from the rim [candidate].
+
+    Attributes:
+        y, x: rows and columns.
+        first, second: slopes of the first and the second pixel within.
+        first_std, second_std: their standard deviations.
+        outer: slope of the first pixel outside.
+        beyond: size of the slope of the second pixel outside, in standard deviations.
+    """
+
+    y: np.ndarray
+    x: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    first_std: np.ndarray
+    second_std: np.ndarray
+    outer: np.ndarray
+    beyond: np.ndarray
+
+    def rises(self) -> RimEdges:
+        """Compute the rises beside them."""
+        return rises(self.first, self.second, self.first_std, self.second_std)
+
+
 def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, AxisRims]:
     """Find the rims of a surface in its edges along x and along y.
 
@@ -129,47 +155,41 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
     std = np.broadcast_to(noise * (1.0 + steep**2), steep.shape)
     ways = [(axis, sign) for axis in (1, 0) for sign in (1, -1)]
     found = {way: _candidates(slopes[1 - way[0]], steep, std, *way) for way in ways}
-    within = np.zeros(steep.shape, bool)
-    for y, x, *_ in found.values():
-        within[y, x] = True
-    outlines, n_outlines = label(binary_dilation(within, np.ones((3, 3))), np.ones((3, 3)))  # type: ignore[misc]  # SciPy's stubs
-    of = {way: outlines[y, x] for way, (y, x, *_) in found.items()}
-    beside = {way: rises(*known) for way, (_, _, *known, _, _) in found.items() if len(of[way])}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
+    within = np.zeros(steep.shape, bool)
+    for c in found.values():
+        within[c.y, c.x] = True
+    eight = np.ones((3, 3))
+    outlines, n_outlines = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
+    beside = {way: c.rises() for way, c in found.items()}
     for number in range(1, n_outlines + 1):
-        mine = {way: np.flatnonzero(of[way] == number) for way in beside}
-        outside = np.concatenate([found[way][-1][i] for way, i in mine.items()])
-        if (n := len(outside)) < LEAST_EDGES or np.median(outside) > LEVEL_STD:
+        mine = {way: np.flatnonzero(outlines[c.y, c.x] == number) for way, c in found.items()}
+        beyond = np.concatenate([found[way].beyond[i] for way, i in mine.items()])
+        if len(beyond) < LEAST_EDGES or np.median(beyond) > LEVEL_STD:
             continue
         evidence = np.sum([beside[way].evidence[:, i].sum(1) for way, i in mine.items()], axis=0)
-        evidence = evidence * min(1.0, N_INDEPENDENT / n)
+        evidence = evidence * min(1.0, N_INDEPENDENT / len(beyond))
         if np.max(evidence) - evidence[-1] < DECISIVE:
             continue
         share = softmax(evidence)
         for (axis, sign), i in mine.items():
-            y, x, first, second, _, _, outer, _ = (a[i] for a in found[axis, sign])
-            b, level = beside[axis, sign], np.zeros((len(OFFSETS), len(i)))
+            c, b = _Candidates(*(a[i] for a in found[axis, sign])), beside[axis, sign]
+            level = np.zeros((len(OFFSETS), len(i)))
             parts = (
-                (-1, 0.5 * outer, level, level + outer**2 / 12.0),
-                (0, 0.5 * (outer + first), b.rise[:, i], b.variance[:, i]),
-                (1, 0.5 * (first + second), b.next_rise[:, i], b.next_variance[:, i]),
+                (-1, c.outer, level, level + c.outer**2 / 12.0),
+                (0, c.outer + c.first, b.rise[:, i], b.variance[:, i]),
+                (1, c.first + c.second, b.next_rise[:, i], b.next_variance[:, i]),
             )
-            for step, trapezoid, rise, variance in parts:
+            for step, sum_of_ends, rise, variance in parts:
                 # edges are numbered by their first pixel along the axis
                 move = step - 1 if sign > 0 else -step
-                place = (y + move * (axis == 0), x + move * (axis == 1))
-                out[axis].fill(place, number, sign, trapezoid, share, rise, variance)
+                place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
+                out[axis].fill(place, number, sign, 0.5 * sum_of_ends, share, rise, variance)
     return out[1], out[0]
 
 
-def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> tuple[np.ndarray, ...]:
-    """Find the first pixels within rims, seen along an axis in one direction.
-
-    Returns:
-        Their rows and columns; slopes of the first and the second pixel within, rising away from the rim, and their
-        standard deviations; that of the first pixel outside; the size of that of the second pixel outside, in standard
-        deviations.
-    """
+def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> _Candidates:
+    """Find the first pixels within rims along an axis (0: y, 1: x), upwards or downwards (`sign`)."""
     way = (slice(None), slice(None, None, sign)) if axis == 1 else (slice(None, None, sign), slice(None))
     turned = (lambda a: a[way]) if axis == 1 else (lambda a: a[way].T)
     s, t, e = sign * turned(slope), turned(steep), turned(std)
@@ -180,6 +200,6 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     is_rim &= (further > WALL * size) & (further < size + RISING * np.hypot(e[:, first], e[:, second]))
     row, column = np.nonzero(is_rim)
     at, after = (row, column + 2), (row, column + 3)
-    values = s[at], s[after], e[at], e[after], s[row, column + 1], (t / e)[row, column]
     along = column + 2 if sign > 0 else s.shape[1] - 1 - (column + 2)
-    return (row, along, *values) if axis == 1 else (along, row, *values)
+    place = (row, along) if axis == 1 else (along, row)
+    return _Candidates(*place, s[at], s[after], e[at], e[after], s[row, column + 1], (t / e)[row, column])

@@ -205,7 +205,7 @@ def test_a_measured_height_is_taken():
 
 
 def test_a_start_too_rough_to_predict_is_smoothed():
-    """Half-way to the smoothed surface as often as needed, three times at most; then the error is the caller's."""
+    """Half-way to the smoothed surface as often as needed, four times at most; then the error is the caller's."""
 
     def work(surface, limit):
         if surface.height.max() > limit:
@@ -216,7 +216,7 @@ def test_a_start_too_rough_to_predict_is_smoothed():
     found, surface = with_backtracking(lambda surface: work(surface, 4.0), rough, smooth)
     assert found == surface.height.max() == 3.0
     with pytest.raises(PredictionError):
-        with_backtracking(lambda surface: work(surface, 1.5), rough, smooth)
+        with_backtracking(lambda surface: work(surface, 1.2), rough, smooth)
 
 
 @pytest.mark.slow
