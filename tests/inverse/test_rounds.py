@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helio_jax.arrays import border_mask
+from helio_jax.errors import PredictionError
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
@@ -145,6 +146,36 @@ def test_a_level_that_is_free_comes_to_rest(bshem):
     refine = {"max_rounds": 4, "rays": 100_000, "bias_pairs": 0, "samples": 0}
     rec = pipeline.reconstruct(one, "refine", border="free", refine=refine)
     assert rec.provenance["height_changes_um"][-1] < 3.0
+
+
+@pytest.mark.parametrize(("limit", "is_reached"), [(85.0, True), (41.5, False)])
+def test_a_fit_whose_surface_cannot_be_traced_goes_on(bshem, limit, is_reached):
+    """From a bump at 40 %, nothing can be predicted above a limit: the fit goes there, or stays, and says so.
+
+    The first solve raises the bump to its 100 um. A sixteenth of the way from 40 um there is at 43 um: where 41.5 um is the
+    limit, the last surface that could be predicted is kept. Catches an error in place of a result.
+    """
+    surface, _ = bump()
+    start = Surface(0.4 * surface.height, 0.4 * surface.slope_x, 0.4 * surface.slope_y)
+    signal = np.asarray(signal_of(bshem, surface))
+    variance = (0.01 * signal.mean()) ** 2 * np.ones_like(signal)
+    settings = ReconstructSettings(refine=RefineSettings(samples=0, bias_pairs=0, max_rounds=2))
+    problem = FitProblem.of(signal, variance, bshem, Raster.regular(SHAPE, PITCH), start, settings)
+    seen = []
+
+    def predict(height, normals, **known):
+        seen.append(float(height.max()))
+        if seen[-1] > limit:
+            raise PredictionError("too rough")
+        return nothing_more(height, normals)
+
+    fit = fit_heights(problem, start, predict)
+    assert "stopped" in fit.status
+    assert (len(seen) > 2) and seen[0] == pytest.approx(40.0, abs=1.0) and seen[1] > 90.0
+    assert (seen[-1] < limit) == is_reached
+    assert np.isfinite(fit.residuals).all()
+    if not is_reached:
+        assert fit.surface.height.max() == pytest.approx(seen[0])
 
 
 def nothing_more(height, normals, *instrument, **albedo):
