@@ -152,7 +152,7 @@ def test_a_level_that_is_free_comes_to_rest(bshem):
 def test_a_fit_whose_surface_cannot_be_traced_goes_on(bshem, limit, is_reached):
     """From a bump at 40 %, nothing can be predicted above a limit: the fit goes there, or stays, and says so.
 
-    The first solve raises the bump to its 100 um. A sixteenth of the way from 40 um there is at 43 um: where 41.5 um is the
+    The first solve raises the bump to its 100 um. A sixteenth of the way from 40 um is at 43 um: where 41.5 um is the
     limit, the last surface that could be predicted is kept. Catches an error in place of a result.
     """
     surface, _ = bump()
