@@ -113,16 +113,21 @@ class DwellInformation:
             seconds: dwell times.
             edge_factor: by which edges between pixels weigh more, scalar or [edge], from `edge_factor`.
         """
-        linear, n_edges = self.at.linear, self.at.edge_error.run.size
+        linear = self.at.linear
+        heavier = self.heavier(seconds, edge_factor)
         factor = np.ones(len(linear.instrument))
-        factor[: seconds.size] = np.sqrt(self.information(seconds)[0]).ravel()
-        factor[seconds.size : seconds.size + n_edges] = edge_factor
+        factor[: heavier.size] = heavier
         return replace(
             linear,
             surface=sparse.csr_matrix(sparse.diags_array(factor) @ linear.surface),
             instrument=factor[:, None] * linear.instrument,
             common=factor[:, None] * linear.common,
         )
+
+    def heavier(self, seconds: np.ndarray, edge_factor: np.ndarray | float) -> np.ndarray:
+        """Compute by how much more the residuals of the data, then of the edges, weigh [residual]; as `linear_at`."""
+        of_edges = np.broadcast_to(edge_factor, self.at.edge_error.run.size)
+        return np.concatenate([np.sqrt(self.information(seconds)[0]).ravel(), of_edges])
 
     def noise_ratio(self, seconds: np.ndarray) -> np.ndarray:
         """Compute how much less noise every pixel has than so far, by all of its images [y, x]; 1 without such."""
@@ -155,12 +160,13 @@ class DwellInformation:
         error bars are inflated alike.
         """
         t = self.thinned(seconds)
-        linear = self.linear_at(t, self.edge_factor(t))
+        edge_factor = self.edge_factor(t)
+        linear = self.linear_at(t, edge_factor)
         share = np.where(self.is_observed, self.model * t / (self.counting + self.model * t), 0.0)
         error = replace(self.at.error, share=share)
-        # of heavier data the same error is more standard deviations
-        heavier = np.sqrt(self.information(t)[0]).reshape(-1, 1)
-        unfitted = None if self.at.unfitted is None else heavier * self.at.unfitted
+        unfitted = self.at.unfitted
+        if unfitted is not None:  # of heavier data the same error is more standard deviations
+            unfitted = self.heavier(t, edge_factor)[: len(unfitted), None] * unfitted
         found = sample_posterior(linear, n_samples, error=error, edge_error=self.at.edge_error, unfitted=unfitted)
         return inflated(found.levelled(self.at.planes), self.state).on_raster(self.shape, self.at.stride)
 
