@@ -52,7 +52,9 @@ def has_converged(changes: Sequence[float], tolerance: float) -> bool:
     return changes[-1] < tolerance
 
 
-def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool = False) -> str:
+def status_of(
+    changes: Sequence[float], tolerance: float, is_interrupted: bool = False, is_traceable: bool = True
+) -> str:
     """Describe how a fit ended, in a sentence.
 
     A last change above the one before is noise unless it also exceeds half of the largest one: then the fit diverges.
@@ -61,10 +63,14 @@ def status_of(changes: Sequence[float], tolerance: float, is_interrupted: bool =
         changes: of the heights in every iteration, um.
         tolerance: below which the fit has converged, um.
         is_interrupted: whether the user stopped it.
+        is_traceable: whether the surface of the last iteration could be traced; if not, the one before is the result.
     """
     last = f"the last of {len(changes)} iterations changed the heights by {changes[-1]:.2f} um (limit {tolerance:g} um)"
     if is_interrupted:
         return f"interrupted: best so far; {last}"
+    if not is_traceable:
+        rough = "to a surface too rough or steep to be traced, which is not kept"
+        return f"stopped: {last}, {rough}; check background and gains"
     if has_converged(changes, tolerance):
         return f"converged: {last}"
     if len(changes) > 1 and changes[-1] > max(changes[-2], 0.5 * max(changes)):

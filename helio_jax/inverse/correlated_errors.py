@@ -89,6 +89,7 @@ class EdgeError:
         """Find the runs of edges at kinks of a surface; edges as from `edges.find_edges`."""
         shares, runs, n_runs = [], [], 0
         for edges, slope, axis in ((along_x, surface.slope_x, 1), (along_y, surface.slope_y, 0)):
+            # at rims sigma may be below that of a kink
             share = np.minimum(kink_size(slope, axis) ** 2 / 12.0 / edges.sigma**2, 1.0)
             beside = np.zeros((3, 3), int)
             beside[:, 1] = 1

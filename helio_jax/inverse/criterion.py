@@ -3,7 +3,8 @@
 The same model as `hx.fisher`: residuals, priors, edges and errors that agree between neighbours are those of the fit,
 linearised at an assumed surface, the instrument marginalised. There the standard deviations are sampled on the host;
 here they come from the dense information matrix, so that they are exact, and their gradient by reverse mode moves
-apertures to where the heights are known best. For rasters up to about 31 x 31 with a flat border.
+apertures to where the heights are known best. Rims of domes (`rims`) count as kinks here. For rasters up to about
+31 x 31 with a flat border.
 
 What stays as in the optics that a case was posed with: which edges are at one kink, the raster, the surface. Which
 sample is the horizon of a masked point is constant under differentiation (`forward/masking.py`).

@@ -114,9 +114,8 @@ class DwellInformation:
             edge_factor: by which edges between pixels weigh more, scalar or [edge], from `edge_factor`.
         """
         linear = self.at.linear
-        heavier = self.heavier(seconds, edge_factor)
-        factor = np.ones(len(linear.instrument))
-        factor[: heavier.size] = heavier
+        factor, known = np.ones(len(linear.instrument)), self.residual_factor(seconds, edge_factor)
+        factor[: known.size] = known
         return replace(
             linear,
             surface=sparse.csr_matrix(sparse.diags_array(factor) @ linear.surface),
@@ -124,8 +123,8 @@ class DwellInformation:
             common=factor[:, None] * linear.common,
         )
 
-    def heavier(self, seconds: np.ndarray, edge_factor: np.ndarray | float) -> np.ndarray:
-        """Compute by how much more the residuals of the data, then of the edges, weigh [residual]; as `linear_at`."""
+    def residual_factor(self, seconds: np.ndarray, edge_factor: np.ndarray | float) -> np.ndarray:
+        """Compute the factor of the residuals of data, then of edges [residual]; arguments as `linear_at`."""
         of_edges = np.broadcast_to(edge_factor, self.at.edge_error.run.size)
         return np.concatenate([np.sqrt(self.information(seconds)[0]).ravel(), of_edges])
 
@@ -164,9 +163,8 @@ class DwellInformation:
         linear = self.linear_at(t, edge_factor)
         share = np.where(self.is_observed, self.model * t / (self.counting + self.model * t), 0.0)
         error = replace(self.at.error, share=share)
-        unfitted = self.at.unfitted
-        if unfitted is not None:  # of heavier data the same error is more standard deviations
-            unfitted = self.heavier(t, edge_factor)[: len(unfitted), None] * unfitted
+        # of data with smaller standard deviations the same error is more of them
+        unfitted = self.residual_factor(t, edge_factor)[:, None] * self.at.unfitted
         found = sample_posterior(linear, n_samples, error=error, edge_error=self.at.edge_error, unfitted=unfitted)
         return inflated(found.levelled(self.at.planes), self.state).on_raster(self.shape, self.at.stride)
 

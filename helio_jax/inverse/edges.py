@@ -89,21 +89,20 @@ class AxisEdges:
     """The edges along one axis, as the next solve sees them.
 
     Attributes:
-        gap: expected (height change / pitch) - (mean of the two slopes) on an edge without a jump.
-        sigma: its standard deviation.
+        sigma: standard deviation of (height change / pitch) - (mean of the two slopes) on an edge without a jump; the
+            mean of it is `rims.gap`.
         joined: weight that is left to the edge, 1: joined, 0: a depth jump.
-        is_rim: whether the edge is at a rim, or next to it (`rims`).
+        rims: of domes along this axis.
     """
 
-    gap: np.ndarray
     sigma: np.ndarray
     joined: np.ndarray
-    is_rim: np.ndarray
+    rims: AxisRims
 
     @property
     def smooth(self) -> np.ndarray:
-        """Weight left to the edge where the surface may be smooth beyond its ends, too."""
-        return np.where(self.is_rim, 0.0, self.joined)
+        """Weight for `smoothness_weight`: `joined`, and 0 at rims, where slopes are no cubic."""
+        return np.where(self.rims.is_rim, 0.0, self.joined)
 
     @property
     def weight(self) -> np.ndarray:
@@ -141,7 +140,7 @@ def find_edges(
         axis: 0 (y) or 1 (x).
         noise: slope noise of one pixel, or of every pixel [y, x].
         cut: misfit, in standard deviations, at which an edge has lost three quarters of its weight.
-        rims: along this axis.
+        rims: of domes along this axis; default: none.
 
     Source: own derivation, tests/inverse/test_edges.py.
     """
@@ -149,12 +148,10 @@ def find_edges(
     curvature = np.gradient(after - before, axis=axis) if slope.shape[axis] > 2 else np.zeros_like(before)
     own = noise_of_edges(noise, axis)
     sigma = np.sqrt((NOISE_FLOOR * own) ** 2 + kink_size(slope, axis) ** 2 / 12.0 + (curvature / 12.0) ** 2)
-    gap, is_rim = np.zeros_like(sigma), np.zeros(sigma.shape, bool)
-    if rims is not None:
-        gap, is_rim = rims.gap, rims.outline > 0
-        sigma = np.where(is_rim, np.hypot(NOISE_FLOOR * own, rims.sigma), sigma)
-    misfit = (trapezoid_gap(height, slope, pitch, axis) - gap) / sigma
-    return AxisEdges(gap, sigma, cauchy_weight(misfit, cut) ** 2, is_rim)
+    rims = rims or AxisRims.none(sigma.shape)
+    sigma = np.where(rims.is_rim, np.hypot(NOISE_FLOOR * own, rims.sigma), sigma)
+    misfit = (trapezoid_gap(height, slope, pitch, axis) - rims.gap) / sigma
+    return AxisEdges(sigma, cauchy_weight(misfit, cut) ** 2, rims)
 
 
 def smoothness_weight(joined: np.ndarray, slope: np.ndarray, noise: float | np.ndarray, axis: int) -> np.ndarray:

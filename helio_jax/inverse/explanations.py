@@ -244,9 +244,9 @@ class _Fits:
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
 
     def residuals_of_first(self, fit: Fit) -> np.ndarray:
-        """Compute those of a first fit; as the fit itself had them where its surface cannot be traced.
+        """Compute the residuals of a first fit; where its surface cannot be traced, those of its last solve.
 
-        Such a fit has found nothing that could be real: other explanations are tried all the more.
+        Else no other explanation would be tried where the first one is least likely.
         """
         try:
             return self.residuals(fit)

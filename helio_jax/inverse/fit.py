@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import block_diag
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.compiling import compiled
@@ -21,14 +22,14 @@ from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
+from helio_jax.inverse.edges import AxisEdges
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.parameters import Parameters, smooth_albedo
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
-from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence, edge_scale, surface_of
-from helio_jax.inverse.rims import find_rims
+from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
@@ -122,7 +123,8 @@ class LinearisedFit(NamedTuple):
         planes: heights of the substrate for one prior standard deviation of each tilt [2, y, x], um.
         problem, state: on the thinned raster.
         stride: thinning.
-        unfitted: change of the residuals by numbers that are uncertain and not fitted (`sample_posterior`).
+        unfitted: change of the residuals of data and edges by numbers that are uncertain and not fitted
+            (`sample_posterior`) [residual, number].
     """
 
     linear: Linearised
@@ -132,7 +134,7 @@ class LinearisedFit(NamedTuple):
     problem: FitProblem
     state: FitState
     stride: int
-    unfitted: np.ndarray | None
+    unfitted: np.ndarray
 
 
 def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
@@ -145,10 +147,12 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
     limits = s.robust_limits[-1], s.jump_limits[-1]
     unknowns, fixed = freeze(part, there, *limits, pixels=pixel_terms(problem, state, limits[0]).thinned(stride))
     error = ModelError(model_share(part, there), (length / problem.raster.dy, length / problem.raster.dx), stride)
-    edge_error = EdgeError.of(there.surface, *edges_of(part, there.surface, limits[1]))
+    edges, linear = edges_of(part, there.surface, limits[1]), linearise(unknowns, fixed)
+    edge_error = EdgeError.of(there.surface, *edges)
     planes = part.priors.tilt * part.position
-    unfitted = _unfitted(part, there, unknowns, fixed)
-    return LinearisedFit(linearise(unknowns, fixed), error, edge_error, planes, part, there, stride, unfitted)
+    rim_errors = _rim_errors(edges, fixed, linear.edge_scale)
+    unfitted = np.asarray(block_diag(_incidence_error(part, unknowns, fixed), rim_errors))
+    return LinearisedFit(linear, error, edge_error, planes, part, there, stride, unfitted)
 
 
 def inflated(posterior: Posterior, state: FitState) -> Posterior:
@@ -158,39 +162,19 @@ def inflated(posterior: Posterior, state: FitState) -> Posterior:
     return posterior
 
 
-def _unfitted(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
-    """Compute the change of the residuals of data and edges by uncertain numbers that are not fitted."""
-    of_data, of_edges = _incidence_error(problem, unknowns, fixed), _rim_errors(problem, state, unknowns, fixed)
-    if of_edges is None:
-        return of_data
-    of_edges = np.concatenate([np.zeros((problem.signal.size, of_edges.shape[1])), of_edges])
-    if of_data is None:
-        return of_edges
-    rest = np.zeros((len(of_edges) - len(of_data), of_data.shape[1]))
-    return np.hstack([np.concatenate([of_data, rest]), of_edges])
-
-
-def _rim_errors(problem: FitProblem, state: FitState, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
-    """Compute what one standard deviation of every rim's steepness does to the edges [edge, outline]."""
-    rims = find_rims(state.surface, problem.pixel_noise)
-    outline = np.concatenate([along.outline.ravel() for along in rims])
-    if not outline.any():
-        return None
-    with jax.enable_x64(True):
-        scale = float(_edge_scale(*jax.tree.map(jnp.asarray, (unknowns, fixed))))
-    weight = scale * np.concatenate([np.ravel(w) for w in (fixed.edges.inverse_std_x, fixed.edges.inverse_std_y)])
-    change = -weight * np.concatenate([along.common.ravel() for along in rims])
+def _rim_errors(edges: tuple[AxisEdges, AxisEdges], fixed: FixedTerms, scale: float) -> np.ndarray:
+    """Compute what one standard deviation of the steepness of every rim does to the edges [edge, outline]."""
+    outline, common = (np.concatenate([getattr(e.rims, n).ravel() for e in edges]) for n in ("outline", "common"))
+    inverse_std = np.concatenate([np.ravel(w) for w in (fixed.edges.inverse_std_x, fixed.edges.inverse_std_y)])
+    change = -scale * inverse_std * common
     return np.where(outline[:, None] == np.unique(outline[outline > 0]), change[:, None], 0.0)
 
 
-_edge_scale = compiled(lambda unknowns, fixed: edge_scale(surface_of(unknowns, fixed), unknowns.parameters, fixed))
-
-
-def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray | None:
-    """Compute what one standard deviation of the incidence, which is not fitted, does to the data [residual, 1]."""
+def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms) -> np.ndarray:
+    """Compute what one standard deviation of the incidence does to the data [residual, 1], [residual, 0] if known."""
     std = problem.geometry.incidence_std
     if not std or problem.optics.beam_shifts is not None:
-        return None
+        return np.zeros((problem.signal.size, 0))
     with jax.enable_x64(True):
         return std * np.asarray(_data_by_incidence(*jax.tree.map(jnp.asarray, (unknowns, fixed)))).reshape(-1, 1)
 
@@ -241,7 +225,8 @@ def after_one_solve(problem: FitProblem, state: FitState) -> np.ndarray:
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
-    Interrupted from the keyboard after the first iteration, it returns the best so far.
+    Interrupted from the keyboard after the first iteration, it returns the best so far. Where a solve ends in a surface
+    that cannot be traced, the step is halved; where that does not help, the surface before it is kept.
 
     Args:
         problem: data, instrument, priors.
@@ -256,7 +241,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     reached: FitState | None = None
     last_change = np.zeros(start.height.shape)
     extrapolation = 1.0
-    is_interrupted = False
+    is_interrupted, is_traceable = False, True
     said = "start"
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
     for number in range(s.max_rounds):
@@ -264,7 +249,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         try:
             if report:
                 report(number, s.max_rounds, said)
-            state = reached = _updated(problem, state, reached, predict)
+            state = before = reached = _updated(problem, state, reached, predict)
             occluded = _occlusion_edges(problem, state) if number == n_fixed else None
             stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
             for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
@@ -278,7 +263,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         except PredictionError:
             if reached is None:
                 raise
-            state = with_residuals(problem, reached)  # as far as the data can be predicted; it has not converged
+            state, is_traceable = with_residuals(problem, reached), False
             break
         change_before, last_change = last_change, state.surface.height - before.surface.height
         changes.append(float(np.sqrt(np.mean(last_change**2))))
@@ -296,7 +281,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         posterior=None,
         changes=tuple(changes),
         contraction=contraction_of(changes),
-        status=f"{status_of(changes, s.tolerance_um, is_interrupted)}; {found.status}",
+        status=f"{status_of(changes, s.tolerance_um, is_interrupted, is_traceable)}; {found.status}",
         is_interrupted=is_interrupted,
     )
 

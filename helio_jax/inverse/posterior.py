@@ -59,6 +59,7 @@ class Linearised:
         weights: derivative of those with respect to the surface [3 * pixel, common].
         names: of the instrument parameters.
         shape: of the raster (y, x).
+        edge_scale: factor of the edges' weights (`residuals.edge_scale`).
     """
 
     surface: sparse.csr_matrix
@@ -67,6 +68,7 @@ class Linearised:
     weights: np.ndarray
     names: tuple[str, ...]
     shape: tuple[int, int]
+    edge_scale: float = 1.0
 
     def transposed(self, residuals: np.ndarray) -> np.ndarray:
         """Return the surface's whole derivative, transposed, times residuals [residual, ...]."""
@@ -315,7 +317,7 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     common[n_rows : n_rows + n_anchors, n_modes:-1], of_surface[::3, n_modes:-1] = np.eye(n_anchors), anchors.T
     by_height = np.concatenate([part.ravel() for part in raised])
     common[n_data : n_data + by_height.size, -1], of_surface[::3, -1] = by_height, 1.0 / pixel.size
-    return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape)
+    return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape, float(scale))
 
 
 def sample_posterior(
@@ -340,8 +342,9 @@ def sample_posterior(
         edge_error: what is assumed of the edges between pixels.
         sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
             instrument [3 * pixel + parameter, sum].
-        unfitted: change of the first residuals by one standard deviation of each number that is uncertain but not
-            fitted [residual, number]: a fit that takes it as stated answers to its error as to noise.
+        unfitted: change of the residuals of the data, and of the edges if it has so many rows, by one standard
+            deviation of each number that is uncertain but not fitted [residual, number]: a fit that takes it as stated
+            answers to its error as to noise.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; numbers that are not fitted: Schmidt,
         Adv. Control Syst. 3 (1966) 293 (consider analysis); samples: Bardsley, Solonen, Haario and

@@ -45,7 +45,7 @@ class AxisRims:
     """The edges along one axis at and beside rims.
 
     Attributes:
-        gap: by how much the mean slope of the edge should exceed that of its two ends [edge].
+        gap: by how much (height change / pitch) should exceed the mean of the two slopes [edge].
         sigma: standard deviation of it; 0: no rim [edge].
         common: change of it by one standard deviation of what is common to its outline [edge].
         outline: number of the outline; 0: no rim [edge].
@@ -61,12 +61,28 @@ class AxisRims:
         """Make edges without rims."""
         return cls(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape, int))
 
-    def fill(self, place: Any, number: int, sign: int, trapezoid: Any, share: Any, rise: Any, variance: Any) -> None:
-        """Set the edges at a place of an outline, whose rises [offset, edge] are right with a probability [offset]."""
-        mean = share @ rise
-        between = np.sqrt(share @ (rise - mean) ** 2)
+    @property
+    def is_rim(self) -> np.ndarray:
+        """Whether the edge is at a rim, or next to one [edge]."""
+        return self.outline > 0
+
+    def fill(
+        self, place: Any, number: int, sign: int, trapezoid: Any, probability: Any, rise: Any, variance: Any
+    ) -> None:
+        """Set the edges of an outline at a place, seen along the axis in the direction `sign`.
+
+        Args:
+            place: index of the edges.
+            number: of the outline.
+            sign: 1 or -1.
+            trapezoid: mean slope of their two ends [edge].
+            probability: of each of `OFFSETS` [offset].
+            rise, variance: of the edges where that offset is right [offset, edge].
+        """
+        mean = probability @ rise
+        between = np.sqrt(probability @ (rise - mean) ** 2)
         self.gap[place] = sign * (mean - trapezoid)
-        self.sigma[place] = np.sqrt(share @ variance + between**2)
+        self.sigma[place] = np.sqrt(probability @ variance + between**2)
         self.common[place] = sign * between
         self.outline[place] = number
 
@@ -138,9 +154,9 @@ class _Candidates(NamedTuple):
     outer: np.ndarray
     beyond: np.ndarray
 
-    def rises(self) -> RimEdges:
-        """Compute the rises beside them."""
-        return rises(self.first, self.second, self.first_std, self.second_std)
+    def only(self, which: np.ndarray) -> "_Candidates":
+        """Keep some of them [candidate]."""
+        return _Candidates(*(values[which] for values in self))
 
 
 def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, AxisRims]:
@@ -161,30 +177,29 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
         within[c.y, c.x] = True
     eight = np.ones((3, 3))
     outlines, n_outlines = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
-    beside = {way: c.rises() for way, c in found.items()}
     for number in range(1, n_outlines + 1):
-        mine = {way: np.flatnonzero(outlines[c.y, c.x] == number) for way, c in found.items()}
-        beyond = np.concatenate([found[way].beyond[i] for way, i in mine.items()])
+        mine = {way: c.only(outlines[c.y, c.x] == number) for way, c in found.items()}
+        beyond = np.concatenate([c.beyond for c in mine.values()])
         if len(beyond) < LEAST_EDGES or np.median(beyond) > LEVEL_STD:
             continue
-        evidence = np.sum([beside[way].evidence[:, i].sum(1) for way, i in mine.items()], axis=0)
+        beside = {way: rises(c.first, c.second, c.first_std, c.second_std) for way, c in mine.items()}
+        evidence = np.sum([b.evidence.sum(1) for b in beside.values()], axis=0)
         evidence = evidence * min(1.0, N_INDEPENDENT / len(beyond))
         if np.max(evidence) - evidence[-1] < DECISIVE:
             continue
-        share = softmax(evidence)
-        for (axis, sign), i in mine.items():
-            c, b = _Candidates(*(a[i] for a in found[axis, sign])), beside[axis, sign]
-            level = np.zeros((len(OFFSETS), len(i)))
+        probability = softmax(evidence)
+        for (axis, sign), c in mine.items():
+            b, level = beside[axis, sign], np.zeros((len(OFFSETS), len(c.y)))
             parts = (
                 (-1, c.outer, level, level + c.outer**2 / 12.0),
-                (0, c.outer + c.first, b.rise[:, i], b.variance[:, i]),
-                (1, c.first + c.second, b.next_rise[:, i], b.next_variance[:, i]),
+                (0, c.outer + c.first, b.rise, b.variance),
+                (1, c.first + c.second, b.next_rise, b.next_variance),
             )
             for step, sum_of_ends, rise, variance in parts:
                 # edges are numbered by their first pixel along the axis
                 move = step - 1 if sign > 0 else -step
                 place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
-                out[axis].fill(place, number, sign, 0.5 * sum_of_ends, share, rise, variance)
+                out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
     return out[1], out[0]
 
 

@@ -189,8 +189,8 @@ def freeze(
         along_y.weight * strictness,
         smoothness_weight(along_x.smooth, slope_x, problem.pixel_noise, 1),
         smoothness_weight(along_y.smooth, slope_y, problem.pixel_noise, 0),
-        along_x.gap,
-        along_y.gap,
+        along_x.rims.gap,
+        along_y.rims.gap,
     )
     free = noise * steepness(slope_x, slope_y)
     scale_x, scale_y = (_slope_scale(e, axis, free) for e, axis in ((along_x, 1), (along_y, 0)))

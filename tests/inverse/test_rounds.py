@@ -153,13 +153,14 @@ def test_a_fit_whose_surface_cannot_be_traced_goes_on(bshem, limit, is_reached):
     """From a bump at 40 %, nothing can be predicted above a limit: the fit goes there, or stays, and says so.
 
     The first solve raises the bump to its 100 um. A sixteenth of the way from 40 um is at 43 um: where 41.5 um is the
-    limit, the last surface that could be predicted is kept. Catches an error in place of a result.
+    limit, the last surface that could be predicted is kept. Catches an error in place of a result, and a change that is
+    counted from the surface that could not be predicted: the solve returns there, and the fit would have converged.
     """
     surface, _ = bump()
     start = Surface(0.4 * surface.height, 0.4 * surface.slope_x, 0.4 * surface.slope_y)
     signal = np.asarray(signal_of(bshem, surface))
     variance = (0.01 * signal.mean()) ** 2 * np.ones_like(signal)
-    settings = ReconstructSettings(refine=RefineSettings(samples=0, bias_pairs=0, max_rounds=2))
+    settings = ReconstructSettings(refine=RefineSettings(samples=0, bias_pairs=0, max_rounds=4))
     problem = FitProblem.of(signal, variance, bshem, Raster.regular(SHAPE, PITCH), start, settings)
     seen = []
 
@@ -174,7 +175,10 @@ def test_a_fit_whose_surface_cannot_be_traced_goes_on(bshem, limit, is_reached):
     assert (len(seen) > 2) and seen[0] == pytest.approx(40.0, abs=1.0) and seen[1] > 90.0
     assert (seen[-1] < limit) == is_reached
     assert np.isfinite(fit.residuals).all()
-    if not is_reached:
+    assert ("not kept" in fit.status) == (not is_reached)
+    if is_reached:  # half of the way is gone a second time
+        assert fit.changes[1] == pytest.approx(0.5 * fit.changes[0], rel=0.2)
+    else:
         assert fit.surface.height.max() == pytest.approx(seen[0])
 
 
