@@ -134,6 +134,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   dash_steps          such steps as records
   shadow_steps        steps that face away from the beam, by the glow beside them
   step_records        records of steps, bands and patches
+  step_parts          heights of steps along long edges, part by part
   measured_steps      what measured steps are for a fit: walls between pixels, known levels and differences of heights
   parameters          unknowns of the fit that are not the surface, their priors, what they stand for
   law_prior           what is unknown of the scattering law; its test against the cosine law

@@ -21,6 +21,9 @@ map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
 MAX_CONTRADICTED = 0.05
 """Largest share of contradicted pixels, among those that nothing else makes invalid, of a height map that its data do
 not contradict as a whole."""
+MAX_CONTRADICTED_REGION = 0.1
+"""Largest share of contradicted pixels of a region that depth jumps part from the rest and that the data do not
+contradict as a whole: what is fitted of it, its level included, leans on all of its data."""
 
 MEANINGS = {
     "valid": "",
@@ -39,7 +42,8 @@ MEANINGS = {
     ),
     "contradicts the data": (
         "micrographs traced on the map deviate from the data of the 3 x 3 pixels by a mean square above "
-        f"{CHI_SQUARE_LIMIT:g} standard deviations (times the median where instrument or calibration are uncertain)"
+        f"{CHI_SQUARE_LIMIT:g} standard deviations (times the median where instrument or calibration are uncertain), "
+        f"or from those of more than {MAX_CONTRADICTED_REGION:.0%} of the region that depth jumps part from the rest"
     ),
 }
 """What each reason means, in words."""

@@ -145,7 +145,8 @@ class _Known(NamedTuple):
         anchors = anchors_of(stated, problem.raster, problem.optics, surface, detectors)
         names = [(anchor_name(i, one), one.kind) for i, one in enumerate(stated)]
         region = regions(fit.joined_x, fit.joined_y)
-        levels = problem.anchors.within_one(region)
+        is_free = problem.reconstruct_settings.border == "free"  # there, a fit is held at steps, not at levels
+        levels = (Anchors.none(region.shape) if is_free else problem.anchors).within_one(region)
         if steps is not None:
             numbers, measured = anchors_of_steps(steps, surface, problem.raster, region)
             # beside walls, multiple scattering disturbs heights the most: a mean over a whole level is the better sum

@@ -73,6 +73,14 @@ class Anchors:
         """Join with others."""
         return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))
 
+    def differences(self) -> "Anchors":
+        """Anchor how each differs from the mean of all, and leave that open: weights of sum 1 above, -1 below."""
+        if not len(self.value):
+            return self
+        std = 1.0 / np.sum(self.weight, (1, 2), where=self.weight > 0.0)
+        weight, value = std[:, None, None] * self.weight, std * self.value
+        return Anchors((weight - weight.mean(0)) / std[:, None, None], (value - value.mean()) / std)
+
     def taken(self, which: Sequence[bool] | np.ndarray) -> "Anchors":
         """Take some of them."""
         is_taken = np.asarray(which, bool)

@@ -32,16 +32,17 @@ from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, sho
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
-from helio_jax.inverse.measured_steps import labelled, level_anchors, measured_regions, walls_of
+from helio_jax.inverse.measured_steps import anchors_of_steps, labelled, level_anchors, measured_regions, walls_of
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.quality import half_chi_square, squares
+from helio_jax.inverse.quality import contradicted_regions, half_chi_square, regions, squares
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.shadow_steps import find_shadow_step
 from helio_jax.inverse.state import FitState, Predict
+from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
@@ -126,7 +127,8 @@ def explain(
             share = contradicted.mean()
             # pits and patches are areas; an object that is too low is contradicted at its rim
             extent = share if other == fits.from_objects else share_of_areas(contradicted)
-            is_contradicted = extent >= MIN_CONTRADICTED
+            may_be_pits = other == fits.from_pits and has_contradicted_hollow(contradicted, best.fit)
+            is_contradicted = extent >= MIN_CONTRADICTED or may_be_pits
             may_be_patches = other == fits.from_albedo_patches and fits.is_strained(best.fit)
             if not is_contradicted and not may_be_patches:
                 continue
@@ -180,6 +182,25 @@ class _Fits:
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
         """Edges between pixels that cross a wall."""
         return walls_of(self.steps, Raster.of(self.stack))
+
+    def anchors_at(self, surface: Surface, labels: np.ndarray, regions: list[Region]) -> Anchors:
+        """Anchor the mean levels of regions where the border is flat; else the heights of walls, part by part.
+
+        A surface with a free border bends between the means of its levels.
+
+        Args:
+            surface: with the regions at their levels.
+            labels: number of every pixel's region, from 1 [y, x].
+            regions: in their order.
+        """
+        if self.settings.border == "flat" or self.steps is None:
+            return level_anchors(labels, regions, surface)
+        about = surface, Raster.of(self.stack), labels
+        _, anchors = anchors_of_steps(self.steps, *about)
+        for parts in steps_in_parts(self.steps, self.stack):
+            _, found = anchors_of_steps(parts, *about)
+            anchors = anchors.and_also(found.differences())
+        return anchors
 
     @cached_property
     def predict(self) -> Predict:
@@ -290,7 +311,8 @@ class _Fits:
         With a free border, gains and offsets have much the same effect as tilt and relief: what the model lacks moved
         gains of a right instrument by several per cent, and tilted the heights with them. They are then held as stated;
         only where free ones improve one solve by `GAIN` they are fitted, too, and kept if that fit comes to rest
-        (`AT_REST`) and improves on the other by it. The error bars include them in either case.
+        (`AT_REST`) and improves on the other by it, what is known of the instrument included. The error bars include
+        them in either case.
         """
         problem = self.pose(surface, *known)
         if self.settings.border == "flat" or problem.is_instrument_unknown:
@@ -312,7 +334,8 @@ class _Fits:
                 self.say("free gains and offsets are given up: that fit did not come to rest")
                 return fit
             free = self._unbiased(free)
-            return free if improvement(self.residuals(fit), self.residuals(free)) > GAIN else fit
+            gained = improvement(self.residuals(fit), self.residuals(free))
+            return free if gained + relief_of_strain(fit.parameters, free.parameters) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")
             return fit
@@ -372,9 +395,9 @@ class _Fits:
         """Fit from the photometric solution, with regions at the levels of steps, measured or in the beam's shadow."""
         start, smoothed = self.start(patches) if patches.objects else self.plain_start
         shape = self.stack.shape[1:]
-        labels, is_undecided, anchors = np.zeros(shape, int), np.zeros(shape, bool), None
-        if steps := measured_regions(self.steps) or self.shadowed:
-            raster = Raster.of(self.stack)
+        labels, is_undecided, anchors, n_steps = np.zeros(shape, int), np.zeros(shape, bool), None, 0
+        raster = Raster.of(self.stack)
+        if steps := measured_regions(self.steps, raster) or self.shadowed:
             found = search_levels(
                 steps,
                 start,
@@ -389,11 +412,12 @@ class _Fits:
             start, is_undecided = found.surface, covered(steps, found.undecided)
             if moved := [steps[i] for i in found.moved]:
                 labels = labelled(moved)
-                anchors = level_anchors(labels, moved, start)
+                anchors = self.anchors_at(start, labels, moved)
                 # masks on the raster, whose edges lie on pixels, would pull measured levels off
-                labels[covered(steps, [i for i in found.moved if steps[i].height is not None])] = 0
+                measured = [i for i in found.moved if steps[i].height is not None]
+                labels[covered(steps, measured)], n_steps = 0, len(measured)
         fit = self.fitted(start, smoothed, patches, labels, anchors)
-        return Explanation(fit, is_undecided, n_steps=0 if anchors is None else len(anchors.value))
+        return Explanation(fit, is_undecided, n_steps=n_steps)
 
     def from_heights(self, height: np.ndarray, patches: AlbedoPatches) -> Explanation:
         """Fit from given heights, whose levels are taken to be right [y, x], um."""
@@ -475,6 +499,13 @@ class _Fits:
 def share_of_areas(is_contradicted: np.ndarray) -> float:
     """Compute the share of the pixels that are contradicted [y, x] and in an area that is not `NARROW`."""
     return float(binary_opening(is_contradicted, np.ones((NARROW, NARROW))).mean())
+
+
+def has_contradicted_hollow(is_contradicted: np.ndarray, fit: Fit) -> bool:
+    """Whether data contradict [y, x] a region below the largest one, from which depth jumps part it."""
+    region, height = regions(fit.joined_x, fit.joined_y), fit.surface.height
+    is_below = height < np.median(height[region == 0])
+    return bool((contradicted_regions(is_contradicted, region) & is_below).any())
 
 
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:

@@ -126,12 +126,14 @@ class Region:
         height: measured height above the substrate, um; None: not known.
         std: standard deviation of that, um.
         step: measured height above the surface around the region, um; None: not known.
+        skirt: pixels around it that a fit without the jump may have raised: as far as its masks reach.
     """
 
     inside: np.ndarray
     height: float | None = None
     std: float = 0.0
     step: float | None = None
+    skirt: int = SKIRT
 
     def heights(self, surroundings: float, pitch: tuple[float, float], max_width: float) -> list[float]:
         """Choose the heights to be tried, um; arguments as in `search_levels`."""
@@ -228,7 +230,7 @@ def search_levels(
 
     A fit that bridged jumps raised the surroundings, and their masks and multiple scattering let it stay so: the foot
     of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions of measured levels are also tried
-    on a flat substrate, where there may be one.
+    on a flat substrate: at height 0, or with a free border on the plane of the slopes around.
 
     Args:
         regions: one after the other; they may overlap.
@@ -238,20 +240,22 @@ def search_levels(
         misfit, short_fit: see `Misfit`, `ShortFit`.
         beam_shift: `Instrument.beam_shift`: where it is not 0, levels are tried with and without the wall it sees.
         report: called with what is tried next.
-        is_substrate_flat: whether regions of measured levels are also tried on a flat substrate at height 0.
+        is_substrate_flat: whether the substrate is flat at height 0, not any plane.
     """
     best, found = short_fit(surface)
     moved, undecided = [], []
     for i, region in enumerate(regions):
         inside = region.inside
         done = covered(regions, moved) & ~inside
-        base, name = without_skirt(inside, done, found), f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
+        base, name = without_skirt(region, done, found), f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
         search = _RegionSearch(name, region, base, pitch, max_width, beam_shift, misfit, report)
         trials = search.search()
         if region.step is not None:
+            plane, kept = plane_around(region, done, surface, pitch), done
             if is_substrate_flat:
-                flat = jax.tree.map(lambda f, kept=done | inside: np.where(kept, f, 0.0), found)
-                trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
+                plane, kept = Surface(*np.zeros((3, *inside.shape))), done | inside
+            flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
+            trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
             trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
         explanations = [(best, found), *(short_fit(trial) for _, trial in trials)]
         value, better = min(explanations, key=lambda entry: entry[0])
@@ -278,20 +282,36 @@ def covered(regions: Sequence[Region], numbers: Iterable[int]) -> np.ndarray:
     return np.any([np.zeros_like(regions[0].inside), *(regions[i].inside for i in numbers)], axis=0)
 
 
-def without_skirt(inside: np.ndarray, others: np.ndarray, surface: Surface) -> Surface:
+def without_skirt(region: Region, others: np.ndarray, surface: Surface) -> Surface:
     """Continue the surroundings up to a region: a fit that bridged a jump raised the pixels beside it.
 
     Args:
-        inside: the region [y, x].
+        region: that jumps part from its surroundings.
         others: pixels that stay as they are [y, x].
         surface: to begin with.
     """
-    skirt = grown(inside, SKIRT) & ~inside & ~others
-    is_known = ~(grown(inside, SKIRT) | others)
+    reached = grown(region.inside, region.skirt)
+    skirt, is_known = reached & ~region.inside & ~others, ~(reached | others)
     if not is_known.any():
         return surface
     nearest = nearest_known(is_known)
     return jax.tree.map(lambda f: np.where(skirt, f[nearest], f), surface)
+
+
+def plane_around(region: Region, others: np.ndarray, surface: Surface, pitch: tuple[float, float]) -> Surface:
+    """Make the plane of the median slopes beyond the skirt of a region, through its median height there.
+
+    Slopes of a photometric solution are right beyond a jump that it has bridged, where its heights are not. Arguments
+    as those of `without_skirt`.
+    """
+    is_known = ~(grown(region.inside, region.skirt) | others)
+    if not is_known.any():
+        return surface
+    slopes = [float(np.median(slope[is_known])) for slope in (surface.slope_x, surface.slope_y)]
+    y, x = (step * index for step, index in zip(pitch, np.indices(is_known.shape, float), strict=True))
+    tilt = slopes[0] * x + slopes[1] * y
+    level = np.median((surface.height - tilt)[is_known])
+    return Surface(level + tilt, *(np.full(tilt.shape, slope) for slope in slopes))
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:

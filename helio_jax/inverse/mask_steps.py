@@ -52,7 +52,7 @@ _SPLIT = 0.2
 
 
 @dataclass(frozen=True)
-class _Scan:
+class Scan:
     """A stack as the steps below see it."""
 
     images: Images
@@ -78,15 +78,8 @@ def spot_std(stack: MicrographStack) -> float:
     return math.hypot(size, 0.5 * beam.pinhole_radius_um)
 
 
-def find_steps(stack: MicrographStack) -> Steps:
-    """Find the steps of a surface in its micrographs and measure their heights.
-
-    Args:
-        stack: micrographs of a raster, simulated or measured, of an instrument with apertures in a flat plate.
-
-    Raises:
-        SceneError: the images are no raster or of several beams, or the plate is a mesh.
-    """
+def scan_of(stack: MicrographStack) -> tuple[Scan, SignalLevels]:
+    """Prepare a stack for the measurement of steps; arguments and errors as `find_steps`."""
     n_detectors, ny, nx = stack.shape
     if stack.instrument.has_several_beams:
         raise SceneError("steps are measured in scans of one beam, got several: measure them in each scan by itself")
@@ -104,9 +97,22 @@ def find_steps(stack: MicrographStack) -> Steps:
     images = Images(
         signal, np.maximum(variance, least), place, levels.lit, levels.floor, levels.floor_std, side, spot_std(stack)
     )
-    scan = _Scan(images, openings, stack, np.array(stack.instrument.beam_shift))
+    return Scan(images, openings, stack, np.array(stack.instrument.beam_shift)), levels
+
+
+def find_steps(stack: MicrographStack) -> Steps:
+    """Find the steps of a surface in its micrographs and measure their heights.
+
+    Args:
+        stack: micrographs of a raster, simulated or measured, of an instrument with apertures in a flat plate.
+
+    Raises:
+        SceneError: the images are no raster or of several beams, or the plate is a mesh.
+    """
+    scan, levels = scan_of(stack)
+    images, side = scan.images, scan.images.side
     edges = _laid(_found(scan, levels), scan)
-    tried = ((edge, _measure(0, edge, scan, 0.0)) for edge in edges)
+    tried = ((edge, measure_edge(0, edge, scan, 0.0)) for edge in edges)
     shown = [(edge, m) for edge, m in tried if m.bands]
     low = _low(scan, [m for _, m in shown])
     shown = [(edge, m) for edge, m in shown if m.step.is_used or not any(is_on(m.edge, o.edge, side) for o in low)]
@@ -119,12 +125,12 @@ def find_steps(stack: MicrographStack) -> Steps:
     heights = [result.patches[s.below].level_um - ground for s in result.steps[:n]]
     moved = [z if math.isfinite(z) else 0.0 for z in heights]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
-        again = [_measure(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
+        again = [measure_edge(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
         result = _joined([*again, *measured[n:]], patch, scan, levels)
     return result
 
 
-def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
+def _found(scan: Scan, levels: SignalLevels) -> list[Edge]:
     """Find the edges at which bands begin, over all detectors and in each alone.
 
     A band narrower than a pixel shows steps of the raster, whose normals turn those of another detector's points.
@@ -143,7 +149,7 @@ def _found(scan: _Scan, levels: SignalLevels) -> list[Edge]:
     return [*together, *(edge for one in alone for edge in straight_edges(*one, side))]
 
 
-def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
+def _laid(edges: list[Edge], scan: Scan) -> list[tuple[Edge, float]]:
     """Lay the edges between the pixels, and drop those that lie on a longer one."""
     openings = scan.seen_from(0.0)
     v, out = scan.directions(openings), []
@@ -163,7 +169,7 @@ def _laid(edges: list[Edge], scan: _Scan) -> list[tuple[Edge, float]]:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class MeasuredEdge:
     """An edge with its combined height and its bands; `jump`: a rough height, for finding the patches [um]."""
 
     edge: Edge
@@ -171,22 +177,22 @@ class _Measured:
     bands: tuple[BandRow, ...]
     jump: float
 
-    def numbered(self, number: int) -> "_Measured":
+    def numbered(self, number: int) -> "MeasuredEdge":
         """Return the edge with another number."""
         bands = tuple(replace(band, step=number) for band in self.bands)
         return replace(self, step=replace(self.step, number=number), bands=bands)
 
 
-def _low(scan: _Scan, measured: list[_Measured]) -> list[_Measured]:
+def _low(scan: Scan, measured: list[MeasuredEdge]) -> list[MeasuredEdge]:
     """Find the steps that dashes show, apart from those whose bands are measured."""
     used = [m for m in measured if m.step.is_used]
     names, explained = scan.stack.instrument.detector_names, _explained(used, scan)
     found = find_low_steps(scan.images, scan.seen_from(0.0), scan.beam_shift, names, explained)
-    low = (_Measured(edge, step, bands, step.height_um) for edge, step, bands in found)
+    low = (MeasuredEdge(edge, step, bands, step.height_um) for edge, step, bands in found)
     return [m for m in low if not any(is_on(u.edge, m.edge, scan.images.side) for u in used)]
 
 
-def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -> _Measured:
+def measure_edge(number: int, edge: tuple[Edge, float], scan: Scan, level: float) -> MeasuredEdge:
     """Measure the bands at an edge and combine them.
 
     Args:
@@ -219,7 +225,7 @@ def _measure(number: int, edge: tuple[Edge, float], scan: _Scan, level: float) -
             used.append(band)
     step = _combined(number, line, rows, used, place_std)
     rough = max((band.height for band in bands.values() if band.kind == "dark"), default=0.0)
-    return _Measured(line, step, tuple(rows), step.height_um if step.is_used else rough)
+    return MeasuredEdge(line, step, tuple(rows), step.height_um if step.is_used else rough)
 
 
 def _differ(a: BandRow, b: BandRow) -> bool:
@@ -227,7 +233,7 @@ def _differ(a: BandRow, b: BandRow) -> bool:
     return abs(a.height_um - b.height_um) > 4.0 * math.hypot(a.height_std_um, b.height_std_um)
 
 
-def _bands(line: Edge, scan: _Scan, signals: list[WallSignal], v: np.ndarray) -> dict[int, Band]:
+def _bands(line: Edge, scan: Scan, signals: list[WallSignal], v: np.ndarray) -> dict[int, Band]:
     """Fit the bands of all detectors at an edge, masks first: the image of a wall is searched near their height."""
     images, shift = scan.images, scan.beam_shift
     dark = [k for k, s in enumerate(signals) if kind_of(s) == "dark"]
@@ -327,7 +333,7 @@ def _combined(number: int, edge: Edge, rows: list[BandRow], used: list[Band], pl
     )
 
 
-def _patches(measured: list[_Measured], images: Images, levels: SignalLevels) -> np.ndarray:
+def _patches(measured: list[MeasuredEdge], images: Images, levels: SignalLevels) -> np.ndarray:
     """Find the patches between the steps [y, x]."""
     walls = [m for m in measured if m.step.is_used or (m.step.p_wall > CERTAIN_WALL and m.jump > 0.0)]
     heights = np.array([m.jump for m in walls])
@@ -336,7 +342,7 @@ def _patches(measured: list[_Measured], images: Images, levels: SignalLevels) ->
     return with_outlines_moved(patch, images.signal, images.variance, images.lit)
 
 
-def _explained(measured: list[_Measured], scan: _Scan) -> np.ndarray:
+def _explained(measured: list[MeasuredEdge], scan: Scan) -> np.ndarray:
     """Return the pixels within the bands of the steps, and two pixels beside them [detector, y, x]."""
     images, names = scan.images, scan.stack.instrument.detector_names
     v = scan.directions(scan.seen_from(0.0))
@@ -360,7 +366,7 @@ def _border_shares(patch: np.ndarray) -> np.ndarray:
     return np.bincount(ring, minlength=int(patch.max()) + 1) / ring.size
 
 
-def _joined(measured: list[_Measured], patch: np.ndarray, scan: _Scan, levels: SignalLevels) -> Steps:
+def _joined(measured: list[MeasuredEdge], patch: np.ndarray, scan: Scan, levels: SignalLevels) -> Steps:
     """Solve for the levels of the patches."""
     images = scan.images
     steps = []

@@ -135,7 +135,7 @@ def _edge(step: Step) -> Edge:
     return Edge(np.array(step.start), np.array(step.end), ())
 
 
-def measured_regions(found: Steps | None) -> list[Region]:
+def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
     """List the patches between measured steps, the largest first.
 
     A measured level is tried above the patch around it: a surface with a free border may bend so far that the
@@ -152,8 +152,17 @@ def measured_regions(found: Steps | None) -> list[Region]:
         beside = found.patch[grown(inside, SKIRT) & ~inside]
         around = by_number[_most_frequent(beside)]
         step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
-        out.append(Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside))
+        reach = _reach(found, p.number, raster)
+        region = Region(inside, p.level_um, p.level_std_um, step, reach) if p.is_determined else None
+        out.append(region or Region(inside, skirt=reach))
     return out
+
+
+def _reach(found: Steps, patch: int, raster: Raster) -> int:
+    """Find how many pixels the longest mask band beside a patch reaches; `SKIRT` at least."""
+    steps = {step.number for step in found.steps if patch in (step.above, step.below)}
+    longest = max((b.length_um for b in found.bands if b.step in steps and b.kind == "dark"), default=0.0)
+    return max(SKIRT, math.ceil(longest / min(raster.dx, raster.dy)))
 
 
 def level_anchors(labels: np.ndarray, regions: list[Region], surface: Surface) -> Anchors:

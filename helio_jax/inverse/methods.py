@@ -7,7 +7,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -92,11 +92,11 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result, misfit_of, anchors = _refined(stack, settings, make_predict, report, start)
+        result, misfit_of, anchors, region = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)
         if not trace:
             return result
-        tested, misfit = _tested(stack, partial(misfit_of, trace), result)
+        tested, misfit = _tested(stack, partial(misfit_of, trace), result, region)
         return with_path_error(tested, misfit, stack, settings, anchors) if misfit else tested
 
     predict = make_predict and make_predict(settings.refine.start_paths(stack.counts[0].size))
@@ -113,12 +113,12 @@ def reconstruct_stack(
 
 
 def _tested(
-    stack: MicrographStack, misfit_of: Callable[[], Misfit], rec: Reconstruction
+    stack: MicrographStack, misfit_of: Callable[[], Misfit], rec: Reconstruction, region: np.ndarray | None = None
 ) -> tuple[Reconstruction, Misfit | None]:
     """Return a height map with the verdict of its data, and its misfit unless it cannot be traced."""
     _check_finite(rec)
     misfit = cache(misfit_of)
-    tested = judged(rec, stack, lambda: misfit().residuals)
+    tested = judged(rec, stack, lambda: misfit().residuals, region)
     return tested, None if tested.chi_square is None else misfit()
 
 
@@ -168,10 +168,24 @@ def sensitivity(fit: "Fit", settings: ReconstructSettings) -> dict[str, float]:
     }
 
 
-def _refined(
-    stack, settings, make_predict, report, start
-) -> tuple[Reconstruction, Callable[[Trace], Misfit], "Anchors"]:
-    """Reconstruct by the fit; return what computes its misfit from a trace, and the anchors that it was brought to."""
+class _Refined(NamedTuple):
+    """A height map by the fit.
+
+    Attributes:
+        rec: the map, not tested.
+        misfit_of: computes its misfit from a trace.
+        anchors: that it was brought to.
+        region: that depth jumps part from the rest, from `regions` [y, x].
+    """
+
+    rec: Reconstruction
+    misfit_of: Callable[[Trace], Misfit]
+    anchors: "Anchors"
+    region: np.ndarray
+
+
+def _refined(stack, settings, make_predict, report, start) -> _Refined:
+    """Reconstruct by the fit."""
     from helio_jax.inverse.anchoring import as_records, with_anchors
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.instrument_report import describe_instrument
@@ -184,9 +198,8 @@ def _refined(
     check_places(settings.anchor, Raster.of(stack), Optics.of(stack.instrument), stack.instrument.detector_names)
     found = explain(stack, settings, make_predict, report, start)
     (fit, anchors, used), is_floating = with_anchors(found.fit, found.steps), found.is_undecided
-    posterior, raster = fit.posterior, Raster.of(stack)
+    posterior, raster, region = fit.posterior, Raster.of(stack), regions(fit.joined_x, fit.joined_y)
     if posterior is not None:
-        region = regions(fit.joined_x, fit.joined_y)
         known = used.known_steps(region)
         is_floating |= floating(fit.surface.height, posterior.samples, region, posterior.common_modes, known)
     worst = fit.weight.min(0, where=stack.is_observed, initial=1.0)
@@ -233,4 +246,4 @@ def _refined(
             "anchors": as_records(anchors),
         },
     )
-    return rec, partial(misfit_of_state, fit.problem, fit.state), used
+    return _Refined(rec, partial(misfit_of_state, fit.problem, fit.state), used, region)

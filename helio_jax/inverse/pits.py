@@ -6,7 +6,8 @@ explain. The level of a floor is the one whose masks, wall and multiple scatteri
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.levels import GAIN, at_level, least_between
 from helio_jax.inverse.objects import LEAST_PIXELS, numbered
-from helio_jax.inverse.quality import half_chi_square, squares
+from helio_jax.inverse.quality import squares
 
 LIMIT = 3.0
 """Mean square residual, over detectors, above which a flat floor does not explain a pixel."""
@@ -33,6 +34,10 @@ REFINEMENTS = 6
 """... and how many more around the best ones: a minimum may be narrower than their distance ..."""
 MOST_MINIMA = 2
 """... so that around so many minima more are tried."""
+NEAR = 0.15
+"""The floor around a pit is then brought to the best level within this share of its depth."""
+RIM = 1.0 / 3.0
+"""Pixels of a region nearer to its outline than this share of its largest distance from there are its rim."""
 MOST_OF_BORDER = 0.5
 """Largest share of the border's pixels in a pit."""
 _SQUARE = np.ones((3, 3))
@@ -44,12 +49,43 @@ class Pits(NamedTuple):
     Attributes:
         surface: with floors and the walls that the beam sees.
         number: of every pixel's pit, 0: the substrate [y, x].
-        misfit: of the data expected on it.
+        squares: of the residuals of the data expected on it, limited [detector, y, x].
     """
 
     surface: Surface
     number: np.ndarray
-    misfit: float
+    squares: np.ndarray
+
+    @property
+    def misfit(self) -> float:
+        """Half the chi-square; infinite where nothing can be predicted."""
+        return 0.5 * float(self.squares.sum())
+
+    @property
+    def is_unexplained(self) -> np.ndarray:
+        """Pixels that the pits do not explain [y, x]."""
+        return median_filter(self.squares.mean(0), 3) > LIMIT
+
+
+class _Sunk(NamedTuple):
+    """A region sunk to a level, perhaps with a pit in its floor.
+
+    Attributes:
+        pits: with this one.
+        level: of its floor, um.
+        floor: its flat part, without pits in it [y, x].
+        places: regions that may be pits, with the level of the floor around them: largest first, in deeper pits before.
+    """
+
+    pits: Pits
+    level: float
+    floor: np.ndarray
+    places: list[tuple[np.ndarray, float]]
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether a flat floor explains most of what is seen of it."""
+        return bool(np.mean(self.pits.is_unexplained[self.floor]) <= 1.0 - LEAST_EXPLAINED)
 
 
 @dataclass(frozen=True)
@@ -73,35 +109,31 @@ class PitSearch:
     def find(self, shape: tuple[int, int]) -> Pits | None:
         """Find the pits of an image; None where there is none, or where the search is hopeless."""
         flat = Surface(*np.zeros((3, *shape)))
-        pits = Pits(flat, np.zeros(shape, int), self.misfit(flat))
-        places = [(inside, 0.0) for inside in outlines(self.is_unexplained(flat))]
+        pits = Pits(flat, np.zeros(shape, int), self.squares(flat))
+        places = [(inside, 0.0) for inside in outlines(pits.is_unexplained)]
         for _ in range(MOST_PITS):
             if not places:
                 break
-            inside, above = places.pop(0)
-            deeper, level = self.sunk(pits, inside, above)
-            if deeper.misfit < pits.misfit - GAIN:
-                floor, is_unexplained = floor_of(deeper.surface, inside), self.is_unexplained(deeper.surface)
-                if np.mean(is_unexplained[floor]) <= 1.0 - LEAST_EXPLAINED:
-                    pits = deeper
-                    places = [(within, level) for within in outlines(floor & is_unexplained)] + places
+            found = self.sunk(pits, *places.pop(0))
+            if found is not None:
+                pits, places = found.pits, found.places + places
             if pits.misfit > self.hopeless:
                 return None
         return pits if pits.number.any() else None
 
-    def misfit(self, surface: Surface) -> float:
-        """Half the chi-square of the data expected on a surface; infinite where nothing can be predicted."""
+    def squares(self, surface: Surface) -> np.ndarray:
+        """Compute limited squares of residuals [detector, y, x]; infinite where nothing can be predicted."""
         try:
-            return half_chi_square(self.residuals(surface))
+            return squares(self.residuals(surface))
         except PredictionError:
-            return np.inf
+            return np.full((1, *surface.height.shape), np.inf)
 
-    def is_unexplained(self, surface: Surface) -> np.ndarray:
-        """Mark the pixels that a surface does not explain [y, x]."""
-        return median_filter(squares(self.residuals(surface)).mean(0), 3) > LIMIT
+    def sunk(self, pits: Pits, inside: np.ndarray, above: float) -> _Sunk | None:
+        """Sink a region below the floor around it, and the largest pit in its own floor, where there is one.
 
-    def sunk(self, pits: Pits, inside: np.ndarray, above: float) -> tuple[Pits, float]:
-        """Sink a region below the floor around it, to the level that explains the data best.
+        A floor with a pit in it is explained best by a level between the two, and then the outline of what is not
+        explained is not that of the pit. Along its rim, a floor has its own level, at which the outline of the pit
+        shows.
 
         Args:
             pits: found so far.
@@ -109,28 +141,94 @@ class PitSearch:
             above: height of the floor around it, um.
 
         Returns:
-            The pits, and the level of the region, um; one whose floor the beam does not see is none.
+            None where a flat floor explains no more than no pit does.
         """
-        beam = self.beam_shift if any(self.beam_shift) else None
-        width = 2.0 * float(np.max(np.asarray(distance_transform_edt(np.pad(inside, 1), sampling=self.pitch))))
+        region = _Region(self, pits, inside, above)
+        best = region.sunk(inside)
+        if best.places and best.pits.misfit <= self.hopeless:
+            by_rim = self._deeper(region, region.sunk(region.rim))
+            best = by_rim if by_rim.pits.misfit < best.pits.misfit else self._deeper(region, best)
+        return best if best.pits.misfit < pits.misfit - GAIN and best.is_flat else None
 
-        def trial(depth: float) -> Surface:
-            return at_level(inside, pits.surface, -depth, above, self.pitch, beam)
+    def _deeper(self, region: "_Region", outer: _Sunk) -> _Sunk:
+        """Sink the largest unexplained part of a region's floor, if that is a pit, and bring the floor to its level."""
+        if not outer.places:
+            return outer
+        (inside, _), *others = outer.places
+        inner = _Region(self, outer.pits, inside, outer.level).sunk(inside)
+        if inner.pits.misfit >= outer.pits.misfit - GAIN or not inner.is_flat:
+            return outer._replace(places=others)
+        best = outer._replace(pits=inner.pits, floor=outer.floor & ~inside)
+
+        def misfit(level: float) -> float:
+            """Of both pits, the floor of the outer one at a level."""
+            nonlocal best
+            self.report(f"trying the level {level:.0f} um of the floor around a pit")
+            floor = outer.pits._replace(surface=region.at(region.above - level))
+            surface = _Region(self, floor, inside, level).at(level - inner.level)
+            pits = inner.pits._replace(surface=surface, squares=self.squares(surface))
+            if pits.misfit < best.pits.misfit:
+                best = best._replace(pits=pits, level=level)
+            return pits.misfit
+
+        change = NEAR * (region.above - outer.level)
+        least_between(misfit, outer.level - change, outer.level + change, REFINEMENTS)
+        return best._replace(places=inner.places + [(place, best.level) for place, _ in others])
+
+
+@dataclass(frozen=True)
+class _Region:
+    """A region that may be a pit; arguments as those of `PitSearch.sunk`."""
+
+    search: PitSearch
+    pits: Pits
+    inside: np.ndarray
+    above: float
+    tried: dict[float, np.ndarray] = field(default_factory=dict)
+
+    @cached_property
+    def distance(self) -> np.ndarray:
+        """Distance of every pixel of the region from the outside [y, x], um."""
+        padded = np.asarray(distance_transform_edt(np.pad(self.inside, 1), sampling=self.search.pitch))
+        return padded[1:-1, 1:-1]
+
+    @property
+    def rim(self) -> np.ndarray:
+        """The pixels of the region along its outline [y, x]."""
+        return self.inside & (self.distance <= RIM * self.distance.max())
+
+    def at(self, depth: float) -> Surface:
+        """Make the surface with the region's floor at a depth below the floor around it, um."""
+        beam = self.search.beam_shift if any(self.search.beam_shift) else None
+        return at_level(self.inside, self.pits.surface, -depth, self.above, self.search.pitch, beam)
+
+    def squares(self, depth: float) -> np.ndarray:
+        """Compute the squares of the residuals at a depth; infinite for a pit whose floor the beam does not see."""
+        if depth not in self.tried:
+            search, n_pixels = self.search, self.inside.sum()
+            search.report(f"trying a pit of {n_pixels} pixels, {depth - self.above:.0f} um deep")
+            surface = self.at(depth)
+            is_seen = np.sum(floor_of(surface, self.inside)) >= max(LEAST_PIXELS, LEAST_FLOOR * n_pixels)
+            self.tried[depth] = search.squares(surface) if is_seen else np.full_like(self.pits.squares, np.inf)
+        return self.tried[depth]
+
+    def sunk(self, where: np.ndarray) -> _Sunk:
+        """Sink the region to the depth that explains the data best in some of its pixels [y, x] and around it."""
+        is_weighed = where | ~self.inside
 
         def misfit(depth: float) -> float:
-            self.report(f"trying a pit of {inside.sum()} pixels, {depth - above:.0f} um deep")
-            surface = trial(depth)
-            is_floor_seen = np.sum(floor_of(surface, inside)) >= max(LEAST_PIXELS, LEAST_FLOOR * inside.sum())
-            return self.misfit(surface) if is_floor_seen else np.inf
+            return 0.5 * float(np.sum(self.squares(depth), where=is_weighed))
 
-        depths = [width * share for share in DEPTHS]
+        depths = [2.0 * float(self.distance.max()) * share for share in DEPTHS]
         tried = [misfit(depth) for depth in depths]
         value, depth = min(zip(tried, depths, strict=True))
         for place in minima(tried)[:MOST_MINIMA]:
             low, high = depths[max(place - 1, 0)], depths[min(place + 1, len(depths) - 1)]
             value, depth = min((value, depth), least_between(misfit, low, high, REFINEMENTS))
-        number = np.where(inside, pits.number.max() + 1, pits.number)
-        return Pits(trial(depth), number, value), above - depth
+        number = np.where(self.inside, self.pits.number.max() + 1, self.pits.number)
+        pits, level = Pits(self.at(depth), number, self.squares(depth)), self.above - depth
+        floor = floor_of(pits.surface, self.inside)
+        return _Sunk(pits, level, floor, [(within, level) for within in outlines(floor & pits.is_unexplained)])
 
 
 def outlines(is_unexplained: np.ndarray) -> list[np.ndarray]:

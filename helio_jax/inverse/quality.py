@@ -6,7 +6,7 @@ The limits that make up the rule of `is_valid` are those of `validity`.
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import binary_erosion, uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -14,7 +14,7 @@ from helio_jax.forward.surface import along
 from helio_jax.inverse.edges import ranked, trapezoid_gap
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of
 from helio_jax.micrograph import MicrographStack
-from helio_jax.validity import EXPLAINED, FACET_IMAGES, FLOATING, REASONS
+from helio_jax.validity import EXPLAINED, FACET_IMAGES, FLOATING, MAX_CONTRADICTED_REGION, REASONS
 
 MASK_LIMIT = 0.1
 """A datum darker than this share of the detector's flat signal counts as masked."""
@@ -30,6 +30,8 @@ VEILED = 5.0
 """A datum whose assumed deviation is this many times that of its counts is not informative of a facet."""
 MIN_REGION = 16
 """Smaller regions are part of the jump that surrounds them [pixels]."""
+CORE = 2
+"""Pixels of a region that are nearer to its outline do not tell whether the data contradict it."""
 _FEW, _MASKED, _JUMP, _FLOATING = (REASONS.index(r) for r in (REASONS[1], REASONS[2], REASONS[3], "floating"))
 
 
@@ -102,6 +104,25 @@ def floating(
             known, weight = steps[number]
             is_floating &= float(np.std(np.tensordot(samples, weight, 2))) > FLOATING * known
         flags |= inside & is_floating
+    return flags
+
+
+def contradicted_regions(is_contradicted: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Mark regions that their data contradict as a whole: in more than `MAX_CONTRADICTED_REGION` of their core [y, x].
+
+    Beside a wall the data deviate by where it stands. The core of a region lies `CORE` pixels and more within; one of
+    fewer than `MIN_REGION` pixels tells nothing. The largest region is not tested: it is most of the map.
+
+    Args:
+        is_contradicted: pixels whose data contradict the map [y, x].
+        region: from `regions` [y, x].
+    """
+    flags = np.zeros(region.shape, bool)
+    for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
+        inside = region == number
+        core = np.asarray(binary_erosion(inside, np.ones((3, 3)), iterations=CORE), bool)
+        if core.sum() >= MIN_REGION and np.mean(is_contradicted[core]) > MAX_CONTRADICTED_REGION:
+            flags |= inside
     return flags
 
 

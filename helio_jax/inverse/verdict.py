@@ -21,7 +21,7 @@ from helio_jax.forward.surface import surface_of_heights
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.linear import signal_of
-from helio_jax.inverse.quality import squares
+from helio_jax.inverse.quality import contradicted_regions, squares
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.validity import CHI_SQUARE_LIMIT, REASONS, contradicted_share
@@ -178,16 +178,23 @@ def expected_chi_square(stack: MicrographStack, instrument: Instrument, chi_squa
     return max(1.0, float(np.median(chi_square))) if is_uncertain else 1.0
 
 
-def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], np.ndarray]) -> Reconstruction:
+def judged(
+    rec: Reconstruction,
+    stack: MicrographStack,
+    residuals: Callable[[], np.ndarray],
+    region: np.ndarray | None = None,
+) -> Reconstruction:
     """Return a height map with the verdict of its data: chi-square, reasons, and a sentence in its status.
 
-    Pixels must deviate by more than `CHI_SQUARE_LIMIT` times the chi-square of a right map (`expected_chi_square`).
+    Pixels must deviate by more than `CHI_SQUARE_LIMIT` times the chi-square of a right map (`expected_chi_square`), or
+    belong to a region in which so many do (`contradicted_regions`).
 
     Args:
         rec: the height map.
         stack: its micrographs.
         residuals: computes (model - data) / standard deviation of the traced map [detector, y, x]; a PredictionError
             means that the map cannot be traced, which contradicts the data, too.
+        region: from `regions` [y, x]; None: depth jumps part nothing.
     """
     try:
         found = np.where(stack.is_observed, residuals(), np.nan)
@@ -197,8 +204,10 @@ def judged(rec: Reconstruction, stack: MicrographStack, residuals: Callable[[], 
         return rec.replace(reason=reason, is_valid=reason == 0, status=f"{said}; {rec.status}")
     chi_square = local_chi_square(found, stack.is_observed)
     right = expected_chi_square(stack, rec.instrument, chi_square)
-    is_worse = (rec.reason == 0) & (chi_square > CHI_SQUARE_LIMIT * right)
-    reason = np.where(is_worse, _CONTRADICTED, rec.reason)
+    is_worse = chi_square > CHI_SQUARE_LIMIT * right
+    if region is not None:
+        is_worse |= contradicted_regions(is_worse, region)
+    reason = np.where((rec.reason == 0) & is_worse, _CONTRADICTED, rec.reason)
     names, square = stack.instrument.detector_names, np.where(stack.is_observed, squares(found), 0.0)
     by_detector = square.sum((1, 2)) / np.maximum(stack.is_observed.sum((1, 2)), 1)
     about = {"traced_chi_square": dict(zip(names, by_detector.tolist(), strict=True))}

@@ -9,7 +9,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.correlated_errors import EdgeError
 from helio_jax.inverse.edges import find_edges
 from helio_jax.inverse.explanations import _Fits
-from helio_jax.inverse.pits import LIMIT, PitSearch, floor_of, minima, outlines
+from helio_jax.inverse.pits import LIMIT, Pits, PitSearch, floor_of, minima, outlines
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import EDGE_PLACE, edge_std
 from helio_jax.workflows.corrections import make_predictor
@@ -22,9 +22,9 @@ INNER = (np.abs(X - 27) < 5) & (np.abs(Y - 21) < 4)
 PITCH = 10.0
 
 
-def found(depths, beam_shift=(0.0, 0.0)):
+def found(depths, beam_shift=(0.0, 0.0), inner=INNER):
     """Search pits where each pixel's one residual is its height error over 30 um, beyond 0.9."""
-    truth = -depths[0] * OUTER - (depths[1] - depths[0]) * INNER
+    truth = -depths[0] * OUTER - (depths[1] - depths[0]) * inner
     search = PitSearch(lambda s: (0.9 + np.abs(s.height - truth) / 30.0)[None], (PITCH, PITCH), beam_shift)
     return truth, search.find(SHAPE)
 
@@ -35,6 +35,20 @@ def test_a_pit_in_a_pit_has_two_outlines_and_two_levels():
     assert pits is not None and pits.number.max() >= 2
     assert np.sum((pits.number > 0) != OUTER) <= 4  # corners
     assert np.sum(np.abs(pits.surface.height - truth) > 0.05 * 130.0) <= 8
+
+
+def test_a_large_pit_in_a_pit_has_its_own_outline():
+    """One half of a floor is 80 um deeper: a level between the two explains neither, the rim shows the upper one.
+
+    Both floors to 2 um. Rejects the best level of the whole floor, which leaves no pit at all.
+    """
+    inner = (np.abs(X - 27) < 8) & (np.abs(Y - 21) < 6)
+    assert 0.4 < inner.sum() / OUTER.sum() < 0.6
+    truth, pits = found((80.0, 160.0), inner=inner)
+    assert pits is not None and pits.number.max() == 2
+    assert np.sum((pits.surface.height < -120.0) != inner) <= 4  # corners
+    for inside in (OUTER & ~inner, inner):
+        assert np.median(pits.surface.height[inside]) == pytest.approx(np.median(truth[inside]), abs=2.0)
 
 
 def test_all_minima_of_the_depth_are_looked_into():
@@ -95,8 +109,7 @@ def test_outlines_need_several_pixels():
     wrong = np.zeros((2, *SHAPE))
     wrong[:, 5, 5] = 100.0
     wrong[0, 20:24, 30:35] = 2.0 * np.sqrt(LIMIT)
-    search = PitSearch(lambda _: wrong, (PITCH, PITCH), (0.0, 0.0))
-    regions = outlines(search.is_unexplained(Surface(*np.zeros((3, *SHAPE)))))
+    regions = outlines(Pits(Surface(*np.zeros((3, *SHAPE))), np.zeros(SHAPE, int), wrong**2).is_unexplained)
     assert len(regions) == 1
     rows, columns = np.nonzero(regions[0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (20, 23, 30, 34)

@@ -5,13 +5,14 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from helio_jax.errors import PredictionError
+from helio_jax.forward.optics import Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
-from helio_jax.inverse.levels import GAIN, Region, at_level, search_levels, without_skirt
+from helio_jax.inverse.levels import GAIN, Region, at_level, grown, plane_around, search_levels, without_skirt
 from helio_jax.inverse.measured_steps import measured_regions
 from helio_jax.inverse.step_records import Patch
 from helio_jax.workflows import pipeline
@@ -38,10 +39,58 @@ def test_the_skirt_of_a_region_is_taken_off():
     surface = Surface(blurred(40.0), *np.ones((2, *SHAPE)))
     others = np.zeros(SHAPE, bool)
     others[:, 43:45] = True
-    found = without_skirt(INSIDE, others, surface)
+    found = without_skirt(Region(INSIDE), others, surface)
     assert np.abs(found.height[8:12, 20:35]).max() < 1.0
     for same in (INSIDE, others):
         np.testing.assert_array_equal(found.height[same], surface.height[same])
+
+
+def test_the_skirt_is_as_wide_as_the_masks():
+    """Raised by 30 um up to seven pixels from the region: rejects a skirt of four pixels."""
+    reach = np.asarray(binary_dilation(INSIDE, np.ones((3, 3)), iterations=7)) & ~INSIDE
+    surface = Surface(np.where(INSIDE, 40.0, 30.0 * reach), *np.zeros((2, *SHAPE)))
+    for skirt, raised in ((7, 0.0), (4, 30.0)):
+        found = without_skirt(Region(INSIDE, skirt=skirt), np.zeros(SHAPE, bool), surface)
+        assert found.height[reach].max() == raised
+
+
+def test_the_plane_around_a_region_is_that_of_the_slopes():
+    """Slopes of 0.05 and -0.02 beyond the skirt, heights that bend by 50 um there: the plane has the slopes.
+
+    Through the median of the heights; slopes in the skirt and the region are those of a bridged jump.
+    """
+    y, x = np.indices(SHAPE) * 10.0
+    wrong = np.where(grown(INSIDE, 4), 0.7, 0.0)
+    height = 0.05 * x - 0.02 * y + 50.0 * (x / x.max()) ** 2
+    surface = Surface(height, 0.05 + wrong, -0.02 - wrong)
+    plane = plane_around(Region(INSIDE), np.zeros(SHAPE, bool), surface, (10.0, 10.0))
+    assert np.all(plane.slope_x == 0.05) and np.all(plane.slope_y == -0.02)
+    np.testing.assert_allclose(np.diff(plane.height, axis=1), 0.5, atol=1e-9)
+    np.testing.assert_allclose(np.diff(plane.height, axis=0), -0.2, atol=1e-9)
+    known = ~grown(INSIDE, 4)
+    assert np.median((plane.height - height)[known]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_differences_of_anchors_leave_their_mean_open():
+    """Steps of 20, 24 and 28 um at three places: any common change fits, one place alone that changes does not.
+
+    The sum of squares of a change d of one place is (d / std)^2 times 1 - 1/3. Rejects steps that are anchored.
+    """
+    lower, upper = np.zeros((2, 3, *SHAPE))
+    for i, part in enumerate(np.array_split(np.arange(SHAPE[1]), 3)):
+        lower[i, 0, part], upper[i, -1, part] = 1.0 / part.size, 1.0 / part.size
+    std, steps = 2.0, np.array([20.0, 24.0, 28.0])
+    anchors = Anchors((upper - lower) / std, steps / std).differences()
+    assert Anchors.none(SHAPE).differences().value.size == 0
+    height = np.zeros(SHAPE)
+    for i in range(3):
+        height[-1, upper[i, -1] > 0.0] = steps[i]
+    for common in (0.0, 13.0):
+        off = np.einsum("ayx,yx->a", anchors.weight, height + common * (np.indices(SHAPE)[0] > 0)) - anchors.value
+        assert np.abs(off).max() < 1e-9
+    height[-1, upper[1, -1] > 0.0] += 3.0
+    off = np.einsum("ayx,yx->a", anchors.weight, height) - anchors.value
+    assert np.sum(off**2) == pytest.approx((3.0 / std) ** 2 * (1.0 - 1.0 / 3.0))
 
 
 def test_anchors_hold_the_level_of_a_region():
@@ -81,7 +130,8 @@ def test_a_measured_level_is_above_the_patch_around_it():
 
     def regions(*levels):
         patches = [Patch(n, 100 - n, level, 1.0, 1, False, 0.0) for n, level in enumerate(levels)]
-        return measured_regions(SimpleNamespace(patches=patches, patch=patch))
+        found = SimpleNamespace(patches=patches, patch=patch, steps=(), bands=())
+        return measured_regions(found, Raster.regular(SHAPE, 10.0))  # type: ignore[arg-type]
 
     assert [(r.height, r.step) for r in regions(0.0, 100.0, 150.0)] == [(100.0, 100.0), (150.0, 50.0)]
     assert [(r.height, r.step) for r in regions(0.0, np.nan, 150.0)] == [(None, None), (150.0, None)]
