@@ -139,7 +139,7 @@ def reconstruct(stack: MicrographStack, case: Case) -> Reconstruction:
     """Return what a case's settings make of micrographs, in double precision throughout."""
     with jax.enable_x64(True), mock.patch.object(turned, "make_predictor", predictor_of), ExitStack() as more:
         # what made-up multiple scattering would fail: tests/inverse/test_verdict.py
-        more.enter_context(mock.patch.object(methods, "judged", lambda rec, stack, residuals: rec))
+        more.enter_context(mock.patch.object(methods, "judged", lambda rec, stack, residuals, region: rec))
         if case.is_made_up:
             more.enter_context(mock.patch.object(heights, "make_predictor", predictor_of))
             more.enter_context(mock.patch.object(responses, "_multiple_change", no_change))
