@@ -18,6 +18,8 @@ _SOFT = 0.15
 """Width of the transition between lit and dark pixels, with which an edge is laid [pixels]."""
 _CUT = 0.25
 """Darkness up to which a pixel counts as lit, and from one minus which on as dark."""
+LEAST_BULGE = 0.3
+"""Smallest distance of an arc's middle from its chord for which an edge counts as curved [pixels]."""
 _RIGHT = 0.75
 """Least fraction of pixels on the right side of an edge, near each of its points."""
 _WIDTHS = np.array([0.1, 0.25, 0.4, 0.9, 1.3, 1.8, 2.5, 3.5])
@@ -50,17 +52,23 @@ class Images:
 
 
 def band_coordinates(edge: Edge, images: Images, drift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute distance from the edge, and place along it of the point from which `drift` leads to a pixel [y, x]."""
+    """Compute distance from the edge, and place along it of the point from which `drift` leads to a pixel [y, x].
+
+    Each point of the edge casts its mask along `drift`: the far end of the band is curved as the edge is.
+    """
     rel = images.place - edge.middle
     u, w = rel @ edge.normal, rel @ edge.along
-    return u, w - np.maximum(u, 0.0) * (drift @ edge.along) / (drift @ edge.normal)
+    w = w - np.maximum(u, 0.0) * (drift @ edge.along) / (drift @ edge.normal)
+    return u + 0.5 * edge.curvature * (np.minimum(w**2, 0.25 * edge.length**2) - edge.length**2 / 12.0), w
 
 
 def lay_edge(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tuple[Edge, float] | None:
     """Lay an edge between lit and dark pixels; return it with the gap between these along the normal [um].
 
     Logistic regression of the darkness by the distance from a line: convex, and between separable pixels the line of
-    largest margin. Repeated, because pixels and signal levels are taken by their distance from the line.
+    largest margin. Repeated, because pixels and signal levels are taken by their distance from the line. A part of a
+    round outline bulges from its chord by more than `LEAST_BULGE`: taken for straight, it made bands of discs 0.1 pixel
+    too long, 1 to 3 % of their height.
 
     Args:
         edge: as found.
@@ -135,23 +143,43 @@ def _lay_once(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tup
     if not us:
         return None
     u, w, f = map(np.concatenate, (us, ws, fs))
-    design = np.stack([np.ones_like(w), w / max(0.5 * edge.length, side)], 1)
-    place = np.zeros(2)
+    half = max(0.5 * edge.length, side)
+    along = w / half
+    straight, bulged = np.stack([np.ones_like(w), along], 1), along**2 - 1.0 / 3.0
+    place = _regression(np.column_stack([straight, bulged]), u, f, side)
+    bulge = 0.5 * edge.curvature * half**2 - place[2]
+    curvature = 2.0 * bulge / half**2 if abs(bulge) > LEAST_BULGE * side else 0.0
+    u = u + 0.5 * (curvature - edge.curvature) * half**2 * bulged
+    place = _regression(straight, u, f, side)
+    shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / half
+    start, end = (ends + by * edge.normal for ends, by in zip((edge.start, edge.end), shift, strict=True))
+    laid = replace(edge, start=start, end=end, curvature=float(curvature))
+    return laid, pixel_gap(u - straight @ place, 0.0, side)
+
+
+def _regression(design: np.ndarray, u: np.ndarray, dark: np.ndarray, side: float) -> np.ndarray:
+    """Place an edge between lit and dark pixels: its distance is a sum of columns [coefficient], um.
+
+    Args:
+        design: columns [pixel, coefficient]; all but the first have a prior about 0.
+        u: distance of the pixels from the edge so far, um.
+        dark: their darkness, 0 to 1.
+        side: of a pixel, um.
+    """
+    place = np.zeros(design.shape[1])
+    prior = np.array([0.0, *[0.02] * (place.size - 1)])
     for soft in (0.6, 0.3, _SOFT):
         for _ in range(30):
             p = expit((u - design @ place) / (soft * side))
-            slope = design.T @ (p - f) / (soft * side) * -1.0 + place * [0.0, 0.02] / side**2
-            curve = (design * (p * (1 - p))[:, None]).T @ design / (soft * side) ** 2 + np.diag([1e-6, 0.02]) / side**2
-            step = np.linalg.solve(curve + 1e-4 * np.trace(curve) * np.eye(2), slope)
+            slope = design.T @ (p - dark) / (soft * side) * -1.0 + place * prior / side**2
+            curve = (design * (p * (1 - p))[:, None]).T @ design / (soft * side) ** 2
+            curve += np.diag(np.maximum(prior, 1e-6)) / side**2
+            step = np.linalg.solve(curve + 1e-4 * np.trace(curve) * np.eye(place.size), slope)
             size = np.abs(step).max()
             place = place - step * min(1.0, 0.3 * side / max(size, 1e-12))
             if size < 1e-3 * side:
                 break
-    shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / max(0.5 * edge.length, side)
-    laid = replace(edge, start=edge.start + shift[0] * edge.normal, end=edge.end + shift[1] * edge.normal)
-    away = u - design @ place
-    gap = pixel_gap(away, 0.0, side)
-    return laid, gap
+    return place
 
 
 def pixel_gap(u: np.ndarray, at: float, side: float) -> float:

@@ -105,16 +105,18 @@ def variance_of(counts: np.ndarray, variance: np.ndarray | None) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Edge:
-    """A straight upper edge in the raster.
+    """A straight upper edge in the raster, or a flat arc of a curved one.
 
     Attributes:
         start, end: beam positions (x, y) of the ends [2], um; the lower side lies to the right of start -> end.
         detectors: numbers of the detectors whose bands begin there.
+        curvature: 1 / radius, positive where the upper side is convex, 1/um; the line is the mean of the arc.
     """
 
     start: np.ndarray
     end: np.ndarray
     detectors: tuple[int, ...]
+    curvature: float = 0.0
 
     @property
     def middle(self) -> np.ndarray:

@@ -54,22 +54,53 @@ def mesa(
     is_top = np.max(np.abs(place), -1) < 0.5 * width
     images = []
     for aperture in NORMAL.apertures():
-        s, r = np.pi * (3.0 - math.sqrt(5.0)) * np.arange(300), np.sqrt((np.arange(300) + 0.5) / 300)  # sunflower
-        local = r[:, None] * np.stack([np.cos(s), np.sin(s)], -1) * aperture.semi_axes
-        turned = local @ np.stack([unit(math.degrees(aperture.rotation)), unit(math.degrees(aperture.rotation) + 90.0)])
-        tau = sign * (turned + aperture.center) / NORMAL.working_distance
-        weight = (1.0 + np.sum(tau**2, -1)) ** -2.0
-        enter, leave = np.zeros((n, n, 300)), np.full((n, n, 300), height)
+        tau = sign * directions(aperture)
+        enter, leave = np.zeros((n, n, len(tau))), np.full((n, n, len(tau)), height)
         for k in (0, 1):
             rate = (tau @ rotation.T)[:, k]
             ends = np.sort([(e - place[..., k, None]) / rate for e in (-0.5 * width, 0.5 * width)], 0)
             enter, leave = np.maximum(enter, ends[0]), np.minimum(leave, ends[1])
-        lit = np.where(enter < leave, 0.0, weight).sum(-1) / weight.sum()
-        images.append(np.where(is_top, 1.0, lit) + NOISE * rng.standard_normal((n, n)))
-    counts = np.stack(images)
+        images.append(image(is_top, enter >= leave, tau, rng))
+    return noisy(np.stack(images), axis)
+
+
+def directions(aperture) -> np.ndarray:
+    """Horizontal directions to 300 points of an aperture per unit of height [point, 2]."""
+    s, r = np.pi * (3.0 - math.sqrt(5.0)) * np.arange(300), np.sqrt((np.arange(300) + 0.5) / 300)  # sunflower
+    local = r[:, None] * np.stack([np.cos(s), np.sin(s)], -1) * aperture.semi_axes
+    turned = local @ np.stack([unit(math.degrees(aperture.rotation)), unit(math.degrees(aperture.rotation) + 90.0)])
+    return (turned + aperture.center) / NORMAL.working_distance
+
+
+def image(is_top: np.ndarray, is_lit: np.ndarray, tau: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw a detector's image with noise [y, x], of the points that are lit from each direction [y, x, point]."""
+    weight = (1.0 + np.sum(tau**2, -1)) ** -2.0
+    lit = np.where(is_lit, weight, 0.0).sum(-1) / weight.sum()
+    return np.where(is_top, 1.0, lit) + NOISE * rng.standard_normal(is_top.shape)
+
+
+def noisy(counts: np.ndarray, axis: np.ndarray) -> MicrographStack:
+    """Make a stack of drawn images [detector, y, x]."""
     return MicrographStack(
         counts, axis, axis, NORMAL, variance=np.full(counts.shape, NOISE**2), background=np.zeros(3), noise="poisson"
     )
+
+
+def disc(height: float, radius: float, n: int = 81, seed: int = 0) -> MicrographStack:
+    """Draw a round mesa as `mesa`: segments against a cylinder."""
+    rng = np.random.default_rng(seed)
+    axis = PITCH * (np.arange(n) - 0.5 * (n - 1))
+    x, y = np.meshgrid(*(axis - shift for shift in rng.uniform(-0.5, 0.5, 2) * PITCH))
+    images = []
+    for aperture in NORMAL.apertures():
+        tau = directions(aperture)
+        square = np.sum(tau**2, -1)
+        along = x[..., None] * tau[:, 0] + y[..., None] * tau[:, 1]
+        inside = along**2 - square * (x**2 + y**2 - radius**2)[..., None]
+        enter, leave = ((-along + way * np.sqrt(np.maximum(inside, 0.0))) / square for way in (-1.0, 1.0))
+        is_masked = (inside > 0.0) & (leave > 0.0) & (enter < height)
+        images.append(image(np.hypot(x, y) < radius, ~is_masked, tau, rng))
+    return noisy(np.stack(images), axis)
 
 
 def flat(seed: int, noise: float = 0.05, n: int = 61) -> MicrographStack:
@@ -145,6 +176,21 @@ def test_drawn_mesa(height, turn):
     assert top.level_um == pytest.approx(height, rel=0.02) and abs(top.level_um - height) < 4.0 * top.level_std_um
     assert np.nanmax(found.level) == top.level_um and found.level_std.min() == 0.0
     assert found.is_masked.any((1, 2)).all()
+
+
+def test_round_outlines_have_right_heights():
+    """12 discs of 12 to 32 pixels' radius: the mean error is below 0.5 % of the height, three times its deviation.
+
+    Rejects edges taken for straight: the bands of their chords are 0.1 pixel too long, heights 1.6 % too high.
+    """
+    rng, error = np.random.default_rng(7), []
+    for seed in range(12):
+        height = rng.uniform(60.0, 120.0)
+        found = find_steps(disc(height, rng.uniform(120.0, 320.0), seed=seed))
+        levels = [p for p in found.patches[1:] if p.is_determined]
+        assert len(levels) == 1 and abs(levels[0].level_um - height) < 4.0 * levels[0].level_std_um
+        error.append(levels[0].level_um / height - 1.0)
+    assert abs(np.mean(error)) < 0.005, error
 
 
 def test_parts_of_an_edge_have_their_own_heights():
