@@ -18,8 +18,10 @@ _SOFT = 0.15
 """Width of the transition between lit and dark pixels, with which an edge is laid [pixels]."""
 _CUT = 0.25
 """Darkness up to which a pixel counts as lit, and from one minus which on as dark."""
-LEAST_BULGE = 0.3
-"""Smallest distance of an arc's middle from its chord for which an edge counts as curved [pixels]."""
+LEAST_ARC = 8.0
+"""Shorter edges count as straight: a few pixels do not tell an arc from the steps of the raster [pixels]."""
+ARC_GAIN = 0.7
+"""By how much the log likelihood of lit and dark pixels must be better for an arc: straight edges reach 0.5."""
 _RIGHT = 0.75
 """Least fraction of pixels on the right side of an edge, near each of its points."""
 _WIDTHS = np.array([0.1, 0.25, 0.4, 0.9, 1.3, 1.8, 2.5, 3.5])
@@ -66,9 +68,9 @@ def lay_edge(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tupl
     """Lay an edge between lit and dark pixels; return it with the gap between these along the normal [um].
 
     Logistic regression of the darkness by the distance from a line: convex, and between separable pixels the line of
-    largest margin. Repeated, because pixels and signal levels are taken by their distance from the line. A part of a
-    round outline bulges from its chord by more than `LEAST_BULGE`: taken for straight, it made bands of discs 0.1 pixel
-    too long, 1 to 3 % of their height.
+    largest margin. Repeated, because pixels and signal levels are taken by their distance from the line. Parts
+    of a round outline are arcs: taken for straight, they made bands of discs 0.1 pixel too long, 1 to 3 % of their
+    height.
 
     Args:
         edge: as found.
@@ -146,19 +148,21 @@ def _lay_once(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tup
     half = max(0.5 * edge.length, side)
     along = w / half
     straight, bulged = np.stack([np.ones_like(w), along], 1), along**2 - 1.0 / 3.0
-    place = _regression(np.column_stack([straight, bulged]), u, f, side)
-    bulge = 0.5 * edge.curvature * half**2 - place[2]
-    curvature = 2.0 * bulge / half**2 if abs(bulge) > LEAST_BULGE * side else 0.0
-    u = u + 0.5 * (curvature - edge.curvature) * half**2 * bulged
-    place = _regression(straight, u, f, side)
+    line = u - 0.5 * edge.curvature * half**2 * bulged
+    arc, as_arc = _regression(np.column_stack([straight, bulged]), line, f, side)
+    place, as_line = _regression(straight, line, f, side)
+    is_arc = as_line - as_arc > ARC_GAIN and edge.length >= LEAST_ARC * side
+    curvature, away = (-2.0 * arc[2] / half**2, line - bulged * arc[2]) if is_arc else (0.0, line)
+    if is_arc:
+        place, _ = _regression(straight, away, f, side)
     shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / half
     start, end = (ends + by * edge.normal for ends, by in zip((edge.start, edge.end), shift, strict=True))
     laid = replace(edge, start=start, end=end, curvature=float(curvature))
-    return laid, pixel_gap(u - straight @ place, 0.0, side)
+    return laid, pixel_gap(away - straight @ place, 0.0, side)
 
 
-def _regression(design: np.ndarray, u: np.ndarray, dark: np.ndarray, side: float) -> np.ndarray:
-    """Place an edge between lit and dark pixels: its distance is a sum of columns [coefficient], um.
+def _regression(design: np.ndarray, u: np.ndarray, dark: np.ndarray, side: float) -> tuple[np.ndarray, float]:
+    """Place an edge between lit and dark pixels: its distance is a sum of columns [coefficient], um; and the misfit.
 
     Args:
         design: columns [pixel, coefficient]; all but the first have a prior about 0.
@@ -179,7 +183,8 @@ def _regression(design: np.ndarray, u: np.ndarray, dark: np.ndarray, side: float
             place = place - step * min(1.0, 0.3 * side / max(size, 1e-12))
             if size < 1e-3 * side:
                 break
-    return place
+    log_odds = (u - design @ place) / (_SOFT * side)
+    return place, float(np.sum(np.logaddexp(0.0, log_odds) - dark * log_odds))
 
 
 def pixel_gap(u: np.ndarray, at: float, side: float) -> float:
