@@ -20,7 +20,7 @@ CHI_SQUARE_LIMIT = 2.5
 map: noise alone reaches it in one pixel of 50 000 (three detectors)."""
 MAX_CONTRADICTED = 0.05
 """Largest share of contradicted pixels, among those that nothing else makes invalid, of a height map that its data do
-not contradict as a whole."""
+not contradict as a whole; regions that are contradicted as a whole count with all of their pixels."""
 MAX_CONTRADICTED_REGION = 0.1
 """Largest share of contradicted pixels of a region that depth jumps part from the rest and that the data do not
 contradict as a whole: what is fitted of it, its level included, leans on all of its data."""

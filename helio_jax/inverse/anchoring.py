@@ -175,9 +175,10 @@ class Anchored(NamedTuple):
 def with_anchors(fit: Fit, steps: Steps | None = None) -> Anchored:
     """Compute the error bars of a fit (`with_posterior`), and bring it to what is known beside its data, if anything.
 
-    Without error bars (interrupted, or `samples = 0`) anchors are not used. Levels that the fit was held at are taken
-    for what they are, measured steps: error bars of a fit that holds them would be those of its own data, which it
-    trusts too much beside walls.
+    Without error bars (interrupted, or `samples = 0`) anchors are not used. Levels, and with a free border steps, that
+    the fit was held at are taken for what they are, measured steps: error bars of a fit that holds them would be those
+    of its own data, which it trusts too much beside walls. That a measured step contradicts all else shows less in a
+    fit that was held at it.
 
     Args:
         fit: without error bars.

@@ -74,12 +74,21 @@ class Anchors:
         return Anchors(np.concatenate([self.weight, other.weight]), np.concatenate([self.value, other.value]))
 
     def differences(self) -> "Anchors":
-        """Anchor how each differs from the mean of all, and leave that open: weights of sum 1 above, -1 below."""
-        if not len(self.value):
-            return self
+        """Anchor only how they differ from one another; what is common to them stays open.
+
+        Of sums whose weights, times the standard deviation, add up to 1 above and -1 below.
+        """
+        if len(self.value) < 2:
+            return Anchors.none(self.weight.shape[1:])
         std = 1.0 / np.sum(self.weight, (1, 2), where=self.weight > 0.0)
         weight, value = std[:, None, None] * self.weight, std * self.value
-        return Anchors((weight - weight.mean(0)) / std[:, None, None], (value - value.mean()) / std)
+        share = std**-2 / np.sum(std**-2)
+        return Anchors((weight - np.tensordot(share, weight, 1)) / std[:, None, None], (value - share @ value) / std)
+
+    def across(self, region: np.ndarray) -> "Anchors":
+        """Take those whose pixels above and below are mostly of different regions [y, x]."""
+        most = lambda pixels: np.bincount(region[pixels]).argmax()  # noqa: E731
+        return self.taken([bool(most(w > 0.0) != most(w < 0.0)) for w in self.weight])
 
     def taken(self, which: Sequence[bool] | np.ndarray) -> "Anchors":
         """Take some of them."""

@@ -152,13 +152,11 @@ def _lay_once(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tup
     arc, as_arc = _regression(np.column_stack([straight, bulged]), line, f, side)
     place, as_line = _regression(straight, line, f, side)
     is_arc = as_line - as_arc > ARC_GAIN and edge.length >= LEAST_ARC * side
-    curvature, away = (-2.0 * arc[2] / half**2, line - bulged * arc[2]) if is_arc else (0.0, line)
-    if is_arc:
-        place, _ = _regression(straight, away, f, side)
+    place, bulge = (arc[:2], arc[2]) if is_arc else (place, 0.0)
     shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / half
     start, end = (ends + by * edge.normal for ends, by in zip((edge.start, edge.end), shift, strict=True))
-    laid = replace(edge, start=start, end=end, curvature=float(curvature))
-    return laid, pixel_gap(away - straight @ place, 0.0, side)
+    laid = replace(edge, start=start, end=end, curvature=-2.0 * float(bulge) / half**2)
+    return laid, pixel_gap(line - bulge * bulged - straight @ place, 0.0, side)
 
 
 def _regression(design: np.ndarray, u: np.ndarray, dark: np.ndarray, side: float) -> tuple[np.ndarray, float]:

@@ -76,7 +76,7 @@ class Explanation(NamedTuple):
         is_undecided: where another level explains the images as well [y, x].
         number: of the object or pit of every pixel, 0: flat substrate [y, x]; None: no flat substrate is assumed.
         kind: "objects on" or "pits in" the substrate.
-        n_steps: number of regions that are held at the levels of measured steps.
+        n_steps: number of regions that were put to the levels of measured steps.
         steps: measured in the micrographs; None where none can be.
     """
 
@@ -184,7 +184,7 @@ class _Fits:
         return walls_of(self.steps, Raster.of(self.stack))
 
     def anchors_at(self, surface: Surface, labels: np.ndarray, regions: list[Region]) -> Anchors:
-        """Anchor the mean levels of regions where the border is flat; else the heights of walls, part by part.
+        """Anchor the mean levels of regions where the border is flat; else the heights of their walls, part by part.
 
         A surface with a free border bends between the means of its levels.
 
@@ -197,9 +197,10 @@ class _Fits:
             return level_anchors(labels, regions, surface)
         about = surface, Raster.of(self.stack), labels
         _, anchors = anchors_of_steps(self.steps, *about)
+        anchors = anchors.across(labels)
         for parts in steps_in_parts(self.steps, self.stack):
             _, found = anchors_of_steps(parts, *about)
-            anchors = anchors.and_also(found.differences())
+            anchors = anchors.and_also(found.across(labels).differences())
         return anchors
 
     @cached_property

@@ -272,7 +272,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             extrapolation = aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-    remaining = remaining_error(changes, extrapolation) * last_change
+    remaining = (remaining_error(changes, extrapolation) + (not is_traceable)) * last_change  # which is not kept then
     return Fit(
         problem=problem,
         **_shown(problem, state),

@@ -251,7 +251,7 @@ def search_levels(
         search = _RegionSearch(name, region, base, pitch, max_width, beam_shift, misfit, report)
         trials = search.search()
         if region.step is not None:
-            plane, kept = plane_around(region, done, surface, pitch), done
+            plane, kept = plane_around(region, done, found if moved else surface, pitch), done
             if is_substrate_flat:
                 plane, kept = Surface(*np.zeros((3, *inside.shape))), done | inside
             flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
@@ -290,8 +290,8 @@ def without_skirt(region: Region, others: np.ndarray, surface: Surface) -> Surfa
         others: pixels that stay as they are [y, x].
         surface: to begin with.
     """
-    reached = grown(region.inside, region.skirt)
-    skirt, is_known = reached & ~region.inside & ~others, ~(reached | others)
+    is_known = _beyond_skirt(region, others)
+    skirt = ~(is_known | region.inside | others)
     if not is_known.any():
         return surface
     nearest = nearest_known(is_known)
@@ -304,7 +304,7 @@ def plane_around(region: Region, others: np.ndarray, surface: Surface, pitch: tu
     Slopes of a photometric solution are right beyond a jump that it has bridged, where its heights are not. Arguments
     as those of `without_skirt`.
     """
-    is_known = ~(grown(region.inside, region.skirt) | others)
+    is_known = _beyond_skirt(region, others)
     if not is_known.any():
         return surface
     slopes = [float(np.median(slope[is_known])) for slope in (surface.slope_x, surface.slope_y)]
@@ -312,6 +312,15 @@ def plane_around(region: Region, others: np.ndarray, surface: Surface, pitch: tu
     tilt = slopes[0] * x + slopes[1] * y
     level = np.median((surface.height - tilt)[is_known])
     return Surface(level + tilt, *(np.full(tilt.shape, slope) for slope in slopes))
+
+
+def _beyond_skirt(region: Region, others: np.ndarray) -> np.ndarray:
+    """Mark the pixels beyond the skirt of a region [y, x], or beyond `SKIRT` where nothing is; not those of others."""
+    for width in (region.skirt, SKIRT):
+        is_known = ~(grown(region.inside, width) | others)
+        if is_known.any():
+            break
+    return is_known
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:

@@ -159,9 +159,10 @@ def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
 
 
 def _reach(found: Steps, patch: int, raster: Raster) -> int:
-    """Find how many pixels the longest mask band beside a patch reaches; `SKIRT` at least."""
-    steps = {step.number for step in found.steps if patch in (step.above, step.below)}
-    longest = max((b.length_um for b in found.bands if b.step in steps and b.kind == "dark"), default=0.0)
+    """Find how many pixels the longest mask band of a patch's edges reaches around it; `SKIRT` at least."""
+    steps = {step.number for step in found.steps if patch == step.above}
+    bands = (b for b in found.bands if b.step in steps and b.kind == "dark" and b.note == "")
+    longest = max((b.length_um for b in bands), default=0.0)
     return max(SKIRT, math.ceil(longest / min(raster.dx, raster.dy)))
 
 

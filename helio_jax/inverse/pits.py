@@ -74,7 +74,8 @@ class _Sunk(NamedTuple):
         pits: with this one.
         level: of its floor, um.
         floor: its flat part, without pits in it [y, x].
-        places: regions that may be pits, with the level of the floor around them: largest first, in deeper pits before.
+        places: regions that may be pits, with the level of the floor around them: those in the deepest floor first,
+            of each floor the largest first.
     """
 
     pits: Pits
@@ -85,7 +86,8 @@ class _Sunk(NamedTuple):
     @property
     def is_flat(self) -> bool:
         """Whether a flat floor explains most of what is seen of it."""
-        return bool(np.mean(self.pits.is_unexplained[self.floor]) <= 1.0 - LEAST_EXPLAINED)
+        is_unexplained = self.pits.is_unexplained[self.floor]
+        return is_unexplained.size > 0 and bool(np.mean(is_unexplained) <= 1.0 - LEAST_EXPLAINED)
 
 
 @dataclass(frozen=True)
@@ -141,14 +143,17 @@ class PitSearch:
             above: height of the floor around it, um.
 
         Returns:
-            None where a flat floor explains no more than no pit does.
+            None where a floor explains no more than no pit does, or less than half of its own pixels.
         """
         region = _Region(self, pits, inside, above)
-        best = region.sunk(inside)
-        if best.places and best.pits.misfit <= self.hopeless:
+        found = [region.sunk(inside)]
+        misfit = found[0].pits.misfit
+        if found[0].places and misfit <= self.hopeless and np.isfinite(misfit):
             by_rim = self._deeper(region, region.sunk(region.rim))
-            best = by_rim if by_rim.pits.misfit < best.pits.misfit else self._deeper(region, best)
-        return best if best.pits.misfit < pits.misfit - GAIN and best.is_flat else None
+            is_better = by_rim.is_flat and by_rim.pits.misfit < misfit - GAIN
+            found = [by_rim] if is_better else [by_rim, self._deeper(region, found[0])]
+        pit = [sunk for sunk in found if sunk.is_flat and sunk.pits.misfit < pits.misfit - GAIN]
+        return min(pit, key=lambda sunk: sunk.pits.misfit, default=None)
 
     def _deeper(self, region: "_Region", outer: _Sunk) -> _Sunk:
         """Sink the largest unexplained part of a region's floor, if that is a pit, and bring the floor to its level."""
@@ -195,7 +200,7 @@ class _Region:
     @property
     def rim(self) -> np.ndarray:
         """The pixels of the region along its outline [y, x]."""
-        return self.inside & (self.distance <= RIM * self.distance.max())
+        return self.inside & (self.distance <= max(RIM * self.distance.max(), *self.search.pitch))
 
     def at(self, depth: float) -> Surface:
         """Make the surface with the region's floor at a depth below the floor around it, um."""

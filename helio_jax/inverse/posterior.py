@@ -342,9 +342,9 @@ def sample_posterior(
         edge_error: what is assumed of the edges between pixels.
         sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
             instrument [3 * pixel + parameter, sum].
-        unfitted: change of the residuals of the data, and of the edges if it has so many rows, by one standard
-            deviation of each number that is uncertain but not fitted [residual, number]: a fit that takes it as stated
-            answers to its error as to noise.
+        unfitted: change of the first residuals, those of the data and then of the edges, by one standard deviation of
+            each number that is uncertain but not fitted [residual, number]: a fit that takes it as stated answers to
+            its error as to noise.
 
     Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; numbers that are not fitted: Schmidt,
         Adv. Control Syst. 3 (1966) 293 (consider analysis); samples: Bardsley, Solonen, Haario and

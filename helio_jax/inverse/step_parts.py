@@ -22,22 +22,22 @@ PART = 12
 def steps_in_parts(found: Steps, stack: MicrographStack) -> list[Steps]:
     """Measure long steps again in parts of their edges, of `PART` pixels and more; those of each step together.
 
-    What is common to the parts of a step, such as the distance from which it is seen, is in the error of the whole
-    step only. Parts that show no height are left out.
+    Of what is common to the parts of a step, the distance from which it is seen is in the error of the whole step only.
+    Parts that show no height are left out.
 
     Args:
         found: steps, from `find_steps`.
         stack: micrographs.
     """
     scan, _ = scan_of(stack)
-    ground, out = found.patches[0].level_um, []
+    out = []
     for step in found.steps:
         steps, bands = [], []
         ends = np.array([step.start, step.end])
         n = int(np.hypot(*(ends[1] - ends[0])) // (PART * scan.images.side))
         if not step.is_used or step.above == step.below or n < 2:
             continue
-        level = found.patches[step.below].level_um - ground
+        level = found.patches[step.below].level_um
         places = ends[0] + (ends[1] - ends[0]) * np.linspace(0.0, 1.0, n + 1)[:, None]
         for start, end in pairwise(places):
             part = measure_edge(len(steps) + 1, (Edge(start, end, ()), 0.0), scan, float(np.nan_to_num(level)))

@@ -43,12 +43,12 @@ class BandRow:
 
 @dataclass(frozen=True)
 class Step:
-    """A straight edge from which the surface falls.
+    """An edge from which the surface falls, straight or an arc of a round outline.
 
     Attributes:
         number: from 1.
-        start, end: beam positions (x, y) of the upper edge's image [um]; the lower side lies to the right of start ->
-            end.
+        start, end: beam positions (x, y) of the upper edge's image [um], of an arc's those of the line that is its
+            mean; the lower side lies to the right of start -> end.
         direction_deg: of the edge, -90 to 90; falls_deg: of its fall, -180 to 180; counter-clockwise from +x.
         height_um, height_std_um: combined over the detectors; NaN where no band determines it.
         n_bands: bands that are combined.

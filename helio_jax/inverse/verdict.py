@@ -219,7 +219,7 @@ def judged(
     worst = names[int(np.argmax(by_detector))]
     said = (
         f"contradicts the data: micrographs traced on this height map deviate from the measured ones in "
-        f"{contradicted_share(reason):.0%} of the pixels (most in detector {worst}): shape, instrument or scattering "
-        "law are not as assumed"
+        f"{contradicted_share(reason):.0%} of the pixels, contradicted regions as a whole included (most in detector "
+        f"{worst}): shape, instrument or scattering law are not as assumed"
     )
     return judged.replace(status=f"{said}; {rec.status}")
