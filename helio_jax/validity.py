@@ -42,8 +42,8 @@ MEANINGS = {
     ),
     "contradicts the data": (
         "micrographs traced on the map deviate from the data of the 3 x 3 pixels by a mean square above "
-        f"{CHI_SQUARE_LIMIT:g} standard deviations (times the median where instrument or calibration are uncertain), "
-        f"or from those of more than {MAX_CONTRADICTED_REGION:.0%} of the region that depth jumps part from the rest"
+        f"{CHI_SQUARE_LIMIT:g} standard deviations (times the median where instrument or calibration are uncertain); "
+        f"or the pixel is in a region between depth jumps of which more than {MAX_CONTRADICTED_REGION:.0%} does so"
     ),
 }
 """What each reason means, in words."""

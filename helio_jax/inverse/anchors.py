@@ -9,6 +9,11 @@ from helio_jax.inverse.levels import grown
 from helio_jax.inverse.samples import nearest_kept
 
 
+def most_frequent(numbers: np.ndarray) -> int:
+    """Return the most frequent of some numbers; 0 of none."""
+    return int(np.argmax(np.bincount(numbers))) if numbers.size else 0
+
+
 @dataclass(frozen=True)
 class Anchors:
     """Sums of weights times heights that are known.
@@ -62,7 +67,7 @@ class Anchors:
             sides = [region[side] for side in (weight > 0.0, weight < 0.0)]
             if not all(side.size for side in sides):
                 continue
-            low, high = sorted(int(np.bincount(side).argmax()) for side in sides)
+            low, high = sorted(map(most_frequent, sides))
             total = float(weight.sum(where=weight > 0.0))
             height = abs(float(value)) / total
             if low == 0 < high and height > found.get(high, (0.0, weight))[0]:
@@ -87,8 +92,7 @@ class Anchors:
 
     def across(self, region: np.ndarray) -> "Anchors":
         """Take those whose pixels above and below are mostly of different regions [y, x]."""
-        most = lambda pixels: np.bincount(region[pixels]).argmax()  # noqa: E731
-        return self.taken([bool(most(w > 0.0) != most(w < 0.0)) for w in self.weight])
+        return self.taken([most_frequent(region[w > 0.0]) != most_frequent(region[w < 0.0]) for w in self.weight])
 
     def taken(self, which: Sequence[bool] | np.ndarray) -> "Anchors":
         """Take some of them."""
@@ -104,7 +108,7 @@ class Anchors:
         for new, old in zip(out, self.weight, strict=True):
             for part in (old > 0.0, old < 0.0):
                 if part.any():
-                    kept = part & (region == np.bincount(region[part]).argmax())
+                    kept = part & (region == most_frequent(region[part]))
                     new[kept] = old[kept] * (old[part].sum() / old[kept].sum())
         return Anchors(out, self.value)
 

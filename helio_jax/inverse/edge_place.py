@@ -149,13 +149,14 @@ def _lay_once(edge: Edge, images: Images, dark: list[int], v: np.ndarray) -> tup
     along = w / half
     straight, bulged = np.stack([np.ones_like(w), along], 1), along**2 - 1.0 / 3.0
     line = u - 0.5 * edge.curvature * half**2 * bulged
-    arc, as_arc = _regression(np.column_stack([straight, bulged]), line, f, side)
-    place, as_line = _regression(straight, line, f, side)
-    is_arc = as_line - as_arc > ARC_GAIN and edge.length >= LEAST_ARC * side
-    place, bulge = (arc[:2], arc[2]) if is_arc else (place, 0.0)
+    (place, as_line), bulge = _regression(straight, line, f, side), 0.0
+    if edge.length >= LEAST_ARC * side:
+        arc, as_arc = _regression(np.column_stack([straight, bulged]), line, f, side)
+        if as_line - as_arc > ARC_GAIN:
+            place, bulge = arc[:2], float(arc[2])
     shift = place[0] + np.array([-1.0, 1.0]) * place[1] * 0.5 * edge.length / half
     start, end = (ends + by * edge.normal for ends, by in zip((edge.start, edge.end), shift, strict=True))
-    laid = replace(edge, start=start, end=end, curvature=-2.0 * float(bulge) / half**2)
+    laid = replace(edge, start=start, end=end, curvature=-2.0 * bulge / half**2)
     return laid, pixel_gap(line - bulge * bulged - straight @ place, 0.0, side)
 
 

@@ -183,7 +183,7 @@ class _Fits:
         """Edges between pixels that cross a wall."""
         return walls_of(self.steps, Raster.of(self.stack))
 
-    def anchors_at(self, surface: Surface, labels: np.ndarray, regions: list[Region]) -> Anchors:
+    def anchors_at(self, surface: Surface, labels: np.ndarray, moved: list[Region]) -> Anchors:
         """Anchor the mean levels of regions where the border is flat; else the heights of their walls, part by part.
 
         A surface with a free border bends between the means of its levels.
@@ -191,10 +191,10 @@ class _Fits:
         Args:
             surface: with the regions at their levels.
             labels: number of every pixel's region, from 1 [y, x].
-            regions: in their order.
+            moved: the regions, in their order.
         """
         if self.settings.border == "flat" or self.steps is None:
-            return level_anchors(labels, regions, surface)
+            return level_anchors(labels, moved, surface)
         about = surface, Raster.of(self.stack), labels
         _, anchors = anchors_of_steps(self.steps, *about)
         anchors = anchors.across(labels)

@@ -272,7 +272,8 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             extrapolation = aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-    remaining = (remaining_error(changes, extrapolation) + (not is_traceable)) * last_change  # which is not kept then
+    undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result
+    remaining = (remaining_error(changes, extrapolation) + undone) * last_change
     return Fit(
         problem=problem,
         **_shown(problem, state),

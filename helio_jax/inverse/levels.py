@@ -251,9 +251,10 @@ def search_levels(
         search = _RegionSearch(name, region, base, pitch, max_width, beam_shift, misfit, report)
         trials = search.search()
         if region.step is not None:
-            plane, kept = plane_around(region, done, found if moved else surface, pitch), done
             if is_substrate_flat:
                 plane, kept = Surface(*np.zeros((3, *inside.shape))), done | inside
+            else:
+                plane, kept = plane_around(region, done, found if moved else surface, pitch), done
             flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
             trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
             trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]

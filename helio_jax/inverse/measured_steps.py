@@ -5,13 +5,14 @@ are; a fit, which holds its masks fixed in every iteration, learns little of it.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from helio_jax.forward.optics import Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.forward.surface import along as along_axis
-from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.anchors import Anchors, most_frequent
 from helio_jax.inverse.levels import SKIRT, Region, grown
 from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.mask_patches import COMMON_STD
@@ -102,7 +103,7 @@ def _sides(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
     """Find the pixels above and below a step [y, x], the distance of all from its edge [y, x], and that of the band's
     end [um]; None where too few pixels show a side."""
-    bands = [b for b in found.bands if b.step == step.number and b.kind == "dark" and b.note == ""]
+    bands = [b for b in found.bands if b.step == step.number and b.is_clear_mask]
     if not bands:
         return None
     side = math.sqrt(float(raster.dx) * float(raster.dy))
@@ -113,13 +114,8 @@ def _sides(
     is_low = beside & (distance > 0.5 * side) & (distance < end + BEYOND * side) & (found.patch == step.below)
     lower = is_low & (distance > end)
     lower = lower if lower.sum() >= MIN_PIXELS else is_low
-    upper, lower = (side & (region == _most_frequent(region[side])) for side in (upper, lower))
+    upper, lower = (side & (region == most_frequent(region[side])) for side in (upper, lower))
     return (upper, lower, distance, end) if min(upper.sum(), lower.sum()) >= MIN_PIXELS else None
-
-
-def _most_frequent(numbers: np.ndarray) -> int:
-    """Return the most frequent of some numbers; 0 of none."""
-    return int(np.argmax(np.bincount(numbers))) if numbers.size else 0
 
 
 def _beside(step: Step, raster: Raster) -> tuple[np.ndarray, np.ndarray, float]:
@@ -150,18 +146,17 @@ def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
             continue
         inside = found.patch == p.number
         beside = found.patch[grown(inside, SKIRT) & ~inside]
-        around = by_number[_most_frequent(beside)]
+        around = by_number[most_frequent(beside)]
         step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
-        reach = _reach(found, p.number, raster)
-        region = Region(inside, p.level_um, p.level_std_um, step, reach) if p.is_determined else None
-        out.append(region or Region(inside, skirt=reach))
+        region = Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside)
+        out.append(replace(region, skirt=_reach(found, p.number, raster)))
     return out
 
 
 def _reach(found: Steps, patch: int, raster: Raster) -> int:
     """Find how many pixels the longest mask band of a patch's edges reaches around it; `SKIRT` at least."""
     steps = {step.number for step in found.steps if patch == step.above}
-    bands = (b for b in found.bands if b.step in steps and b.kind == "dark" and b.note == "")
+    bands = (b for b in found.bands if b.step in steps and b.is_clear_mask)
     longest = max((b.length_um for b in bands), default=0.0)
     return max(SKIRT, math.ceil(longest / min(raster.dx, raster.dy)))
 

@@ -163,21 +163,20 @@ class PitSearch:
         inner = _Region(self, outer.pits, inside, outer.level).sunk(inside)
         if inner.pits.misfit >= outer.pits.misfit - GAIN or not inner.is_flat:
             return outer._replace(places=others)
-        best = outer._replace(pits=inner.pits, floor=outer.floor & ~inside)
+        found = [outer._replace(pits=inner.pits, floor=outer.floor & ~inside)]
 
         def misfit(level: float) -> float:
             """Of both pits, the floor of the outer one at a level."""
-            nonlocal best
             self.report(f"trying the level {level:.0f} um of the floor around a pit")
             floor = outer.pits._replace(surface=region.at(region.above - level))
             surface = _Region(self, floor, inside, level).at(level - inner.level)
             pits = inner.pits._replace(surface=surface, squares=self.squares(surface))
-            if pits.misfit < best.pits.misfit:
-                best = best._replace(pits=pits, level=level)
+            found.append(found[0]._replace(pits=pits, level=level))
             return pits.misfit
 
         change = NEAR * (region.above - outer.level)
         least_between(misfit, outer.level - change, outer.level + change, REFINEMENTS)
+        best = min(found, key=lambda sunk: sunk.pits.misfit)
         return best._replace(places=inner.places + [(place, best.level) for place, _ in others])
 
 

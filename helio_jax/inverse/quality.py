@@ -69,6 +69,11 @@ def regions(joined_x: np.ndarray, joined_y: np.ndarray) -> np.ndarray:
     return ranked(connected_components(graph, directed=False)[1]).reshape(shape)
 
 
+def _parted(region: np.ndarray) -> np.ndarray:
+    """List the numbers of regions, from `regions` [y, x], but for the largest and those below `MIN_REGION`."""
+    return np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]
+
+
 def floating(
     height: np.ndarray,
     samples: np.ndarray,
@@ -95,7 +100,7 @@ def floating(
         relative = np.sqrt(((common_modes - np.median(common_modes, (1, 2), keepdims=True)) ** 2).sum(0))
         flags |= relative > FLOATING * np.subtract(*np.quantile(height, (0.99, 0.01)))
     substrate = region == 0
-    for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
+    for number in _parted(region):
         inside = region == number
         step = abs(float(np.median(height[inside]) - np.median(height[substrate])))
         spread = float(np.std(samples[:, inside].mean(1) - samples[:, substrate].mean(1)))
@@ -118,7 +123,7 @@ def contradicted_regions(is_contradicted: np.ndarray, region: np.ndarray) -> np.
         region: from `regions` [y, x].
     """
     flags = np.zeros(region.shape, bool)
-    for number in np.flatnonzero(np.bincount(region.ravel()) >= MIN_REGION)[1:]:
+    for number in _parted(region):
         inside = region == number
         core = np.asarray(binary_erosion(inside, np.ones((3, 3)), iterations=CORE), bool)
         if core.sum() >= MIN_REGION and np.mean(is_contradicted[core]) > MAX_CONTRADICTED_REGION:

@@ -1,4 +1,4 @@
-"""Heights of steps along long edges, part by part: how high a wall is here, not on the mean.
+"""Heights of steps along long edges, part by part: how high a wall is at each place, not on average.
 
 A fit holds its masks fixed in every iteration and learns little of them. Beside a wall it sees a surface in few images,
 lit by what the wall scatters: there its error is tens of micrometres, and goes on beyond the band. Parts of the band

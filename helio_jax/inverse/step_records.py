@@ -40,6 +40,11 @@ class BandRow:
     runs_deg: float
     note: str
 
+    @property
+    def is_clear_mask(self) -> bool:
+        """Whether it is a mask band that nothing disturbs."""
+        return self.kind == "dark" and self.note == ""
+
 
 @dataclass(frozen=True)
 class Step:
