@@ -50,6 +50,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   hidden_side         where the side that the beam does not see may stand
   body                Body: triangles and spheres with material names
   border              continuation of a surface beyond its image
+  waves               continuation of waves beyond an image
   wall_grid           grid of heights whose walls are half-way between pixels
   wall_outlines       smooth outlines of walls between pixels
   scattering          the [material] tables: scattering laws

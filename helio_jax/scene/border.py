@@ -3,13 +3,16 @@
 `extend_border`: the border falls to the substrate, a terrace continues level. An image often ends on a flank. The
 surface beyond it is not imaged but scatters atoms into the image. Continued at the height of the border, it would lie
 above the true substrate, nearer to the apertures, and scatter too much. `continue_border`: relief goes on as it is
-inside, mirrored as that of a wall across the image (`mirror_border`), or with the image's autocorrelation as that of a
-rough or wavy surface (`predict_border`): whichever would have predicted the image's own margin better.
+inside, mirrored as that of a wall across the image (`mirror_border`), with the image's autocorrelation as that of a
+rough surface (`predict_border`), or as plane waves (`continue_waves`): whichever would have predicted the image's own
+margin best.
 """
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter1d, map_coordinates, median_filter
+
+from helio_jax.scene.waves import continue_waves
 
 MAX_TERRACE_SLOPE = 0.2
 """A terrace slopes outwards by less than this. Any other border falls with its own slope, by at least this slope.
@@ -83,14 +86,16 @@ def continue_border(z: np.ndarray, pitch: tuple[float, float], level: float, pix
         level: height of the substrate, um.
         pixels: fewer than there are rows and columns.
     """
+    ways = (
+        lambda heights, n: mirror_border(heights, pitch, level, n),
+        predict_border,
+        continue_waves,
+    )
     margin = min(z.shape) // _MARGIN
-    mirrored = mirror_border(z, pitch, level, pixels)
     if margin < 2:
-        return mirrored
+        return ways[0](z, pixels)
     inside = z[margin:-margin, margin:-margin]
-    tried = mirror_border(inside, pitch, level, margin), predict_border(inside, margin)
-    as_mirrored, as_predicted = (float(np.mean((found - z) ** 2)) for found in tried)
-    return mirrored if as_mirrored <= as_predicted else predict_border(z, pixels)
+    return min(ways, key=lambda way: float(np.mean((way(inside, margin) - z) ** 2)))(z, pixels)
 
 
 def predict_border(z: np.ndarray, pixels: int) -> np.ndarray:
