@@ -112,6 +112,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edges               edges of the raster: smooth, kink or jump
   rims                where a dome, steepest at its rim, meets a level surface
   strain              how far a fit moves the instrument from what is stated
+  wider_readout       fit of gains or offsets that are far from what is stated
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   photometric_start   surfaces that a fit starts from
   backtracking        a step halved until its surface can be traced

@@ -4,8 +4,9 @@ The first is the photometric solution, with regions at the levels of the steps t
 the border is free, of a step in the beam's shadow (`shadow_steps`). Where the data contradict its fit, pits in and
 objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any
 images: there, patches are tried first, and so they are on a substrate that is too dark. With a flat border they are
-also tried where the fit moves the instrument far beyond what is stated (`is_strained`). A level that explains the
-images about as well as the one that is kept is undecided.
+also tried where the fit moves the instrument far beyond what is stated (`is_strained`), and so are, at the end, gains
+and offsets that are not what is stated (`wider_readout`). A level that explains the images about as well as the one
+that is kept is undecided.
 """
 
 import math
@@ -46,6 +47,7 @@ from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
+from helio_jax.inverse.wider_readout import fit_wider_readout, relief
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
 
@@ -116,6 +118,7 @@ def explain(
         best, others = fits.from_heights(start, none), []
     is_albedo_likely = best.fit.problem.is_instrument_unknown or fits.is_substrate_dark
     others.insert(0 if is_albedo_likely else len(others), fits.from_albedo_patches)
+    others.append(fits.from_wider_readout)
     residuals: np.ndarray | None = None
     for other in others:
         if best.fit.is_interrupted:
@@ -129,8 +132,8 @@ def explain(
             extent = share if other == fits.from_objects else share_of_areas(contradicted)
             may_be_pits = other == fits.from_pits and has_contradicted_hollow(contradicted, best.fit)
             is_contradicted = extent >= MIN_CONTRADICTED or may_be_pits
-            may_be_patches = other == fits.from_albedo_patches and fits.is_strained(best.fit)
-            if not is_contradicted and not may_be_patches:
+            explains_strain = other in (fits.from_albedo_patches, fits.from_wider_readout)
+            if not is_contradicted and not (explains_strain and fits.is_strained(best.fit)):
                 continue
             found = other(best, residuals)
             if found is None:
@@ -140,7 +143,7 @@ def explain(
             is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
-                gained += relief_of_strain(best.fit.parameters, found.fit.parameters)
+                gained += relief(best.fit, found.fit, settings.refine)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
         except PredictionError as e:
@@ -495,6 +498,29 @@ class _Fits:
         problem, surface = best.fit.problem, best.fit.state.surface  # levels that were found hold here, too
         region = problem.region if best.number is None else best.number
         return best._replace(fit=self.fitted(surface, surface, patches, region, problem.anchors))
+
+    def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
+        """Fit gains or offsets that are not what is stated; None where nothing speaks for that.
+
+        Without patches: their albedos may stand for what wrong gains and offsets do.
+        """
+        problem, surface = best.fit.problem, best.fit.state.surface
+        if problem.is_instrument_unknown or not self.is_strained(best.fit):
+            return None
+        has_levels = best.number is not None or best.n_steps
+        known = (
+            AlbedoPatches.none(self.stack.shape[1:]),
+            problem.region if best.number is None else best.number,
+            problem.anchors,
+        )
+        fit = fit_wider_readout(
+            best.fit,
+            self.settings,
+            (surface, surface) if has_levels else self.plain_start,
+            lambda start, smoothed, settings: self.fitted(start, smoothed, *known, settings),
+            self.say,
+        )
+        return None if fit is None else best._replace(fit=fit)
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:

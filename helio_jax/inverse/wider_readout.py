@@ -1,0 +1,143 @@
+"""Gains or offsets far from what is stated: a fit with a heavy-tailed prior of them.
+
+A stated gain or offset may be plainly wrong, by many of its standard deviations: background that nobody subtracted. A
+normal prior holds the fit between the stated and the true one, with heights that are wrong by more than any error bar.
+So a fit that strains the instrument is repeated with Student's t as the prior of the offsets, or of the gains. The
+solver knows normal priors only: one as wide as to have the same gradient at the fitted numbers stands for it
+(`widened`).
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.fit import Fit
+from helio_jax.inverse.parameters import Parameters
+from helio_jax.inverse.quality import half_chi_square
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.strain import is_strained, relief_of_strain
+
+READOUT = {"offset": "offset_std", "log_gain": "gain_std"}
+"""Parameters of the read-out, the likelier to be wrong first, and the settings of their prior standard deviations."""
+FREEDOM = 3.0
+"""Degrees of freedom of Student's t."""
+MAX_FITS = 3
+"""Fits with wider and wider priors."""
+SAME_WIDTH = 1.2
+"""A prior is not widened again by less than this factor."""
+
+Widths = dict[str, float]
+"""Standard deviation of the priors of gains and offsets over those stated, by name (`READOUT`)."""
+
+
+def fit_wider_readout(
+    fit: Fit,
+    settings: ReconstructSettings,
+    start: tuple[Surface, Surface],
+    fitted: Callable[[Surface, Surface, ReconstructSettings], Fit],
+    say: Callable[[str], None],
+) -> Fit | None:
+    """Fit with a heavy-tailed prior of the offsets; where the fit still strains the instrument, of the gains.
+
+    Args:
+        fit: which strains the instrument.
+        settings: as stated.
+        start: surface to fit from, and a smoother one. Not the fit's own, where another is known: a fit that a wrong
+            prior held down overshoots from there, and rests at a larger misfit.
+        fitted: fits from a surface, or one nearer to a smoother one, with settings.
+        say: reports what is tried.
+
+    Returns:
+        The fit that explains data and instrument best; None where no other one explains more.
+    """
+    best = fit
+    for name in READOUT:
+        found = _widened(fit, name, settings, start, fitted, say)
+        best = max(best, found, key=partial(_evidence, fit, stated=settings.refine))
+        if found.is_interrupted or not is_strained(best.parameters):
+            break
+    return None if best is fit else best
+
+
+def _widened(fit: Fit, name: str, settings: ReconstructSettings, start, fitted, say) -> Fit:
+    """Fit with a heavy-tailed prior of the gains or the offsets; the same fit where that explains no more."""
+    best, (surface, smoothed) = fit, start
+    for _ in range(MAX_FITS):
+        before = widths(best, settings.refine)
+        width = widened(best.parameters, before)[name]
+        if width < SAME_WIDTH * before[name]:
+            break
+        say(f"{READOUT[name].removesuffix('_std')}s known {width:.0f} times less well than stated")
+        found = fitted(surface, smoothed, _with_width(settings, name, width))
+        if found.is_interrupted or _evidence(best, found, settings.refine) < 0.0:
+            break
+        best = found
+        surface = smoothed = found.state.surface
+    return best
+
+
+def _evidence(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+    """Compute by how much another fit explains data and instrument better than a fit, in half chi-square."""
+    return half_chi_square(fit.residuals) - half_chi_square(other.residuals) + relief(fit, other, stated)
+
+
+def relief(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+    """Compute by how much less likely a fit's instrument is than another fit's, in half chi-square.
+
+    Gains and offsets count by the heavy-tailed prior where one of the fits has it.
+    """
+    found = relief_of_strain(fit.parameters, other.parameters)
+    both = [(each.parameters, widths(each, stated)) for each in (fit, other)]
+    if both[0][1] == both[1][1]:
+        return found
+    heavy, normal = ([penalty(*one) for one in both] for penalty in (heavy_tailed, _normal))
+    return found + heavy[0] - normal[0] - (heavy[1] - normal[1])
+
+
+def widths(fit: Fit, stated: RefineSettings) -> Widths:
+    """Compute the widths of a fit's priors of gains and offsets over those stated."""
+    return {name: getattr(fit.problem.settings, key) / getattr(stated, key) for name, key in READOUT.items()}
+
+
+def widened(parameters: Parameters, factors: Widths) -> Widths:
+    """Compute the widths of the normal priors that stand for the heavy-tailed one.
+
+    They have at the fitted parameters the gradient of a multivariate Student's t of the stated width.
+
+    Args:
+        parameters: fitted, in standard deviations of their priors.
+        factors: widths of these priors.
+
+    Source: weights of the t distribution: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881, eq. 3.
+    """
+    squares = _squares(parameters, factors)
+    return {name: max(1.0, math.sqrt((FREEDOM + total) / (FREEDOM + n))) for name, (total, n) in squares.items()}
+
+
+def heavy_tailed(parameters: Parameters, factors: Widths) -> float:
+    """Compute minus the log of the heavy-tailed prior of gains and offsets, 0 at its maximum.
+
+    Arguments as those of `widened`.
+    """
+    squares = _squares(parameters, factors).values()
+    return sum(0.5 * (FREEDOM + n) * math.log1p(total / FREEDOM) for total, n in squares)
+
+
+def _normal(parameters: Parameters, factors: Widths) -> float:
+    """Compute the same of the normal priors that the parameters were fitted with."""
+    return sum(0.5 * total / factors[name] ** 2 for name, (total, _) in _squares(parameters, factors).items())
+
+
+def _squares(parameters: Parameters, factors: Widths) -> dict[str, tuple[float, int]]:
+    """Compute the sum of squares, in stated standard deviations, and the number of gains and offsets."""
+    pulls = {name: factors[name] * np.ravel(getattr(parameters, name)) for name in READOUT}
+    return {name: (float(np.sum(p**2)), p.size) for name, p in pulls.items()}
+
+
+def _with_width(settings: ReconstructSettings, name: str, width: float) -> ReconstructSettings:
+    """Know gains or offsets so many times less well than stated."""
+    key = READOUT[name]
+    return settings.changed(refine=settings.refine.changed(**{key: width * getattr(settings.refine, key)}))
