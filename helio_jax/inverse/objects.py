@@ -7,7 +7,7 @@ object's level is the one whose masks and multiple scattering explain the microg
 every trial. Whether the result is true is for a fit that starts from it to decide.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -44,6 +44,8 @@ MOST_MISFIT = 2.0
 """No more objects are looked for where the first leaves so many times the misfit of the relief alone ..."""
 HOPELESS = 2.0
 """... and its outline and level are not refined where it begins with so many times more."""
+MOST_START = 3.0
+"""Outlines are not looked for at a level that begins with so many times the misfit of the best one."""
 MOST_OBJECTS = 8
 """More objects are not looked for: the smaller ones keep the relief that they start with."""
 LEAST_SEGMENT = 4
@@ -123,7 +125,8 @@ class ObjectSearch:
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
             self.report(f"object {place} of {min(n, MOST_OBJECTS)}")
             starts = [best, *self._shifted(best, number, STARTS)]
-            best = _best(self._without_segments(trial, number) for trial in starts)
+            most = MOST_START * _best(starts).misfit
+            best = _best(self._without_segments(trial, number) for trial in starts if trial.misfit <= most)
             if best.misfit > HOPELESS * limit:
                 return None
             best = _best([best, *(self._peeled(t, number) for t in self._shifted(best, number, STARTS))])
@@ -145,18 +148,25 @@ class ObjectSearch:
         return (self._tried(trial.objects.shifted(number, before + share * width)) for share in shares)
 
     def _without_segments(self, best: Trial, number: int) -> Trial:
-        """Give segments at the rim to the substrate, one by one, while that lowers the misfit."""
+        """Give segments at the rim to the substrate, while that lowers the misfit.
+
+        All that lower it alone are given together, where that lowers it more than the best one does.
+        """
         parts = segments(self.sharp, best.objects.number == number)
+
+        def without(given: Sequence[int]) -> Trial:
+            outline = _filled((best.objects.number == number) & ~np.isin(parts, given))
+            other = best.objects.outlined(number, outline)
+            is_tried = outline.sum() >= LEAST_PIXELS and np.any(other.number != best.objects.number)
+            return self._tried(other) if is_tried else best
+
         while np.isfinite(best.misfit):
             inside = best.objects.number == number
-            at_rim = np.unique(parts[inside & ~_core(inside)])
-            outlines = (_filled(inside & (parts != part)) for part in at_rim)
-            trials = [self._tried(best.objects.outlined(number, o)) for o in outlines if o.sum() >= LEAST_PIXELS]
-            trials = [trial for trial in trials if np.any(trial.objects.number != best.objects.number)]
-            other = _best([best, *trials])
-            if other.misfit > best.misfit - GAIN:
+            trials = {part: without([part]) for part in np.unique(parts[inside & ~_core(inside)])}
+            lower = [part for part, trial in trials.items() if trial.misfit <= best.misfit - GAIN]
+            if not lower:
                 break
-            best = other
+            best = _best([*trials.values(), *([without(lower)] if len(lower) > 1 else [])])
         return best
 
     def _peeled(self, trial: Trial, number: int) -> Trial:
