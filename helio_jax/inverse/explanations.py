@@ -59,8 +59,6 @@ NARROW = 5
 """Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels]."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
-HOPELESS = 2.0
-"""Pits are given up where they leave so many times the misfit of an unknown instrument's best fit."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
 AT_REST = 0.1
@@ -456,12 +454,16 @@ class _Fits:
         if self.settings.border != "flat" or not self.settings.refine.objects:
             return None
         none, raster, shape = AlbedoPatches.none(self.stack.shape[1:]), Raster.of(self.stack), self.stack.shape[1:]
+        try:
+            rival = self.residuals_on(best.fit.state.surface, none)
+        except PredictionError:
+            rival = None
         search = PitSearch(
             lambda surface: self.residuals_on(surface, none),
             (raster.dy, raster.dx),
             self.stack.instrument.beam_shift,
             self.say,
-            HOPELESS * half_chi_square(residuals) if best.fit.problem.is_instrument_unknown else math.inf,
+            rival,
         )
         pits = search.find((shape[0], shape[1]))
         if pits is None:

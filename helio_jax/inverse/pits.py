@@ -24,6 +24,8 @@ LIMIT = 3.0
 """Mean square residual, over detectors, above which a flat floor does not explain a pixel."""
 LEAST_FLOOR = 0.15
 """Least share of a pit's pixels that show its floor: a wall alone has no level."""
+HOPELESS = 2.0
+"""A region is no pit that with its floor at the best tried depth leaves so many times the misfit of another surface."""
 LEAST_EXPLAINED = 0.5
 """Least share of a visible floor that is explained once the pit has its level: what is not flat is no pit."""
 MOST_PITS = 8
@@ -99,17 +101,18 @@ class PitSearch:
         pitch: dy, dx, um.
         beam_shift: `Instrument.beam_shift`.
         report: called with what is tried next.
-        hopeless: misfit above which no more pits are looked for once the largest one is sunk.
+        rival: residuals of another surface, the instrument as for the pits, which pits have to compete with
+            [detector, y, x]; None: of none.
     """
 
     residuals: Callable[[Surface], np.ndarray]
     pitch: tuple[float, float]
     beam_shift: tuple[float, float]
     report: Callable[[str], None] = lambda said: None
-    hopeless: float = np.inf
+    rival: np.ndarray | None = None
 
     def find(self, shape: tuple[int, int]) -> Pits | None:
-        """Find the pits of an image; None where there is none, or where the search is hopeless."""
+        """Find the pits of an image; None where there is none."""
         flat = Surface(*np.zeros((3, *shape)))
         pits = Pits(flat, np.zeros(shape, int), self.squares(flat))
         places = [(inside, 0.0) for inside in outlines(pits.is_unexplained)]
@@ -119,8 +122,6 @@ class PitSearch:
             found = self.sunk(pits, *places.pop(0))
             if found is not None:
                 pits, places = found.pits, found.places + places
-            if pits.misfit > self.hopeless:
-                return None
         return pits if pits.number.any() else None
 
     def squares(self, surface: Surface) -> np.ndarray:
@@ -143,12 +144,15 @@ class PitSearch:
             above: height of the floor around it, um.
 
         Returns:
-            None where a floor explains no more than no pit does, or less than half of its own pixels.
+            None where a floor explains no more than no pit does, or less than half of its own pixels, or far less than
+            the rival does.
         """
         region = _Region(self, pits, inside, above)
+        if region.is_hopeless:
+            return None
         found = [region.sunk(inside)]
         misfit = found[0].pits.misfit
-        if found[0].places and misfit <= self.hopeless and np.isfinite(misfit):
+        if found[0].places and np.isfinite(misfit):
             by_rim = self._deeper(region, region.sunk(region.rim))
             is_better = by_rim.is_flat and by_rim.pits.misfit < misfit - GAIN
             found = [by_rim] if is_better else [by_rim, self._deeper(region, found[0])]
@@ -216,6 +220,19 @@ class _Region:
             self.tried[depth] = search.squares(surface) if is_seen else np.full_like(self.pits.squares, np.inf)
         return self.tried[depth]
 
+    @cached_property
+    def depths(self) -> list[float]:
+        """Depths that are tried at first, um."""
+        return [2.0 * float(self.distance.max()) * share for share in DEPTHS]
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether at all depths the region's pixels leave far more than on the rival surface."""
+        if self.search.rival is None:
+            return False
+        least = min(np.sum(self.squares(depth)[:, self.inside]) for depth in self.depths)
+        return bool(least > HOPELESS * np.sum(squares(self.search.rival)[:, self.inside]))
+
     def sunk(self, where: np.ndarray) -> _Sunk:
         """Sink the region to the depth that explains the data best in some of its pixels [y, x] and around it."""
         is_weighed = where | ~self.inside
@@ -223,11 +240,10 @@ class _Region:
         def misfit(depth: float) -> float:
             return 0.5 * float(np.sum(self.squares(depth), where=is_weighed))
 
-        depths = [2.0 * float(self.distance.max()) * share for share in DEPTHS]
-        tried = [misfit(depth) for depth in depths]
-        value, depth = min(zip(tried, depths, strict=True))
+        tried = [misfit(depth) for depth in self.depths]
+        value, depth = min(zip(tried, self.depths, strict=True))
         for place in minima(tried)[:MOST_MINIMA]:
-            low, high = depths[max(place - 1, 0)], depths[min(place + 1, len(depths) - 1)]
+            low, high = self.depths[max(place - 1, 0)], self.depths[min(place + 1, len(tried) - 1)]
             value, depth = min((value, depth), least_between(misfit, low, high, REFINEMENTS))
         number = np.where(self.inside, self.pits.number.max() + 1, self.pits.number)
         pits, level = Pits(self.at(depth), number, self.squares(depth)), self.above - depth

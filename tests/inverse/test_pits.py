@@ -87,8 +87,8 @@ def test_a_cone_is_no_pit():
         assert (search.find(SHAPE) is not None) == is_pit
 
 
-def test_a_hopeless_search_ends_with_the_largest_pit():
-    """Where a floor leaves more than `hopeless`, the inner pit is not looked for, and there are no pits at all."""
+def test_what_another_surface_explains_far_better_is_no_pit():
+    """Its depth is not refined, and no pit is looked for in its floor; a rival that explains less changes nothing."""
     tried = []
 
     def residuals(surface):
@@ -96,12 +96,12 @@ def test_a_hopeless_search_ends_with_the_largest_pit():
         return (0.9 + np.abs(surface.height + 80.0 * OUTER + 60.0 * INNER) / 30.0)[None]
 
     counts = []
-    for hopeless in (np.inf, 100.0):
-        pits = PitSearch(residuals, (PITCH, PITCH), (0.0, 0.0), hopeless=hopeless).find(SHAPE)
-        assert (pits is None) == (hopeless == 100.0)
+    for left in (1.5, 0.1):
+        search = PitSearch(residuals, (PITCH, PITCH), (0.0, 0.0), rival=np.full((1, *SHAPE), left))
+        assert (search.find(SHAPE) is None) == (left == 0.1)
         counts.append(len(tried))
         tried.clear()
-    assert counts[1] < 0.7 * counts[0], counts
+    assert counts[1] < 0.3 * counts[0], counts
 
 
 def test_outlines_need_several_pixels():
