@@ -4,7 +4,7 @@ A stated gain or offset may be plainly wrong, by many of its standard deviations
 normal prior holds the fit between the stated and the true one, with heights that are wrong by more than any error bar.
 So a fit that strains the instrument is repeated with Student's t as the prior of the offsets, or of the gains. The
 solver knows normal priors only: one as wide as to have the same gradient at the fitted numbers stands for it
-(`widened`).
+(`normal_widths`).
 """
 
 import math
@@ -27,7 +27,7 @@ FREEDOM = 3.0
 MAX_FITS = 3
 """Fits with wider and wider priors."""
 SAME_WIDTH = 1.2
-"""A prior is not widened again by less than this factor."""
+"""A prior is not made wider again by less than this factor."""
 
 Widths = dict[str, float]
 """Standard deviation of the priors of gains and offsets over those stated, by name (`READOUT`)."""
@@ -55,24 +55,26 @@ def fit_wider_readout(
     """
     best = fit
     for name in READOUT:
-        found = _widened(fit, name, settings, start, fitted, say)
+        found = _with_wider_prior(fit, name, settings, start, fitted, say)
         best = max(best, found, key=partial(_evidence, fit, stated=settings.refine))
         if found.is_interrupted or not is_strained(best.parameters):
             break
     return None if best is fit else best
 
 
-def _widened(fit: Fit, name: str, settings: ReconstructSettings, start, fitted, say) -> Fit:
+def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start, fitted, say) -> Fit:
     """Fit with a heavy-tailed prior of the gains or the offsets; the same fit where that explains no more."""
     best, (surface, smoothed) = fit, start
     for _ in range(MAX_FITS):
         before = widths(best, settings.refine)
-        width = widened(best.parameters, before)[name]
+        width = normal_widths(best.parameters, before)[name]
         if width < SAME_WIDTH * before[name]:
             break
         say(f"{READOUT[name].removesuffix('_std')}s known {width:.0f} times less well than stated")
         found = fitted(surface, smoothed, _with_width(settings, name, width))
-        if found.is_interrupted or _evidence(best, found, settings.refine) < 0.0:
+        if found.is_interrupted:
+            return found
+        if _evidence(best, found, settings.refine) < 0.0:
             break
         best = found
         surface = smoothed = found.state.surface
@@ -102,7 +104,7 @@ def widths(fit: Fit, stated: RefineSettings) -> Widths:
     return {name: getattr(fit.problem.settings, key) / getattr(stated, key) for name, key in READOUT.items()}
 
 
-def widened(parameters: Parameters, factors: Widths) -> Widths:
+def normal_widths(parameters: Parameters, factors: Widths) -> Widths:
     """Compute the widths of the normal priors that stand for the heavy-tailed one.
 
     They have at the fitted parameters the gradient of a multivariate Student's t of the stated width.
@@ -120,7 +122,7 @@ def widened(parameters: Parameters, factors: Widths) -> Widths:
 def heavy_tailed(parameters: Parameters, factors: Widths) -> float:
     """Compute minus the log of the heavy-tailed prior of gains and offsets, 0 at its maximum.
 
-    Arguments as those of `widened`.
+    Arguments as those of `normal_widths`.
     """
     squares = _squares(parameters, factors).values()
     return sum(0.5 * (FREEDOM + n) * math.log1p(total / FREEDOM) for total, n in squares)

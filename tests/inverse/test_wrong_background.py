@@ -7,7 +7,7 @@ import pytest
 
 import helio_jax as hx
 from helio_jax.inverse.parameters import Parameters
-from helio_jax.inverse.wider_readout import FREEDOM, heavy_tailed, widened
+from helio_jax.inverse.wider_readout import FREEDOM, heavy_tailed, normal_widths
 from tests.inverse.test_strained_instrument import parameters_with
 
 ADDED = 0.3
@@ -20,11 +20,11 @@ def pulled(offset: float) -> Parameters:
 
 @pytest.mark.parametrize("width", [1.0, 4.0])
 def test_the_wider_prior_has_the_gradient_of_the_heavy_tailed_one(width):
-    """At the fitted offsets, by finite differences; inside the stated deviation nothing is widened."""
+    """At the fitted offsets, by finite differences; inside the stated deviation nothing gets wider."""
     factors, step = {"log_gain": 1.0, "offset": width}, 1e-5
     ends = [heavy_tailed(pulled(7.0 + s), factors) for s in (-step, step)]
     pull = 7.0 * width  # in stated standard deviations
-    wide = widened(pulled(7.0), factors)
+    wide = normal_widths(pulled(7.0), factors)
     assert wide["log_gain"] == 1.0
     scaled = (FREEDOM + 3) / (FREEDOM + 3 * pull**2)
     assert wide["offset"] == pytest.approx(1.0 / math.sqrt(scaled))
