@@ -184,6 +184,17 @@ class _Fits:
         """Edges between pixels that cross a wall."""
         return walls_of(self.steps, Raster.of(self.stack))
 
+    @cached_property
+    def measured(self) -> list[Region]:
+        """Regions between measured steps, the largest first."""
+        return measured_regions(self.steps, Raster.of(self.stack))
+
+    @cached_property
+    def off_substrate(self) -> np.ndarray:
+        """Pixels at levels that mask bands measure, other than that of the substrate [y, x]."""
+        levels = [region.inside for region in self.measured if region.height is not None]
+        return np.any([np.zeros(self.stack.shape[1:], bool), *levels], axis=0)
+
     def anchors_at(self, surface: Surface, labels: np.ndarray, moved: list[Region]) -> Anchors:
         """Anchor the mean levels of regions where the border is flat; else the heights of their walls, part by part.
 
@@ -241,6 +252,7 @@ class _Fits:
             parallax=parallax_of(self.stack),
             noise_share=noise_share_of(self.stack),
             walls=self.walls,
+            off_substrate=self.off_substrate,
         )
 
     def misfit(self, surface: Surface, patches: AlbedoPatches) -> float:
@@ -399,7 +411,7 @@ class _Fits:
         shape = self.stack.shape[1:]
         labels, is_undecided, anchors, n_steps = np.zeros(shape, int), np.zeros(shape, bool), None, 0
         raster = Raster.of(self.stack)
-        if steps := measured_regions(self.steps, raster) or self.shadowed:
+        if steps := self.measured or self.shadowed:
             found = search_levels(
                 steps,
                 start,

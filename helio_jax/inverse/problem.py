@@ -59,6 +59,8 @@ class FitProblem:
         parallax_height: at which the images of several beams were read [y, x], um.
         noise_share: noise of every pixel over the typical one, by its dwell time [y, x]; None: all alike.
         walls: whether a wall parts neighbours along x and y [y, x - 1], [y - 1, x]; None: no wall is known.
+        off_substrate: pixels that known steps part from the substrate: there, a flat border is not at its height
+            [y, x]; None: no step is known.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """
@@ -85,6 +87,7 @@ class FitProblem:
     parallax_height: np.ndarray
     noise_share: np.ndarray | None = None
     walls: tuple[np.ndarray, np.ndarray] | None = None
+    off_substrate: np.ndarray | None = None
     instrument: Instrument | None = None
     stride: int = 1
 
@@ -105,6 +108,7 @@ class FitProblem:
         parallax: tuple[np.ndarray, np.ndarray] | None = None,
         noise_share: np.ndarray | None = None,
         walls: tuple[np.ndarray, np.ndarray] | None = None,
+        off_substrate: np.ndarray | None = None,
     ) -> "FitProblem":
         """Pose the problem; `start` fixes the level that is held, where the settings ask for it.
 
@@ -130,7 +134,7 @@ class FitProblem:
             order, is_held, is_free and not is_held, 0.0, anchors or Anchors.none(shape),
             np.zeros(shape, int) if region is None else region, modes, median, noise,
             patches or AlbedoPatches.none(shape), *(parallax or (np.zeros(signal.shape), np.zeros(shape))),
-            noise_share, walls, given,
+            noise_share, walls, off_substrate, given,
         )  # fmt: skip
         return replace(problem, held_level=float(np.sum(problem.level_weight * start.height)))
 
@@ -179,7 +183,10 @@ class FitProblem:
     @property
     def border(self) -> np.ndarray:
         """Prior weight of each height above the substrate [y, x], 1/um."""
-        return _border_weight(self.raster.shape, self.reconstruct_settings)
+        weight = _border_weight(self.raster.shape, self.reconstruct_settings)
+        if self.off_substrate is None or self.reconstruct_settings.border != "flat":
+            return weight
+        return np.where(self.off_substrate, _HELD, weight)
 
     @property
     def position(self) -> np.ndarray:
@@ -330,6 +337,7 @@ class FitProblem:
             parallax_height=self.parallax_height[thin],
             noise_share=None if self.noise_share is None else self.noise_share[thin],
             walls=None if self.walls is None else thinned_walls(*self.walls, stride),
+            off_substrate=None if self.off_substrate is None else self.off_substrate[thin],
             stride=stride,
         )
 
