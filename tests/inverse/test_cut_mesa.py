@@ -1,4 +1,4 @@
-"""A mesa that the image's border cuts, on a border that is stated to be flat: it is not pulled down to the substrate."""
+"""A mesa that the image's border cuts, on a border stated to be flat: it is not pulled down to the substrate."""
 
 import numpy as np
 import pytest
