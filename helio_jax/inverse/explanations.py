@@ -47,7 +47,7 @@ from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
-from helio_jax.inverse.wider_readout import fit_wider_readout, relief
+from helio_jax.inverse.wider_readout import READOUT, fit_wider_readout, relief, with_widths
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
 
@@ -331,7 +331,7 @@ class _Fits:
         problem = self.pose(surface, *known)
         if self.settings.border == "flat" or problem.is_instrument_unknown:
             return self._unbiased(self._fit(surface, smoothed, *known))
-        held = with_held_readout(self.settings)
+        held = with_widths(self.settings, dict.fromkeys(READOUT, HELD))
         patches, region, anchors = (*known, None, None)[:3]
         fit = self._unbiased(self._fit(surface, smoothed, patches, region, anchors, held))
         parameters = readout_as_stated(fit.parameters)
@@ -552,12 +552,6 @@ def has_contradicted_hollow(is_contradicted: np.ndarray, fit: Fit) -> bool:
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:
     """Compute by how much other residuals [detector, y, x] are smaller, in half chi-square."""
     return half_chi_square(residuals) - half_chi_square(others)
-
-
-def with_held_readout(settings: ReconstructSettings) -> ReconstructSettings:
-    """Hold gains and offsets at what is stated."""
-    held = {"gain_std": HELD * settings.refine.gain_std, "offset_std": HELD * settings.refine.offset_std}
-    return settings.model_copy(update={"refine": settings.refine.model_copy(update=held)})
 
 
 def readout_as_stated(parameters: Parameters) -> Parameters:

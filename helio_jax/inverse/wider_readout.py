@@ -71,7 +71,7 @@ def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start,
         if width < SAME_WIDTH * before[name]:
             break
         say(f"{READOUT[name].removesuffix('_std')}s known {width:.0f} times less well than stated")
-        found = fitted(surface, smoothed, _with_width(settings, name, width))
+        found = fitted(surface, smoothed, with_widths(settings, {name: width}))
         if found.is_interrupted:
             return found
         if _evidence(best, found, settings.refine) < 0.0:
@@ -139,7 +139,7 @@ def _squares(parameters: Parameters, factors: Widths) -> dict[str, tuple[float, 
     return {name: (float(np.sum(p**2)), p.size) for name, p in pulls.items()}
 
 
-def _with_width(settings: ReconstructSettings, name: str, width: float) -> ReconstructSettings:
-    """Know gains or offsets so many times less well than stated."""
-    key = READOUT[name]
-    return settings.changed(refine=settings.refine.changed(**{key: width * getattr(settings.refine, key)}))
+def with_widths(settings: ReconstructSettings, factors: Widths) -> ReconstructSettings:
+    """Give the priors of gains and offsets other widths; they may exceed what a scene file may state."""
+    wide = {READOUT[name]: factor * getattr(settings.refine, READOUT[name]) for name, factor in factors.items()}
+    return settings.model_copy(update={"refine": settings.refine.model_copy(update=wide)})

@@ -7,7 +7,8 @@ import pytest
 
 import helio_jax as hx
 from helio_jax.inverse.parameters import Parameters
-from helio_jax.inverse.wider_readout import FREEDOM, heavy_tailed, normal_widths
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.wider_readout import FREEDOM, heavy_tailed, normal_widths, with_widths
 from tests.inverse.test_strained_instrument import parameters_with
 
 ADDED = 0.3
@@ -30,6 +31,13 @@ def test_the_wider_prior_has_the_gradient_of_the_heavy_tailed_one(width):
     assert wide["offset"] == pytest.approx(1.0 / math.sqrt(scaled))
     # the normal prior of that width: half the sum of squares over width^2, three offsets
     assert (ends[1] - ends[0]) / (2.0 * step * width) == pytest.approx(3.0 * pull / wide["offset"] ** 2, rel=1e-6)
+
+
+def test_a_prior_may_be_wider_than_a_scene_may_state():
+    """0 +- 90 % made three times wider: refused as a setting above its limit of 1, it ended the reconstruction."""
+    stated = ReconstructSettings(refine=RefineSettings(offset_std=0.9))
+    found = with_widths(stated, {"offset": 3.0}).refine
+    assert found.offset_std == pytest.approx(2.7) and found.gain_std == stated.refine.gain_std
 
 
 @pytest.mark.slow
