@@ -88,6 +88,16 @@ class Explanation(NamedTuple):
     steps: Steps | None = None
 
     @property
+    def has_levels(self) -> bool:
+        """Whether regions were put to levels that were found."""
+        return self.number is not None or self.n_steps > 0
+
+    @property
+    def region(self) -> np.ndarray:
+        """Number of every pixel's region, for another fit at the same levels [y, x]."""
+        return self.fit.problem.region if self.number is None else self.number
+
+    @property
     def assumed(self) -> str:
         """What the fit takes for granted beyond the settings, in words; "": nothing."""
         if self.number is not None:
@@ -507,11 +517,10 @@ class _Fits:
             patches = patches.keeping(patches.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
-        if best.number is None and not best.n_steps:
+        if not best.has_levels:
             return self.from_steps(patches)
-        problem, surface = best.fit.problem, best.fit.state.surface  # levels that were found hold here, too
-        region = problem.region if best.number is None else best.number
-        return best._replace(fit=self.fitted(surface, surface, patches, region, problem.anchors))
+        surface = best.fit.state.surface  # levels that were found hold here, too
+        return best._replace(fit=self.fitted(surface, surface, patches, best.region, best.fit.problem.anchors))
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit gains or offsets that are not what is stated; None where nothing speaks for that.
@@ -521,16 +530,11 @@ class _Fits:
         problem, surface = best.fit.problem, best.fit.state.surface
         if problem.is_instrument_unknown or not self.is_strained(best.fit):
             return None
-        has_levels = best.number is not None or best.n_steps
-        known = (
-            AlbedoPatches.none(self.stack.shape[1:]),
-            problem.region if best.number is None else best.number,
-            problem.anchors,
-        )
+        known = AlbedoPatches.none(self.stack.shape[1:]), best.region, problem.anchors
         fit = fit_wider_readout(
             best.fit,
             self.settings,
-            (surface, surface) if has_levels else self.plain_start,
+            (surface, surface) if best.has_levels else self.plain_start,
             lambda start, smoothed, settings: self.fitted(start, smoothed, *known, settings),
             self.say,
         )

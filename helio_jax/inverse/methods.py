@@ -30,7 +30,7 @@ from helio_jax.inverse.quality import (
     reasons_from_fit,
     regions,
 )
-from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
+from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.verdict import (
     Misfit,
     Trace,
@@ -53,15 +53,6 @@ LAW_WARNING = (
     "sample to test it"
 )
 """Warning of a fit whose scattering law is unknown."""
-
-READOUT_WARNING = (
-    "gains or offsets are not what is stated, and were fitted: {far}; check dark counts, background and the detectors' "
-    "gains"
-)
-"""Warning of a fit whose gains and offsets are far from what is stated."""
-
-FAR = 3.0
-"""They are named where they are so many stated standard deviations off."""
 
 UNUSED = "the anchors, {n} in number, were not used: {why}"
 """Warning of a height map that was not moved to what the user knows."""
@@ -158,24 +149,6 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
     return tuple(found)
 
 
-def _readout_warning(fit: "Fit", stated: RefineSettings) -> tuple[str, ...]:
-    """Name the gains and offsets that were fitted with wider priors than stated and lie far from what is stated."""
-    used = fit.problem.settings
-    if used.offset_std <= stated.offset_std and used.gain_std <= stated.gain_std:
-        return ()
-    changes = {
-        "gain": (fit.gain - 1.0, stated.gain_std),
-        "offset": (fit.offset / fit.problem.median_signal, stated.offset_std),
-    }
-    far = [
-        f"{what} of {name!r} {value:+.1%} (stated: 0 +- {std:.1%})"
-        for what, (values, std) in changes.items()
-        for name, value in zip(fit.instrument.detector_names, values, strict=True)
-        if abs(value) > FAR * std
-    ]
-    return (READOUT_WARNING.format(far=", ".join(far)),) if far else ()
-
-
 def sensitivity(fit: "Fit") -> dict[str, float]:
     """Compute the change of the highest point per change of each gain and offset, per cent per per cent of signal.
 
@@ -217,6 +190,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.instrument_report import describe_instrument
     from helio_jax.inverse.known_heights import check_places
+    from helio_jax.inverse.wider_readout import warning_of
 
     if make_predict is None:
         raise GuardError(
@@ -260,7 +234,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
         offset=fit.offset,
         border=settings.border,
         status="; ".join(filter(None, (fit.status, assumed))),
-        warnings=(*about_anchors, *warnings_of(fit), *_readout_warning(fit, settings.refine)),
+        warnings=(*about_anchors, *warnings_of(fit), *warning_of(fit, settings.refine)),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),

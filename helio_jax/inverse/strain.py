@@ -4,6 +4,7 @@ An uncertain instrument can imitate another albedo almost anywhere, so that the 
 """
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 
@@ -15,12 +16,12 @@ STRAIN = 5.0
 """The instrument is strained where its pulls' chi-square exceeds its mean by this many of its standard deviations."""
 
 
-def instrument_pulls(parameters: Parameters) -> np.ndarray:
+def instrument_pulls(parameters: Parameters, without: Collection[str] = ()) -> np.ndarray:
     """Pulls of all unknowns but the surface, its albedo, drift and scan lines, in prior standard deviations [number].
 
-    They are independent and normal under the prior.
+    They are independent and normal under the prior. `without`: names that are left out.
     """
-    return np.concatenate([np.ravel(getattr(parameters, name)) for name in INSTRUMENT])
+    return np.concatenate([np.ravel(getattr(parameters, name)) for name in INSTRUMENT if name not in without])
 
 
 def is_strained(parameters: Parameters) -> bool:

@@ -18,10 +18,17 @@ from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
-from helio_jax.inverse.strain import is_strained, relief_of_strain
+from helio_jax.inverse.strain import instrument_pulls, is_strained, relief_of_strain
 
 READOUT = {"offset": "offset_std", "log_gain": "gain_std"}
 """Parameters of the read-out, the likelier to be wrong first, and the settings of their prior standard deviations."""
+WARNING = (
+    "gains or offsets are not what is stated, and were fitted: {far}; check dark counts, background and the detectors' "
+    "gains; a wrong geometry can look alike: heights may be off by more than their stated standard deviations"
+)
+"""Of a fit whose gains and offsets are far from what is stated."""
+FAR = 3.0
+"""They are named where they are so many stated standard deviations off."""
 FREEDOM = 3.0
 """Degrees of freedom of Student's t."""
 MAX_FITS = 3
@@ -70,7 +77,7 @@ def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start,
         width = normal_widths(best.parameters, before)[name]
         if width < SAME_WIDTH * before[name]:
             break
-        say(f"{READOUT[name].removesuffix('_std')}s known {width:.0f} times less well than stated")
+        say(f"{READOUT[name]} {width:.0f} times the stated one")
         found = fitted(surface, smoothed, with_widths(settings, {name: width}))
         if found.is_interrupted:
             return found
@@ -91,12 +98,31 @@ def relief(fit: Fit, other: Fit, stated: RefineSettings) -> float:
 
     Gains and offsets count by the heavy-tailed prior where one of the fits has it.
     """
-    found = relief_of_strain(fit.parameters, other.parameters)
     both = [(each.parameters, widths(each, stated)) for each in (fit, other)]
     if both[0][1] == both[1][1]:
-        return found
-    heavy, normal = ([penalty(*one) for one in both] for penalty in (heavy_tailed, _normal))
-    return found + heavy[0] - normal[0] - (heavy[1] - normal[1])
+        return relief_of_strain(fit.parameters, other.parameters)
+    before, after = (
+        0.5 * float(np.sum(instrument_pulls(parameters, READOUT) ** 2)) + heavy_tailed(parameters, factors)
+        for parameters, factors in both
+    )
+    return before - after
+
+
+def warning_of(fit: Fit, stated: RefineSettings) -> tuple[str, ...]:
+    """Name the gains and offsets that were fitted with wider priors than stated and lie far from what is stated."""
+    if max(widths(fit, stated).values()) <= 1.0:
+        return ()
+    changes = {
+        "gain": (fit.gain - 1.0, stated.gain_std),
+        "offset": (fit.offset / fit.problem.median_signal, stated.offset_std),
+    }
+    far = [
+        f"{what} of {name!r} {value:+.1%} (stated: 0 +- {std:.1%})"
+        for what, (values, std) in changes.items()
+        for name, value in zip(fit.instrument.detector_names, values, strict=True)
+        if abs(value) > FAR * std
+    ]
+    return (WARNING.format(far=", ".join(far)),) if far else ()
 
 
 def widths(fit: Fit, stated: RefineSettings) -> Widths:
@@ -126,11 +152,6 @@ def heavy_tailed(parameters: Parameters, factors: Widths) -> float:
     """
     squares = _squares(parameters, factors).values()
     return sum(0.5 * (FREEDOM + n) * math.log1p(total / FREEDOM) for total, n in squares)
-
-
-def _normal(parameters: Parameters, factors: Widths) -> float:
-    """Compute the same of the normal priors that the parameters were fitted with."""
-    return sum(0.5 * total / factors[name] ** 2 for name, (total, _) in _squares(parameters, factors).items())
 
 
 def _squares(parameters: Parameters, factors: Widths) -> dict[str, tuple[float, int]]:

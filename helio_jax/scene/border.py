@@ -86,15 +86,14 @@ def continue_border(z: np.ndarray, pitch: tuple[float, float], level: float, pix
         level: height of the substrate, um.
         pixels: fewer than there are rows and columns.
     """
-    ways = (
-        lambda heights, n: mirror_border(heights, pitch, level, n),
-        predict_border,
-        continue_waves,
-    )
+
+    def mirrored(heights: np.ndarray, n: int) -> np.ndarray:
+        return mirror_border(heights, pitch, level, n)
+
     margin = min(z.shape) // _MARGIN
     if margin < 2:
-        return ways[0](z, pixels)
-    inside = z[margin:-margin, margin:-margin]
+        return mirrored(z, pixels)
+    inside, ways = z[margin:-margin, margin:-margin], (mirrored, predict_border, continue_waves)
     return min(ways, key=lambda way: float(np.mean((way(inside, margin) - z) ** 2)))(z, pixels)
 
 
