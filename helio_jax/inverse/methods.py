@@ -92,12 +92,12 @@ def reconstruct_stack(
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
     if settings.method == "refine":
-        result, misfit_of, anchors, region = _refined(stack, settings, make_predict, report, start)
+        result, misfit_of, anchors, region, off_substrate = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)
         if not trace:
             return result
         tested, misfit = _tested(stack, partial(misfit_of, trace), result, region)
-        return with_path_error(tested, misfit, stack, settings, anchors) if misfit else tested
+        return with_path_error(tested, misfit, stack, settings, anchors, off_substrate) if misfit else tested
 
     predict = make_predict and make_predict(settings.refine.start_paths(stack.counts[0].size))
     test = None
@@ -176,12 +176,14 @@ class _Refined(NamedTuple):
         misfit_of: computes its misfit from a trace.
         anchors: that it was brought to.
         region: that depth jumps part from the rest, from `regions` [y, x].
+        off_substrate: pixels that measured steps part from the substrate (`FitProblem`).
     """
 
     rec: Reconstruction
     misfit_of: Callable[[Trace], Misfit]
     anchors: "Anchors"
     region: np.ndarray
+    off_substrate: np.ndarray | None
 
 
 def _refined(stack, settings, make_predict, report, start) -> _Refined:
@@ -247,4 +249,4 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
             "anchors": as_records(anchors),
         },
     )
-    return _Refined(rec, partial(misfit_of_state, fit.problem, fit.state), used, region)
+    return _Refined(rec, partial(misfit_of_state, fit.problem, fit.state), used, region, fit.problem.off_substrate)

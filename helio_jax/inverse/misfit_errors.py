@@ -110,17 +110,19 @@ def path_error(
     expected: float,
     settings: ReconstructSettings,
     anchors: Anchors | None = None,
+    off_substrate: np.ndarray | None = None,
 ) -> np.ndarray:
     """Compute the common-mode error by slopes that the data contradict, relative to the reference [y, x], um.
 
-    The reference is the border where it is flat, else the largest valid region; the border's median is then 0. Slope
-    errors of one sign add up to a bound; a uniform distribution within it has the deviation bound / sqrt(3).
+    The reference is the border where it is flat, but for what is `off_substrate` (`FitProblem`), else the largest valid
+    region; the border's median is then 0. Slope errors of one sign add up to a bound; a uniform distribution within it
+    has the deviation bound / sqrt(3).
     """
     assert rec.chi_square is not None
     errors = excess_slope_errors(slope_errors(misfit, Optics.of(rec.instrument)), rec.chi_square, expected)
     frame = border_mask(rec.height.shape, settings.border_fraction)
     if settings.border == "flat":
-        known = frame & rec.is_valid
+        known = frame & rec.is_valid & (True if off_substrate is None else ~off_substrate)
         return accumulated(errors, raster, known if known.any() else frame, anchors) / np.sqrt(3.0)
     found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0, anchors)
     return (found - np.median(found[frame])) / np.sqrt(3.0)
@@ -132,12 +134,13 @@ def with_path_error(
     stack: MicrographStack,
     settings: ReconstructSettings,
     anchors: Anchors | None = None,
+    off_substrate: np.ndarray | None = None,
 ) -> Reconstruction:
     """Widen the error bars of a tested map by `path_error`, as a common-mode error, and flag what then floats."""
     if rec.height_samples is None or rec.chi_square is None:
         return rec
     expected = expected_chi_square(stack, rec.instrument, rec.chi_square)
-    error = path_error(rec, misfit, Raster.of(stack), expected, settings, anchors)
+    error = path_error(rec, misfit, Raster.of(stack), expected, settings, anchors, off_substrate)
     samples = add_common_modes(rec.height_samples, [error], SEED)
     std = np.sqrt(np.mean(samples**2, axis=0))
     return flag_floating(rec.replace(height_samples=samples, height_std=std), anchors)

@@ -14,6 +14,7 @@ from helio_jax.inverse.misfit_errors import (
     accumulated,
     excess_slope_errors,
     flag_floating,
+    path_error,
     slope_errors,
     valid_regions,
     with_path_error,
@@ -149,6 +150,24 @@ def test_error_bars_of_a_tested_map_hold_what_its_path_adds(bshem):
     assert found.height_std is not None
     assert np.median(found.height_std[ring(0.0, 4.0)]) == pytest.approx(8.0 / np.sqrt(3.0), rel=0.2)
     assert np.max(found.height_std[ring(12.0, 99.0)]) < 1e-3
+
+
+def test_what_the_border_cuts_is_no_reference(bshem):
+    """A part at another level that reaches the border is known across a contradicted band only: 8 / sqrt(3) um (20 %).
+
+    Taken for substrate at the border, it had no error; the other side of the band has none.
+    """
+    place = np.broadcast_to(np.arange(N), (N, N))
+    band, beyond = (place >= 12) & (place < 16), place >= 16
+    rec = terrace(bshem, 0.0).replace(is_valid=~band, reason=np.where(band, CONTRADICTED, 0))
+    wrong = misfit_of(bshem, 0.0, (0.0, 0.0), (0.2, 0.0))
+    misfit = Misfit(wrong.difference * band, wrong.std, wrong.form_factor, wrong.normals)
+    tested = rec.replace(chi_square=np.where((place >= 11) & (place < 17), 1e4, 1.0))
+    about = tested, misfit, Raster.regular((N, N), 10.0), 1.0, ReconstructSettings(border="flat")
+    for off_substrate, expected in ((beyond, 8.0 / np.sqrt(3.0)), (None, 0.0)):
+        found = path_error(*about, off_substrate=off_substrate)
+        assert np.median(found[place > 18]) == pytest.approx(expected, rel=0.2, abs=1e-3)
+        assert np.max(found[place < 10]) < 1e-3
 
 
 def test_regions_are_of_valid_pixels_only():
