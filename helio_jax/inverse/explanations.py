@@ -33,7 +33,14 @@ from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, sho
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
-from helio_jax.inverse.measured_steps import anchors_of_steps, labelled, level_anchors, measured_regions, walls_of
+from helio_jax.inverse.measured_steps import (
+    anchors_of_steps,
+    labelled,
+    level_anchors,
+    measured_regions,
+    off_ground,
+    walls_of,
+)
 from helio_jax.inverse.objects import find_objects
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo
@@ -201,9 +208,8 @@ class _Fits:
 
     @cached_property
     def off_substrate(self) -> np.ndarray:
-        """Pixels at levels that mask bands measure, other than that of the substrate [y, x]."""
-        levels = [region.inside for region in self.measured if region.height is not None]
-        return np.any([np.zeros(self.stack.shape[1:], bool), *levels], axis=0)
+        """Pixels that mask bands show above or below the substrate [y, x]."""
+        return off_ground(self.measured, (self.stack.shape[1], self.stack.shape[2]))
 
     def anchors_at(self, surface: Surface, labels: np.ndarray, moved: list[Region]) -> Anchors:
         """Anchor the mean levels of regions where the border is flat; else the heights of their walls, part by part.

@@ -123,7 +123,7 @@ class Region:
 
     Attributes:
         inside: its pixels [y, x].
-        height: measured height above the substrate, um; None: not known.
+        height: measured height above the ground (`Steps.ground`), um; None: not known.
         std: standard deviation of that, um.
         step: measured height above the surface around the region, um; None: not known.
         skirt: pixels around it that a fit without the jump may have raised: as far as its masks reach.

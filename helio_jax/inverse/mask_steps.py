@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
-from helio_jax.arrays import border_mask, pitch
+from helio_jax.arrays import pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
 from helio_jax.inverse.band_fit import Band, disturbance, fit_band, kind_of, place_edge
@@ -31,7 +31,7 @@ from helio_jax.inverse.mask_edges import (
 )
 from helio_jax.inverse.mask_patches import find_patches, likeness, sides_of, solve_levels
 from helio_jax.inverse.patch_outlines import with_outlines_moved
-from helio_jax.inverse.step_records import BandRow, Patch, Step, Steps
+from helio_jax.inverse.step_records import BandRow, Patch, Step, Steps, border_shares
 from helio_jax.inverse.wall_signal import Opening, WallSignal, opening_of, wall_signal
 from helio_jax.micrograph import MicrographStack
 
@@ -121,8 +121,7 @@ def find_steps(stack: MicrographStack) -> Steps:
     patch = _patches(measured, images, levels)
     result = _joined(measured, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step, above most of the border
-    ground = result.patches[int(np.argmax(_border_shares(patch)))].level_um
-    heights = [result.patches[s.below].level_um - ground for s in result.steps[:n]]
+    heights = [result.patches[s.below].level_um - result.ground.level_um for s in result.steps[:n]]
     moved = [z if math.isfinite(z) else 0.0 for z in heights]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
         again = [measure_edge(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]
@@ -360,18 +359,12 @@ def _explained(measured: list[MeasuredEdge], scan: Scan) -> np.ndarray:
     return out
 
 
-def _border_shares(patch: np.ndarray) -> np.ndarray:
-    """Compute the share of every patch in the outermost ring of pixels [patch]."""
-    ring = patch[border_mask((patch.shape[0], patch.shape[1]), 1.0 / max(patch.shape))]
-    return np.bincount(ring, minlength=int(patch.max()) + 1) / ring.size
-
-
 def _joined(measured: list[MeasuredEdge], patch: np.ndarray, scan: Scan, levels: SignalLevels) -> Steps:
     """Solve for the levels of the patches."""
     images = scan.images
     steps = []
     # where two patches share the border, either may stand at the stated distance
-    is_split = np.sum(_border_shares(patch) > _SPLIT) > 1
+    is_split = np.sum(border_shares(patch) > _SPLIT) > 1
     for m in measured:
         above, below = sides_of(m.edge, patch, images.place, images.side)
         step = replace(m.step, above=above, below=below)

@@ -30,6 +30,8 @@ MAX_LEVEL_SLOPE = 0.3
 LEAST_SHARE = 0.01
 """Smaller patches, in shares of the image, are tried at no levels but measured ones: a search takes as long for them as
 for others, and they are mostly no patches."""
+CERTAINLY_OFF = 3.0
+"""A region's level is not the ground's where it differs by so many standard deviations."""
 PLACES = -0.3, 0.0, 0.3
 """Places of an edge that are allowed for: a pixel between them may be on either side; it is joined to none [pixels]."""
 
@@ -132,25 +134,32 @@ def _edge(step: Step) -> Edge:
 
 
 def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
-    """List the patches between measured steps, the largest first.
+    """List the patches between measured steps but for the ground (`Steps.ground`), the largest first.
 
     A measured level is tried above the patch around it: a surface with a free border may bend so far that the
     substrate elsewhere is no reference.
     """
     if found is None:
         return []
-    by_number = {p.number: p for p in found.patches}
-    out = []
-    for p in sorted(found.patches[1:], key=lambda patch: -patch.pixels):
-        if not p.is_determined and p.pixels < LEAST_SHARE * found.patch.size:
+    by_number, ground, out = {p.number: p for p in found.patches}, found.ground, []
+    for p in sorted(found.patches, key=lambda patch: -patch.pixels):
+        is_searched = p.is_determined or p.pixels >= LEAST_SHARE * found.patch.size
+        if p.number == ground.number or not is_searched:
             continue
         inside = found.patch == p.number
         beside = found.patch[grown(inside, SKIRT) & ~inside]
         around = by_number[most_frequent(beside)]
-        step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
-        region = Region(inside, p.level_um, p.level_std_um, step) if p.is_determined else Region(inside)
+        step = p.level_um - around.level_um if around.number in (0, ground.number) or around.is_determined else None
+        level, std = p.level_um - ground.level_um, math.hypot(p.level_std_um, ground.level_std_um)
+        region = Region(inside, level, std, step) if p.is_determined else Region(inside)
         out.append(replace(region, skirt=_reach(found, p.number, raster)))
     return out
+
+
+def off_ground(regions: list[Region], shape: tuple[int, int]) -> np.ndarray:
+    """Find the pixels [y, x] of regions (`measured_regions`) that are certainly not level with the ground."""
+    off = [r.inside for r in regions if r.height is not None and abs(r.height) > CERTAINLY_OFF * r.std]
+    return np.any([np.zeros(shape, bool), *off], axis=0)
 
 
 def _reach(found: Steps, patch: int, raster: Raster) -> int:

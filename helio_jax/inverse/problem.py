@@ -59,8 +59,8 @@ class FitProblem:
         parallax_height: at which the images of several beams were read [y, x], um.
         noise_share: noise of every pixel over the typical one, by its dwell time [y, x]; None: all alike.
         walls: whether a wall parts neighbours along x and y [y, x - 1], [y - 1, x]; None: no wall is known.
-        off_substrate: pixels that known steps part from the substrate: there, a flat border is not at its height
-            [y, x]; None: no step is known.
+        off_substrate: pixels known to be above or below the substrate, to which a flat border does not apply [y, x];
+            None: none is known.
         instrument: that the optics are of, None where they are given alone.
         stride: thinning of the raster; every datum stands for stride^2.
     """

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from helio_jax.arrays import as_json
+from helio_jax.arrays import as_json, border_mask
 
 _UNEXPLAINED = 0.05
 """Fraction of a patch's pixels in masks that no step explains, from which on its level is not relied on."""
@@ -113,6 +113,12 @@ class Patch:
         return math.isfinite(self.level_um) and not self.is_lower_bound and self.unexplained < _UNEXPLAINED
 
 
+def border_shares(patch: np.ndarray) -> np.ndarray:
+    """Compute the share of every patch in the outermost ring of pixels [patch], from the numbers of patches [y, x]."""
+    ring = patch[border_mask((patch.shape[0], patch.shape[1]), 1.0 / max(patch.shape))]
+    return np.bincount(ring, minlength=int(patch.max()) + 1) / ring.size
+
+
 @dataclass(frozen=True)
 class Steps:
     """All steps of a stack.
@@ -132,6 +138,12 @@ class Steps:
     p_masked: np.ndarray
     chi2: float
     dof: int
+
+    @property
+    def ground(self) -> Patch:
+        """The patch that has most of the image's border, of those whose level is known: the substrate, if any is."""
+        shares = border_shares(self.patch)
+        return max((p for p in self.patches if p.number == 0 or p.is_determined), key=lambda p: shares[p.number])
 
     @property
     def level(self) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Levels of regions: put to the level a made-up misfit asks for, a real trench."""
 
-from types import SimpleNamespace
-
 import jax
 import numpy as np
 import pytest
@@ -13,8 +11,8 @@ from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.levels import GAIN, Region, at_level, grown, plane_around, search_levels, without_skirt
-from helio_jax.inverse.measured_steps import measured_regions
-from helio_jax.inverse.step_records import Patch
+from helio_jax.inverse.measured_steps import measured_regions, off_ground
+from helio_jax.inverse.step_records import Patch, Steps
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_height
@@ -120,6 +118,16 @@ def test_a_measured_step_is_tried_above_the_surface_around():
     assert found.moved == [0] and found.surface.height[INSIDE].mean() == pytest.approx(90.0, abs=2.0)
 
 
+def patches_of(patch, *levels, std=1.0):
+    """Regions between steps, from the numbers of patches [y, x] and their levels above the first."""
+    about = [(int(np.sum(patch == n)), level, 0.0 if n == 0 else std) for n, level in enumerate(levels)]
+    listed = tuple(Patch(n, size, level, sigma, 1, False, 0.0) for n, (size, level, sigma) in enumerate(about))
+    nothing = np.zeros((3, *patch.shape))
+    return measured_regions(
+        Steps((), (), listed, patch, nothing > 0.0, nothing, 0.0, 0), Raster.regular(patch.shape, 10.0)
+    )
+
+
 def test_a_measured_level_is_above_the_patch_around_it():
     """A level of 150 um on one of 100 um is a step of 50 um; on one that is not known it is none.
 
@@ -127,14 +135,24 @@ def test_a_measured_level_is_above_the_patch_around_it():
     """
     patch = np.zeros(SHAPE, int)
     patch[4:-4, 4:-4], patch[10:-10, 10:-10] = 1, 2
+    found = [[(r.height, r.step) for r in patches_of(patch, 0.0, level, 150.0)] for level in (100.0, np.nan)]
+    assert found == [[(100.0, 100.0), (150.0, 50.0)], [(None, None), (150.0, None)]]
 
-    def regions(*levels):
-        patches = [Patch(n, 100 - n, level, 1.0, 1, False, 0.0) for n, level in enumerate(levels)]
-        found = SimpleNamespace(patches=patches, patch=patch, steps=(), bands=())
-        return measured_regions(found, Raster.regular(SHAPE, 10.0))  # type: ignore[arg-type]
 
-    assert [(r.height, r.step) for r in regions(0.0, 100.0, 150.0)] == [(100.0, 100.0), (150.0, 50.0)]
-    assert [(r.height, r.step) for r in regions(0.0, np.nan, 150.0)] == [(None, None), (150.0, None)]
+def test_levels_count_from_the_ground():
+    """The patch that has most of the border, even where a mesa is the largest one. Rejects counting from the latter."""
+    patch = np.ones(SHAPE, int)
+    patch[2:-2, 2:-2] = 0
+    (mesa,) = patches_of(patch, 0.0, -100.0, std=2.0)
+    assert (mesa.height, mesa.std) == (100.0, 2.0) and np.array_equal(mesa.inside, patch == 0)
+    assert np.array_equal(off_ground([mesa], SHAPE), patch == 0)
+
+
+def test_substrate_beyond_a_ridge_is_substrate():
+    """Over both walls of a ridge its level is 1 +- 3 um. Rejects taking every other patch for off the ground."""
+    patch = np.zeros(SHAPE, int)
+    patch[:, SHAPE[1] // 2 - 2 :], patch[:, SHAPE[1] // 2 + 3 :] = 1, 2
+    assert np.array_equal(off_ground(patches_of(patch, 0.0, 100.0, 1.0, std=3.0), SHAPE), patch == 1)
 
 
 @pytest.mark.parametrize("best", [-130.0, 45.0])
