@@ -146,7 +146,8 @@ def assumptions(rec: Reconstruction) -> list[str]:
     found.append(law_of(rec))
     if not is_fit:
         return [*found, "the albedo of each pixel is free; gains and offsets are as stated or calibrated"]
-    known = {name: numbers(fit).get(name, 0.0) for name in ("gain_std", "offset_std", "albedo_std", "drift_std")}
+    stated = numbers(fit) | numbers(table(rec.provenance, "readout_priors"))
+    known = {name: stated.get(name, 0.0) for name in ("gain_std", "offset_std", "albedo_std", "drift_std")}
     albedo = f"varies smoothly within {known['albedo_std']:g}" if known["albedo_std"] else "is that of the substrate"
     found.append(f"the albedo {albedo}, except in the patches that were found")
     gain, offset = share(known["gain_std"]), share(known["offset_std"])

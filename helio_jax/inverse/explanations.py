@@ -12,7 +12,7 @@ that is kept is undecided.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -54,7 +54,7 @@ from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
 from helio_jax.inverse.strain import is_strained, relief_of_strain
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
-from helio_jax.inverse.wider_readout import READOUT, fit_wider_readout, relief, with_widths
+from helio_jax.inverse.wider_readout import READOUT, evidence, fit_wider_readout, instrument_improvement, with_widths
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
 
@@ -66,6 +66,8 @@ NARROW = 5
 """Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels]."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
+MORE_CONTRADICTED = 1.05
+"""Gains and offsets that are not as stated may be contradicted in up to so many times as many pixels."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
 AT_REST = 0.1
@@ -97,12 +99,7 @@ class Explanation(NamedTuple):
     @property
     def has_levels(self) -> bool:
         """Whether regions were put to levels that were found."""
-        return self.number is not None or self.n_steps > 0
-
-    @property
-    def region(self) -> np.ndarray:
-        """Number of every pixel's region, for another fit at the same levels [y, x]."""
-        return self.fit.problem.region if self.number is None else self.number
+        return self.n_steps > 0 or bool(self.fit.problem.region.any())
 
     @property
     def assumed(self) -> str:
@@ -125,12 +122,12 @@ def explain(
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as
     they did before (`MIN_CONTRADICTED`). Arguments as `reconstruct_stack`.
     """
-    fits = _Fits(stack, settings, make_predict, report)
+    fits = _Fits(stack, settings, make_predict, report, start)
     none = AlbedoPatches.none(stack.shape[1:])
     if start is None:
         best, others = fits.from_steps(none), [fits.from_pits, fits.from_objects]
     else:
-        best, others = fits.from_heights(start, none), []
+        best, others = fits.from_given_heights(none), []
     is_albedo_likely = best.fit.problem.is_instrument_unknown or fits.is_substrate_dark
     others.insert(0 if is_albedo_likely else len(others), fits.from_albedo_patches)
     others.append(fits.from_wider_readout)
@@ -155,12 +152,16 @@ def explain(
                 continue
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
+            if other == fits.from_wider_readout:  # which is common to all pixels: few of them contradict a wrong one
+                most = max(most, MORE_CONTRADICTED * share)
             is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
-                gained += relief(best.fit, found.fit, settings.refine)
+                gained += instrument_improvement(best.fit, found.fit, settings.refine)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
+            elif found.fit.is_interrupted:
+                best = best._replace(fit=replace(best.fit, is_interrupted=True, status=found.fit.status))
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
@@ -175,6 +176,7 @@ class _Fits:
     settings: ReconstructSettings
     make_predict: Callable[[int], Predict]
     report: Report | None
+    given: np.ndarray | None = None
 
     @property
     def n_pixels(self) -> int:
@@ -418,8 +420,12 @@ class _Fits:
 
     @cached_property
     def plain_start(self) -> tuple[Surface, Surface]:
-        """The same without patches of another albedo; several explanations begin with it."""
-        return self.start(AlbedoPatches.none(self.stack.shape[1:]))
+        """The same without patches of another albedo, or the given heights; several explanations begin with it."""
+        if self.given is None:
+            return self.start(AlbedoPatches.none(self.stack.shape[1:]))
+        with jax.enable_x64(True):
+            start = jax.tree.map(np.asarray, surface_of_heights(self.given, Raster.of(self.stack)))
+        return start, Surface(*np.zeros((3, *self.given.shape)))
 
     def from_steps(self, patches: AlbedoPatches) -> Explanation:
         """Fit from the photometric solution, with regions at the levels of steps, measured or in the beam's shadow."""
@@ -449,29 +455,26 @@ class _Fits:
         fit = self.fitted(start, smoothed, patches, labels, anchors)
         return Explanation(fit, is_undecided, n_steps=n_steps)
 
-    def from_heights(self, height: np.ndarray, patches: AlbedoPatches) -> Explanation:
-        """Fit from given heights, whose levels are taken to be right [y, x], um."""
-        with jax.enable_x64(True):
-            start = jax.tree.map(np.asarray, surface_of_heights(height, Raster.of(self.stack)))
-        smoothed = Surface(*np.zeros((3, *height.shape)))
-        return Explanation(self.fitted(start, smoothed, patches), np.zeros(height.shape, bool))
+    def from_given_heights(self, patches: AlbedoPatches) -> Explanation:
+        """Fit from given heights, whose levels are taken to be right."""
+        return Explanation(self.fitted(*self.plain_start, patches), np.zeros(self.stack.shape[1:], bool))
 
     def from_objects(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
         if self.settings.border != "flat" or not self.settings.refine.objects or best.n_steps:
             return None
-        none, (relief, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
+        none, (surface, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
         objects = find_objects(
             self.stack,
             self.settings,
-            relief,
+            surface,
             self.predict_trial,
             lambda surface: self.misfit(surface, none),
             self.say,
         )
         if objects is None:
             return None
-        start = self.promising(objects.surface(relief), best)
+        start = self.promising(objects.surface(surface), best)
         if start is None:
             return None
         fit = self.fitted(start, smoothed, none, objects.number)
@@ -523,28 +526,35 @@ class _Fits:
             patches = patches.keeping(patches.unexplained(squares(residuals).mean(0)))
         if not patches.objects:
             return None
-        if not best.has_levels:
+        if not best.has_levels and self.given is None:
             return self.from_steps(patches)
-        surface = best.fit.state.surface  # levels that were found hold here, too
-        return best._replace(fit=self.fitted(surface, surface, patches, best.region, best.fit.problem.anchors))
+        surface, problem = best.fit.state.surface, best.fit.problem  # levels that were found hold here, too
+        return best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit gains or offsets that are not what is stated; None where nothing speaks for that.
 
-        Without patches: their albedos may stand for what wrong gains and offsets do.
+        With patches of other albedos and without: they may stand for what wrong gains and offsets do.
         """
         problem, surface = best.fit.problem, best.fit.state.surface
         if problem.is_instrument_unknown or not self.is_strained(best.fit):
             return None
-        known = AlbedoPatches.none(self.stack.shape[1:]), best.region, problem.anchors
-        fit = fit_wider_readout(
-            best.fit,
-            self.settings,
-            (surface, surface) if best.has_levels else self.plain_start,
-            lambda start, smoothed, settings: self.fitted(start, smoothed, *known, settings),
-            self.say,
-        )
-        return None if fit is None else best._replace(fit=fit)
+        start = (surface, surface) if best.has_levels else self.plain_start
+        none = AlbedoPatches.none(self.stack.shape[1:])
+        fit = best.fit
+        for patches in (none, problem.patches) if problem.patches.objects else (none,):
+            known = patches, problem.region, problem.anchors
+            fitted = partial(self._with_settings, known)
+            found = fit_wider_readout(best.fit, self.settings, start, fitted, self.say)
+            if found is not None:
+                fit = max(fit, found, key=partial(evidence, best.fit, stated=self.settings.refine))
+            if found is not None and found.is_interrupted:
+                return best._replace(fit=replace(fit, is_interrupted=True, status=found.status))
+        return None if fit is best.fit else best._replace(fit=fit)
+
+    def _with_settings(self, known: tuple, surface: Surface, smoothed: Surface, settings: ReconstructSettings) -> Fit:
+        """Fit as `fitted`, by other settings than stated; `known` as in `pose`: patches, regions, anchors."""
+        return self.fitted(surface, smoothed, *known, settings)
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:

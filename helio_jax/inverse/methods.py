@@ -192,7 +192,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.instrument_report import describe_instrument
     from helio_jax.inverse.known_heights import check_places
-    from helio_jax.inverse.wider_readout import warning_of
+    from helio_jax.inverse.wider_readout import priors_of, warning_of
 
     if make_predict is None:
         raise GuardError(
@@ -246,6 +246,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
             "instrument": describe_instrument(fit),
             "chi_square": fit.chi_square,
             "assumed": found.assumed,
+            "readout_priors": priors_of(fit),
             "anchors": as_records(anchors),
         },
     )

@@ -26,6 +26,8 @@ LEAST_FLOOR = 0.15
 """Least share of a pit's pixels that show its floor: a wall alone has no level."""
 HOPELESS = 2.0
 """A region is no pit that with its floor at the best tried depth leaves so many times the misfit of another surface."""
+EXPLAINED = 1.5
+"""Largest mean square of the residuals of a region that another surface explains."""
 LEAST_EXPLAINED = 0.5
 """Least share of a visible floor that is explained once the pit has its level: what is not flat is no pit."""
 MOST_PITS = 8
@@ -227,11 +229,13 @@ class _Region:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether at all depths the region's pixels leave far more than on the rival surface."""
+        """Whether the rival surface explains the region's pixels, and far better than a pit of any depth."""
         if self.search.rival is None:
             return False
-        least = min(np.sum(self.squares(depth)[:, self.inside]) for depth in self.depths)
-        return bool(least > HOPELESS * np.sum(squares(self.search.rival)[:, self.inside]))
+        rival = np.mean(squares(self.search.rival)[:, self.inside])
+        if rival > EXPLAINED:
+            return False
+        return bool(min(np.mean(self.squares(depth)[:, self.inside]) for depth in self.depths) > HOPELESS * rival)
 
     def sunk(self, where: np.ndarray) -> _Sunk:
         """Sink the region to the depth that explains the data best in some of its pixels [y, x] and around it."""

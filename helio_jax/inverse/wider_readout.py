@@ -9,10 +9,12 @@ solver knows normal priors only: one as wide as to have the same gradient at the
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.parameters import Parameters
@@ -58,19 +60,22 @@ def fit_wider_readout(
         say: reports what is tried.
 
     Returns:
-        The fit that explains data and instrument best; None where no other one explains more.
+        The fit that explains data and instrument best, marked as interrupted where one was; None where no other one
+        explains more.
     """
     best = fit
     for name in READOUT:
         found = _with_wider_prior(fit, name, settings, start, fitted, say)
-        best = max(best, found, key=partial(_evidence, fit, stated=settings.refine))
-        if found.is_interrupted or not is_strained(best.parameters):
+        best = max(best, found, key=partial(evidence, fit, stated=settings.refine))
+        if found.is_interrupted:
+            return replace(best, is_interrupted=True, status=found.status)
+        if not is_strained(best.parameters):
             break
     return None if best is fit else best
 
 
 def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start, fitted, say) -> Fit:
-    """Fit with a heavy-tailed prior of the gains or the offsets; the same fit where that explains no more."""
+    """Fit with a heavy-tailed prior of the gains or the offsets; the best of these fits and the one without."""
     best, (surface, smoothed) = fit, start
     for _ in range(MAX_FITS):
         before = widths(best, settings.refine)
@@ -78,22 +83,27 @@ def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start,
         if width < SAME_WIDTH * before[name]:
             break
         say(f"{READOUT[name]} {width:.0f} times the stated one")
-        found = fitted(surface, smoothed, with_widths(settings, {name: width}))
-        if found.is_interrupted:
-            return found
-        if _evidence(best, found, settings.refine) < 0.0:
+        try:
+            found = fitted(surface, smoothed, with_widths(settings, {name: width}))
+        except PredictionError as e:
+            say(f"it is given up: {e}")
             break
-        best = found
-        surface = smoothed = found.state.surface
+        better = max(best, found, key=partial(evidence, best, stated=settings.refine))
+        if found.is_interrupted:
+            return replace(better, is_interrupted=True, status=found.status)
+        if better is best:
+            break
+        best, surface = better, better.state.surface
     return best
 
 
-def _evidence(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+def evidence(fit: Fit, other: Fit, stated: RefineSettings) -> float:
     """Compute by how much another fit explains data and instrument better than a fit, in half chi-square."""
-    return half_chi_square(fit.residuals) - half_chi_square(other.residuals) + relief(fit, other, stated)
+    of_data = half_chi_square(fit.residuals) - half_chi_square(other.residuals)
+    return of_data + instrument_improvement(fit, other, stated)
 
 
-def relief(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+def instrument_improvement(fit: Fit, other: Fit, stated: RefineSettings) -> float:
     """Compute by how much less likely a fit's instrument is than another fit's, in half chi-square.
 
     Gains and offsets count by the heavy-tailed prior where one of the fits has it.
@@ -102,32 +112,38 @@ def relief(fit: Fit, other: Fit, stated: RefineSettings) -> float:
     if both[0][1] == both[1][1]:
         return relief_of_strain(fit.parameters, other.parameters)
     before, after = (
-        0.5 * float(np.sum(instrument_pulls(parameters, READOUT) ** 2)) + heavy_tailed(parameters, factors)
+        0.5 * float(np.sum(instrument_pulls(parameters, READOUT) ** 2)) + heavy_tailed_penalty(parameters, factors)
         for parameters, factors in both
     )
     return before - after
 
 
 def warning_of(fit: Fit, stated: RefineSettings) -> tuple[str, ...]:
-    """Name the gains and offsets that were fitted with wider priors than stated and lie far from what is stated."""
+    """Name the gains and offsets that were fitted with wider priors and lie far from what is stated; one at least."""
     if max(widths(fit, stated).values()) <= 1.0:
         return ()
     changes = {
         "gain": (fit.gain - 1.0, stated.gain_std),
         "offset": (fit.offset / fit.problem.median_signal, stated.offset_std),
     }
-    far = [
-        f"{what} of {name!r} {value:+.1%} (stated: 0 +- {std:.1%})"
+    named = [
+        (abs(value) / std, f"{what} of {name!r} {value:+.1%} (stated: 0 +- {std:.1%})")
         for what, (values, std) in changes.items()
         for name, value in zip(fit.instrument.detector_names, values, strict=True)
-        if abs(value) > FAR * std
     ]
-    return (WARNING.format(far=", ".join(far)),) if far else ()
+    far = [text for pull, text in named if pull > FAR]
+    return (WARNING.format(far=", ".join(far or [max(named)[1]])),)
+
+
+def priors_of(fit: Fit) -> dict[str, float]:
+    """Prior standard deviations of gains and offsets with which a fit was made, by the names of their settings."""
+    return {key: getattr(fit.problem.settings, key) for key in READOUT.values()}
 
 
 def widths(fit: Fit, stated: RefineSettings) -> Widths:
     """Compute the widths of a fit's priors of gains and offsets over those stated."""
-    return {name: getattr(fit.problem.settings, key) / getattr(stated, key) for name, key in READOUT.items()}
+    priors = priors_of(fit)
+    return {name: priors[key] / getattr(stated, key) for name, key in READOUT.items()}
 
 
 def normal_widths(parameters: Parameters, factors: Widths) -> Widths:
@@ -145,7 +161,7 @@ def normal_widths(parameters: Parameters, factors: Widths) -> Widths:
     return {name: max(1.0, math.sqrt((FREEDOM + total) / (FREEDOM + n))) for name, (total, n) in squares.items()}
 
 
-def heavy_tailed(parameters: Parameters, factors: Widths) -> float:
+def heavy_tailed_penalty(parameters: Parameters, factors: Widths) -> float:
     """Compute minus the log of the heavy-tailed prior of gains and offsets, 0 at its maximum.
 
     Arguments as those of `normal_widths`.

@@ -1,14 +1,23 @@
 """Background that was not subtracted: gains and offsets far from what is stated are found, and named."""
 
 import math
+from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import helio_jax as hx
+from helio_jax.errors import PredictionError
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
-from helio_jax.inverse.wider_readout import FREEDOM, heavy_tailed, normal_widths, with_widths
+from helio_jax.inverse.wider_readout import (
+    FREEDOM,
+    fit_wider_readout,
+    heavy_tailed_penalty,
+    normal_widths,
+    with_widths,
+)
 from tests.inverse.test_strained_instrument import parameters_with
 
 ADDED = 0.3
@@ -23,7 +32,7 @@ def pulled(offset: float) -> Parameters:
 def test_the_wider_prior_has_the_gradient_of_the_heavy_tailed_one(width):
     """At the fitted offsets, by finite differences; inside the stated deviation nothing gets wider."""
     factors, step = {"log_gain": 1.0, "offset": width}, 1e-5
-    ends = [heavy_tailed(pulled(7.0 + s), factors) for s in (-step, step)]
+    ends = [heavy_tailed_penalty(pulled(7.0 + s), factors) for s in (-step, step)]
     pull = 7.0 * width  # in stated standard deviations
     wide = normal_widths(pulled(7.0), factors)
     assert wide["log_gain"] == 1.0
@@ -38,6 +47,67 @@ def test_a_prior_may_be_wider_than_a_scene_may_state():
     stated = ReconstructSettings(refine=RefineSettings(offset_std=0.9))
     found = with_widths(stated, {"offset": 3.0}).refine
     assert found.offset_std == pytest.approx(2.7) and found.gain_std == stated.refine.gain_std
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """What is read of a fit: offsets [stated standard deviations], half its chi-square, and how it ended."""
+
+    off: float
+    misfit: float
+    settings: ReconstructSettings
+    is_interrupted: bool = False
+    status: str = "converged"
+    state: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(surface=None))
+
+    @property
+    def parameters(self) -> Parameters:
+        return parameters_with(offset=np.full(3, self.off * STATED.refine.offset_std / self.settings.refine.offset_std))
+
+    @property
+    def residuals(self) -> np.ndarray:
+        return np.ones(round(2.0 * self.misfit))
+
+    @property
+    def problem(self) -> SimpleNamespace:
+        return SimpleNamespace(settings=self.settings.refine)
+
+
+STATED = ReconstructSettings()
+HELD = StandIn(10.0, 600.0, STATED)
+
+
+def with_wider_priors(*ends):
+    """Fit stand-ins one after another: offset, misfit and whether interrupted; None: nothing can be predicted."""
+    left = list(ends)
+
+    def fitted(start, smoothed, settings):
+        end = left.pop(0)
+        if end is None:
+            raise PredictionError("no surface")
+        return StandIn(*end[:2], settings, *end[2:])
+
+    return fit_wider_readout(HELD, STATED, (None, None), fitted, lambda said: None)  # type: ignore[arg-type]
+
+
+def test_the_fit_that_explains_most_is_kept():
+    """The second is better than the first, the third is worse. One that is no better at all is not kept."""
+    found = with_wider_priors((20.0, 300.0), (28.0, 200.0), (30.0, 250.0), (29.0, 210.0), (29.0, 210.0), (29.0, 210.0))
+    assert found is not None and found.misfit == 200.0
+    assert with_wider_priors((20.0, 900.0), (20.0, 900.0)) is None
+
+
+def test_a_fit_that_fails_does_not_take_an_earlier_one_with_it():
+    """Nothing can be predicted in the second fit with wider offsets, nor with wider gains: the first is kept."""
+    found = with_wider_priors((20.0, 300.0), None, None)
+    assert found is not None and found.misfit == 300.0
+
+
+@pytest.mark.parametrize(("misfit", "kept"), [(250.0, 250.0), (900.0, 300.0)])
+def test_an_interrupted_fit_ends_the_search(misfit, kept):
+    """The better one is kept, marked as interrupted. Catches an interrupt that is lost with the worse fit."""
+    found = with_wider_priors((20.0, 300.0), (28.0, misfit, True, "interrupted"))
+    assert found is not None and found.misfit == kept and found.is_interrupted and found.status == "interrupted"
 
 
 @pytest.mark.slow
