@@ -7,10 +7,12 @@ from helio_jax.calibration.unknowns import KnownShapeSettings
 
 OUTLINE = 0.6, 0.3, 0.15
 """Scale of the logistic function by which a pixel changes from object to substrate, over the pitch of a raster of at
-most `FIRST_PIXELS` pixels a side: in the first rounds and all later ones. A wide outline finds the object from farther
-away, a narrow one places it better. Data of a pixel that is closer to an outline than this are left out: its masks and
-its multiple scattering change too fast with the object's place for a linear step, and differ between the parts. They
-still tell on which part it lies."""
+most `FIRST_PIXELS` pixels a side: of each stage of a fit. A wide outline finds the object from farther away, a narrow
+one places it better; narrowed before the fit has settled, it holds the object in a wrong place."""
+BESIDE = 0.3
+"""Data of a pixel that is closer to an outline than this, over that pitch, or than that scale, are left out: its
+masks and its multiple scattering change too fast with the object's place for a linear step, and differ between the
+parts. They still tell on which part it lies."""
 CONVERGED = 0.1
 """A fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
 

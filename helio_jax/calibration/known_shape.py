@@ -36,7 +36,7 @@ from helio_jax.calibration.known_model import (
     see,
 )
 from helio_jax.calibration.known_objects import KnownObject
-from helio_jax.calibration.known_pixels import CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
+from helio_jax.calibration.known_pixels import BESIDE, CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
 from helio_jax.calibration.known_scan import (
     InstrumentFit,
     KnownScan,
@@ -126,6 +126,7 @@ class _Fit:
         self.lines = [np.zeros(len(s.counts)) for s in scans]
         self.tiles = [_tiles_of(see(s.model, self.layout.of_scan(i, self.x))) for i, s in enumerate(scans)]
         self.model_error = [np.zeros((len(s.counts), 2)) for s in scans]  # of substrate and object [detector, part]
+        self.stage = 0  # of the outline, which is narrowed from one to the next
         self.is_near = False  # whether misfit is the model's error, no longer that of the unknowns
         self.is_error_known = False  # whether the errors of lines and tiles are held
         self.multiple: list[Multiple] = [
@@ -152,7 +153,7 @@ class _Fit:
     def start_at(self, first: "_Fit") -> None:
         """Begin where a fit of fewer pixels has ended."""
         self.x, self.linear, self.deviation = first.x, first.linear, first.deviation
-        self.is_near, self.rounds_before = first.is_near, max(len(OUTLINE), len(RADIOSITY_PIXELS))
+        self.is_near, self.stage, self.rounds_before = first.is_near, first.stage, len(RADIOSITY_PIXELS)
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """Split whitened unknowns into those of the geometry, and the linear ones of the scans [detector, column]."""
@@ -227,14 +228,14 @@ class _Fit:
             if scan.known.kind != "flat":
                 self.multiple[i] = self._scattered_again(number, i, at, seen, instrument)
             step = _outline_pitch(scan)
-            self.width[i] = OUTLINE[min(number, len(OUTLINE) - 1)] * step
+            self.width[i] = OUTLINE[self.stage] * step
             used = scan.is_used & ~near_foot(scan, own, seen.distance, self.settings)
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             self.outlined[i] = used.any(0)
-            is_beside = is_beside_outline(log_share, self.width[i] / (OUTLINE[0] * step))
+            is_beside = is_beside_outline(log_share, max(OUTLINE[self.stage], BESIDE) / OUTLINE[0])
             # once the outline is narrow, such a pixel stays out: else it may go in and out for ever
-            self.is_beside[i] = is_beside | (self.is_beside[i] & (number >= len(OUTLINE)))
+            self.is_beside[i] = is_beside | (self.is_beside[i] & (self.stage == len(OUTLINE) - 1))
             self.used[i] = used & ~self.is_beside[i]
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
@@ -374,7 +375,9 @@ def _run(
         is_at_minimum = number > 1 and solved.status > 0
         if is_at_minimum and fit.is_near and change < CONVERGED:
             return done + number + 1, True
-        fit.is_near |= is_at_minimum and change < NEAR
+        if is_at_minimum and change < NEAR:
+            fit.is_near |= fit.stage == len(OUTLINE) - 1
+            fit.stage = min(fit.stage + 1, len(OUTLINE) - 1)
         if fit.is_near and until_near:
             return done + number + 1, False
     return max_rounds, False

@@ -160,6 +160,9 @@ def law_of(rec: Reconstruction) -> str:
     law = table(rec.provenance, "instrument", "law")
     if not law:
         return "surfaces scatter by the cosine law"
+    if law.get("kind") == "as_stated":
+        exponent, std = (numbers(law).get(key, math.nan) for key in ("exponent", "std"))
+        return f"surfaces scatter by the law of the instrument file, cos^(1 + m) with m = {exponent:.3g} +- {std:.2g}"
     kind, judged = str(law.get("kind")).replace("_", " "), "compatible" if law.get("is_cosine") else "NOT compatible"
     chance = numbers(law).get("cosine_probability", math.nan)
     return (

@@ -23,6 +23,7 @@ from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.edges import AxisEdges
+from helio_jax.inverse.law_prior import HELD
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.parameters import Parameters, smooth_albedo
@@ -151,7 +152,8 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
     edge_error = EdgeError.of(there.surface, *edges)
     planes = part.priors.tilt * part.position
     rim_errors = _rim_errors(edges, fixed, linear.edge_scale)
-    unfitted = np.asarray(block_diag(_incidence_error(part, unknowns, fixed), rim_errors))
+    of_data = np.hstack([_incidence_error(part, unknowns, fixed), _law_error(part, linear)])
+    unfitted = np.asarray(block_diag(of_data, rim_errors))
     return LinearisedFit(linear, error, edge_error, planes, part, there, stride, unfitted)
 
 
@@ -180,6 +182,12 @@ def _incidence_error(problem: FitProblem, unknowns: Unknowns, fixed: FixedTerms)
 
 
 _data_by_incidence = compiled(data_by_incidence)
+
+
+def _law_error(problem: FitProblem, linear: Linearised) -> np.ndarray:
+    """Compute what one standard deviation of a law that is held does to the data [residual, number]."""
+    of_law = [i for i, name in enumerate(linear.names) if name.startswith("law[") and problem.is_law_held]
+    return linear.instrument[: problem.signal.size, of_law] / HELD
 
 
 def derivative_of_sums(sums: Anchors, planes: np.ndarray, linear: Linearised) -> np.ndarray:

@@ -90,7 +90,8 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     changes of what stack and instrument state. `weak`: combinations of which the data leave more than `WEAK` of their
     prior standard deviation: `share` is what they leave, `of` the largest terms of the (unit) combination. `inflation`:
     Birge ratio by which all error bars are enlarged. `common_mode_um`: largest common-mode error that was added for an
-    instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, where one was fitted.
+    instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, but for the
+    cosine law.
     `discrepancy`: what the model was found to lack, detector -> root mean square over the median signal, where the
     instrument states any, and `discrepancy_std`, that; its modes are in neither list.
     """
@@ -98,7 +99,8 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     if posterior is None:
         return {}
     detectors = fit.instrument.detector_names
-    listed = listed_one_by_one(posterior.names)
+    hidden = ("law",) if fit.problem.is_law_held else ()
+    listed = [i for i in listed_one_by_one(posterior.names) if kind_of(posterior.names[i]) not in hidden]
     names = tuple(posterior.names[i] for i in listed)
     matrix, units = units_of(fit.problem, names)
     law = fit.problem.priors.law
@@ -141,14 +143,20 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
 
 
 def describe_law(fit: Fit, posterior: Posterior) -> dict[str, Any]:
-    """Test whether the fitted scattering law is compatible with the cosine law.
+    """Describe the scattering law; of a fitted one, test whether it is compatible with the cosine law.
 
     `kind`: of the law; `cosine_probability`: `law_prior.cosine_probability`; `is_cosine`: whether it exceeds
-    `LEAST_PROBABILITY`.
+    `LEAST_PROBABILITY`. Of a law that is held: `exponent` and `std`, as the instrument file states them.
     """
+    if fit.problem.is_law_held:
+        assert fit.problem.instrument is not None and fit.problem.instrument.law is not None
+        return {"kind": "as_stated"} | fit.problem.instrument.law.model_dump()
     prior, whitened = fit.problem.priors.law, np.ravel(fit.parameters.law)
     of_law = [i for i, name in enumerate(posterior.names) if kind_of(name) == "law"]
     assert prior is not None
     probability = cosine_probability(prior, whitened, posterior.instrument_covariance[np.ix_(of_law, of_law)])
-    kind = fit.problem.settings.law_of_fit(is_stated=True)  # only the stated one needs no name
-    return {"kind": kind, "cosine_probability": probability, "is_cosine": probability > LEAST_PROBABILITY}
+    return {
+        "kind": fit.problem.settings.law,
+        "cosine_probability": probability,
+        "is_cosine": probability > LEAST_PROBABILITY,
+    }

@@ -14,6 +14,10 @@ from helio_jax.inverse.settings import RefineSettings
 
 LEAST_IMAGES = 5
 """Least number of images from which a monotone law is fitted: three give the facet and its albedo."""
+HELD = 1e-4
+"""The law of the instrument file is held in a fit: its number has this share of its prior standard deviation. What that
+leaves open is in the error bars (`fit.linearised_at`). Three images hardly tell the law of unknown relief: kinks of
+facets within a pixel moved m by 0.1, and heights by as much."""
 _NAMES = {
     PowerLaw: (("exponent of the law", "m of cos^(1 + m)"),),
     LobeLaw: (("share of the lobe", "of the atoms"), ("width of the lobe", "deg")),
@@ -36,11 +40,11 @@ def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> La
 
     Args:
         settings: of the fit. A law that they name has a prior about the numbers of the cosine law.
-        stated: law of the instrument file, for settings that name none.
+        stated: law of the instrument file, for settings that name none: it is held.
     """
     s = settings
     if s.law == "as_stated" and stated is not None:
-        return LawPrior(PowerLaw(stated.exponent), PowerLaw(stated.std))
+        return LawPrior(PowerLaw(stated.exponent), PowerLaw(HELD * stated.std))
     if s.law == "power":
         return LawPrior(PowerLaw(0.0), PowerLaw(s.law_std))
     if s.law == "broad_specular":

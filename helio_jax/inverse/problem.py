@@ -210,6 +210,11 @@ class FitProblem:
         return law_prior(self.settings, None if self.instrument is None else self.instrument.law)
 
     @property
+    def is_law_held(self) -> bool:
+        """Whether the scattering law is that of the instrument file, whose number is not fitted (`law_prior.HELD`)."""
+        return self.law_prior is not None and not self.settings.has_own_law
+
+    @property
     def priors(self) -> Priors:
         """Prior standard deviations of the parameters."""
         s, median = self.settings, self.median_signal

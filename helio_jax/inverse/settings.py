@@ -35,11 +35,12 @@ class RefineSettings(Settings):
     line_std: float = Field(default=0.0, ge=0.0, le=10.0)
     """Prior standard deviation of each scan line's own offset, relative to the median signal; 0: lines have none."""
     law: Literal["as_stated", "cosine", "power", "broad_specular", "rough_diffuse", "monotone"] = "as_stated"
-    """Scattering law of the sample. `as_stated`: that of the instrument file's [law], within its standard deviation;
-    the cosine law where it has none. `cosine`: known; the others have unknown numbers, about those of the cosine law.
-    `power`: exponent m of cos^(1 + m); `broad_specular`: share and width of a lobe about the mirror's direction, the
-    rest by the cosine law; `rough_diffuse`: roughness r of the energy-preserving Oren-Nayar model; `monotone`: any
-    density that falls with the angle to the normal, by its exponent at 7 angles (needs 5 or more images)."""
+    """Scattering law of the sample. `as_stated`: that of the instrument file's [law], which is not fitted, but whose
+    standard deviation is in the error bars; the cosine law where it has none. `cosine`: known; the others have unknown
+    numbers, about those of the cosine law. `power`: exponent m of cos^(1 + m); `broad_specular`: share and width of a
+    lobe about the mirror's direction, the rest by the cosine law; `rough_diffuse`: roughness r of the energy-preserving
+    Oren-Nayar model; `monotone`: any density that falls with the angle to the normal, by its exponent at 7 angles
+    (needs 5 or more images)."""
     law_std: float = Field(default=0.3, gt=0.0, le=1.0)
     """Prior standard deviation of m, of the lobe's share, of r, or of the logarithm of each of the 7 exponents."""
     law_width_deg: float = Field(default=30.0, ge=5.0, le=90.0)

@@ -203,7 +203,7 @@ def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -
     state = with_responses(problem, predict_corrections(problem, state, predict))
     p, base = state.parameters, np.mean(state.held.corrections.multiple)
     rate = np.zeros(p.law.size)
-    for i in range(rate.size if base > 0.0 else 0):
+    for i in range(0 if problem.is_law_held or base <= 0.0 else rate.size):
         stepped = p.replaced(law=p.law + LAW_STEP * (np.arange(rate.size) == i))
         found = np.mean(_predicted(problem, state, predict, stepped).multiple)
         rate[i] = np.log(max(found / base, LEAST_RATIO)) / LAW_STEP
