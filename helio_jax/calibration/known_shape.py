@@ -33,7 +33,9 @@ from helio_jax.calibration.known_model import (
     no_multiple,
     parts,
     probability,
+    radiosity_at,
     see,
+    smoothed_by,
 )
 from helio_jax.calibration.known_objects import KnownObject
 from helio_jax.calibration.known_pixels import BESIDE, CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
@@ -65,6 +67,9 @@ that of the unknowns. Then they are held: estimated again from residuals that th
 RADIOSITY_PIXELS = 25, 25, 61
 """Pixels along the longer side of the raster on which multiple scattering is derived, about: in the first rounds and
 all later ones. On a coarse raster the derivatives are wrong about an object's foot, where they are largest."""
+MOST_SMOOTHED = 91
+"""Pixels along the longer side of a raster, at most, on which the noise of traced multiple scattering is smoothed by
+radiosity; on more of them radiosity takes too much memory."""
 STALE, OLD = 8.0, 0.5
 """Changes of an unknown [standard deviations] after which the derivatives of the multiple scattering are computed anew,
 and after which it is traced anew."""
@@ -277,6 +282,9 @@ class _Fit:
             albedo = np.where(seen.is_object, np.exp(own["log albedo ratio"]), 1.0) / bright
             thrift = 1 if self.is_near else THRIFT
             traced = self.trace(i, instrument, own, scan.model.raster, thrift) / albedo * bright
+            if max(scan.model.raster.shape) <= MOST_SMOOTHED:
+                predicted = radiosity_at(scan.model, at, self.settings.substrate_um)
+                traced = smoothed_by(traced, predicted, seen.is_object)
             self.traced_at[i] = self.x if self.is_near else self.traced_at[i]
         moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
         if traced is not None and number >= len(RADIOSITY_PIXELS) and np.max(moved) < STALE:
