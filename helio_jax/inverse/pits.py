@@ -26,7 +26,7 @@ LEAST_FLOOR = 0.15
 """Least share of a pit's pixels that show its floor: a wall alone has no level."""
 HOPELESS = 2.0
 """A region is no pit that with its floor at the best tried depth leaves so many times the misfit of another surface."""
-EXPLAINED = 1.5
+WELL_EXPLAINED = 1.5
 """Largest mean square of the residuals of a region that another surface explains."""
 LEAST_EXPLAINED = 0.5
 """Least share of a visible floor that is explained once the pit has its level: what is not flat is no pit."""
@@ -233,7 +233,7 @@ class _Region:
         if self.search.rival is None:
             return False
         rival = np.mean(squares(self.search.rival)[:, self.inside])
-        if rival > EXPLAINED:
+        if rival > WELL_EXPLAINED:
             return False
         return bool(min(np.mean(self.squares(depth)[:, self.inside]) for depth in self.depths) > HOPELESS * rival)
 
