@@ -244,9 +244,10 @@ def expand_multiple(
     thin = model.thinned(stride)
     with jax.enable_x64(True):
         at = jnp.asarray(unknowns)
-        slope = np.asarray(_again_derivative(thin, at, _planned(thin, at, substrate_um), free))
+        plan = _planned(thin, at, substrate_um)
+        slope = np.asarray(_again_derivative(thin, at, plan, free))
     if traced is None:
-        traced = radiosity_at(model, unknowns, substrate_um)
+        traced = radiosity_at(model, unknowns, substrate_um, plan if stride == 1 else None)
     ny, nx = model.raster.shape
     nearest = [np.minimum((np.arange(n) + stride // 2) // stride, len(range(0, n, stride)) - 1) for n in (ny, nx)]
     return Multiple(traced, slope[:, :, nearest[0][:, None], nearest[1]], free, unknowns)
@@ -260,18 +261,17 @@ def _planned(model: ScanModel, at: jax.Array, substrate_um: float) -> Any:
     return plan_radiosity(np.asarray(surface.height), normals, optics, model.raster, substrate_um=substrate_um)
 
 
-def radiosity_at(model: ScanModel, unknowns: np.ndarray, substrate_um: float) -> np.ndarray:
-    """Compute the multiple scattering by radiosity [detector, y, x], NumPy, float64."""
+def radiosity_at(model: ScanModel, unknowns: np.ndarray, substrate_um: float, plan: Any = None) -> np.ndarray:
+    """Compute the multiple scattering by radiosity [detector, y, x], NumPy, float64; `plan`: its own, if known."""
     with jax.enable_x64(True):
         at = jnp.asarray(unknowns)
-        return np.asarray(_scattered_again(model, at, _planned(model, at, substrate_um)))
+        return np.asarray(_scattered_again(model, at, _planned(model, at, substrate_um) if plan is None else plan))
 
 
 def smoothed_by(traced: np.ndarray, predicted: np.ndarray, is_object: np.ndarray) -> np.ndarray:
     """Smooth the noise of traced multiple scattering: its ratio to a prediction without noise varies little.
 
-    A regressor's noise makes its fitted factor too small, and moves what it trades against: 512 paths a pixel moved the
-    distance and the plate's shift by 1.6 standard deviations.
+    A regressor's noise makes its fitted factor too small: by half a standard deviation with 512 paths a pixel.
 
     Args:
         traced: multiple scattering [detector, y, x].

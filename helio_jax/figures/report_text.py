@@ -156,7 +156,7 @@ def assumptions(rec: Reconstruction) -> list[str]:
 
 
 def law_of(rec: Reconstruction) -> str:
-    """Say by which law the sample was taken to scatter, and whether it came out as the cosine law."""
+    """Say by which law the sample was taken to scatter; of a fitted one, whether it came out as the cosine law."""
     law = table(rec.provenance, "instrument", "law")
     if not law:
         return "surfaces scatter by the cosine law"

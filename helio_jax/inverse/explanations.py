@@ -42,7 +42,7 @@ from helio_jax.inverse.measured_steps import (
     walls_of,
 )
 from helio_jax.inverse.objects import find_objects
-from helio_jax.inverse.parameters import Parameters
+from helio_jax.inverse.parameters import HELD, Parameters
 from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo
 from helio_jax.inverse.pits import PitSearch
 from helio_jax.inverse.problem import FitProblem
@@ -73,8 +73,6 @@ UNLIKELY_GAIN = 3.0
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
-HELD = 1e-4
-"""Gains and offsets that are held have this share of their prior standard deviation."""
 
 
 class Explanation(NamedTuple):
@@ -150,9 +148,11 @@ def explain(
             found = other(best, residuals)
             if found is None:
                 continue
+            if found.fit.is_interrupted:  # whichever is kept
+                best = best._replace(fit=replace(best.fit, is_interrupted=True, status=found.fit.status))
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
-            if other == fits.from_wider_readout:  # which is common to all pixels: few of them contradict a wrong one
+            if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
                 most = max(most, MORE_CONTRADICTED * share)
             is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
@@ -160,8 +160,6 @@ def explain(
                 gained += instrument_improvement(best.fit, found.fit, settings.refine)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
-            elif found.fit.is_interrupted:
-                best = best._replace(fit=replace(best.fit, is_interrupted=True, status=found.fit.status))
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
@@ -546,10 +544,12 @@ class _Fits:
             known = patches, problem.region, problem.anchors
             fitted = partial(self._with_settings, known)
             found = fit_wider_readout(best.fit, self.settings, start, fitted, self.say)
-            if found is not None:
-                fit = max(fit, found, key=partial(evidence, best.fit, stated=self.settings.refine))
-            if found is not None and found.is_interrupted:
-                return best._replace(fit=replace(fit, is_interrupted=True, status=found.status))
+            if found is None:
+                continue
+            fit = max(fit, found, key=partial(evidence, best.fit, stated=self.settings.refine))
+            if found.is_interrupted:
+                fit = replace(fit, is_interrupted=True, status=found.status)
+                break
         return None if fit is best.fit else best._replace(fit=fit)
 
     def _with_settings(self, known: tuple, surface: Surface, smoothed: Surface, settings: ReconstructSettings) -> Fit:

@@ -23,10 +23,9 @@ from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.edges import AxisEdges
-from helio_jax.inverse.law_prior import HELD
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
-from helio_jax.inverse.parameters import Parameters, smooth_albedo
+from helio_jax.inverse.parameters import HELD, Parameters, smooth_albedo
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
@@ -185,8 +184,12 @@ _data_by_incidence = compiled(data_by_incidence)
 
 
 def _law_error(problem: FitProblem, linear: Linearised) -> np.ndarray:
-    """Compute what one standard deviation of a law that is held does to the data [residual, number]."""
-    of_law = [i for i, name in enumerate(linear.names) if name.startswith("law[") and problem.is_law_held]
+    """Compute what one standard deviation of a law that is held does to the data [residual, number].
+
+    Multiple scattering counts as it is: how it follows a law that is held is not computed.
+    """
+    names = linear.names if problem.is_law_held else ()
+    of_law = [i for i, name in enumerate(names) if name.startswith("law[")]
     return linear.instrument[: problem.signal.size, of_law] / HELD
 
 

@@ -9,15 +9,11 @@ from scipy.stats import chi2
 from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError
 from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw
-from helio_jax.inverse.parameters import LawPrior
+from helio_jax.inverse.parameters import HELD, LawPrior
 from helio_jax.inverse.settings import RefineSettings
 
 LEAST_IMAGES = 5
 """Least number of images from which a monotone law is fitted: three give the facet and its albedo."""
-HELD = 1e-4
-"""The law of the instrument file is held in a fit: its number has this share of its prior standard deviation. What that
-leaves open is in the error bars (`fit.linearised_at`). Three images hardly tell the law of unknown relief: kinks of
-facets within a pixel moved m by 0.1, and heights by as much."""
 _NAMES = {
     PowerLaw: (("exponent of the law", "m of cos^(1 + m)"),),
     LobeLaw: (("share of the lobe", "of the atoms"), ("width of the lobe", "deg")),
@@ -40,7 +36,8 @@ def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> La
 
     Args:
         settings: of the fit. A law that they name has a prior about the numbers of the cosine law.
-        stated: law of the instrument file, for settings that name none: it is held.
+        stated: law of the instrument file, for settings that name none. It is held (`HELD`), for three images hardly
+            tell the law of unknown relief; what that leaves open is in the error bars (`fit.linearised_at`).
     """
     s = settings
     if s.law == "as_stated" and stated is not None:

@@ -121,7 +121,8 @@ def find_steps(stack: MicrographStack) -> Steps:
     patch = _patches(measured, images, levels)
     result = _joined(measured, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step, above most of the border
-    heights = [result.patches[s.below].level_um - result.ground.level_um for s in result.steps[:n]]
+    ground = result.ground.level_um
+    heights = [result.patches[s.below].level_um - ground for s in result.steps[:n]]
     moved = [z if math.isfinite(z) else 0.0 for z in heights]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):
         again = [measure_edge(i, e, scan, z) for i, (e, z) in enumerate(zip(edges, moved, strict=True), 1)]

@@ -66,6 +66,10 @@ NAMES = tuple(Parameters.__dataclass_fields__)
 """Names of the parameters, in array order."""
 
 
+HELD = 1e-4
+"""What is held in a fit has this share of its prior standard deviation."""
+
+
 class LawPrior(eqx.Module):
     """What is known of the numbers of a scattering law: means and standard deviations, each in the form of a law."""
 

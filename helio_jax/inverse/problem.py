@@ -211,7 +211,7 @@ class FitProblem:
 
     @property
     def is_law_held(self) -> bool:
-        """Whether the scattering law is that of the instrument file, whose number is not fitted (`law_prior.HELD`)."""
+        """Whether the scattering law is that of the instrument file, whose number is not fitted."""
         return self.law_prior is not None and not self.settings.has_own_law
 
     @property

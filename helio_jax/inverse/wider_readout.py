@@ -86,7 +86,7 @@ def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start,
         try:
             found = fitted(surface, smoothed, with_widths(settings, {name: width}))
         except PredictionError as e:
-            say(f"it is given up: {e}")
+            say(f"the wider prior is given up: {e}")
             break
         better = max(best, found, key=partial(evidence, best, stated=settings.refine))
         if found.is_interrupted:

@@ -100,8 +100,8 @@ def continue_border(z: np.ndarray, pitch: tuple[float, float], level: float, pix
 def predict_border(z: np.ndarray, pixels: int) -> np.ndarray:
     """Continue heights as a stationary random surface of the image's autocorrelation [y + 2 pixels, x + 2 pixels].
 
-    Heights beyond the border are the best linear prediction from those inside, within their range: they
-    fall to the mean height over the relief's correlation length.
+    Heights beyond the border are the best linear prediction from those inside, within their range: they fall to
+    the mean height over the relief's correlation length.
 
     Args:
         z: heights [y, x], um.

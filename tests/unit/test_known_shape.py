@@ -111,10 +111,9 @@ def test_instrument_moves_as_optics_do(bshem):
 def test_data_beside_the_outline_are_left_out(bshem):
     """Left out is every pixel that the object reaches or leaves when it moves by `BESIDE` pitches, and no other.
 
-    That is at the last stage, whose outline is narrower.
-
-    Such pixels once held the fit off the right place by 5 to 15 deviations. Catches a distance in wrong units, and an
-    outline that no longer counts these pixels. No chance is involved.
+    At the last stage, whose outline is narrower. Pixels so close once held the fit off the right place by 5 to 15
+    deviations. Catches a distance in wrong units, and an outline that no longer counts these pixels. No chance is
+    involved.
     """
     counts = np.random.default_rng(4).normal(1000.0, 10.0, (3, AXIS.size, AXIS.size))
     stack = MicrographStack(counts, AXIS, AXIS, bshem, variance=np.full(counts.shape, 100.0), noise="poisson")
