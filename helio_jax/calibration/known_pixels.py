@@ -8,11 +8,17 @@ from helio_jax.calibration.unknowns import KnownShapeSettings
 OUTLINE = 0.6, 0.3, 0.15
 """Scale of the logistic function by which a pixel changes from object to substrate, over the pitch of a raster of at
 most `FIRST_PIXELS` pixels a side: of each stage of a fit. A wide outline finds the object from farther away, a narrow
-one places it better; narrowed before the fit has settled, it holds the object in a wrong place."""
+one places it better. `known_shape` narrows it when the fit has settled: before, it holds the object in a wrong place.
+`mask_directions` narrows it round by round: to wait did not help there."""
 BESIDE = 0.3
-"""Data of a pixel that is closer to an outline than this, over that pitch, or than that scale, are left out: its
-masks and its multiple scattering change too fast with the object's place for a linear step, and differ between the
-parts. They still tell on which part it lies."""
+"""Data of a pixel that is closer to an outline than so many pitches (of a raster thinned to `FIRST_PIXELS`), or than
+the present scale of the logistic function if that is larger, are left out: its masks and its multiple scattering
+change too fast with the object's place for a linear step, and differ between the parts. They still tell on which
+part it lies."""
+NARROWEST = len(OUTLINE) - 1
+"""Last stage of a fit."""
+SETTLED = 1.0
+"""A fit has settled when no unknown changes by more standard deviations in a round: then the outline is narrowed."""
 CONVERGED = 0.1
 """A fit has converged when no unknown changes by more than this share of its standard deviation in a round."""
 
@@ -59,11 +65,13 @@ def membership(
     return weight / weight.sum(0)
 
 
-def is_beside_outline(log_share: np.ndarray, width: float) -> np.ndarray:
+def beside_outline(log_share: np.ndarray, width: float, before: np.ndarray | None) -> np.ndarray:
     """Find the pixels that are closer to an outline than a distance [y, x].
 
     Args:
-        log_share: logarithm of the share that each part takes of a pixel [part, y, x].
-        width: that distance, over the scale of the logistic function of the shares.
+        log_share: logarithm of the share that each part takes of a pixel, at the widest outline [part, y, x].
+        width: that distance, in the unit of `OUTLINE`.
+        before: pixels that are listed again, in the last stage of a fit: else one may go in and out for ever [y, x].
     """
-    return log_share.max(0) < -np.logaddexp(0.0, -width)
+    is_beside = log_share.max(0) < -np.logaddexp(0.0, -width / OUTLINE[0])
+    return is_beside if before is None else is_beside | before

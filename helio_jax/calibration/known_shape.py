@@ -34,11 +34,21 @@ from helio_jax.calibration.known_model import (
     parts,
     probability,
     radiosity_at,
+    radiosity_plan,
     see,
     smoothed_by,
 )
 from helio_jax.calibration.known_objects import KnownObject
-from helio_jax.calibration.known_pixels import BESIDE, CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
+from helio_jax.calibration.known_pixels import (
+    BESIDE,
+    CONVERGED,
+    NARROWEST,
+    OUTLINE,
+    SETTLED,
+    beside_outline,
+    membership,
+    near_foot,
+)
 from helio_jax.calibration.known_scan import (
     InstrumentFit,
     KnownScan,
@@ -61,15 +71,12 @@ from helio_jax.robust import cauchy_weight
 
 TILES_ACROSS = 6
 """Tiles across an object within which the model's error is the same, if each of them has `TILE` pixels or more."""
-NEAR = 1.0
-"""Errors of the model are estimated when no unknown changes by more standard deviations in a round: before, misfit is
-that of the unknowns. Then they are held: estimated again from residuals that they have shaped, they only grow."""
 RADIOSITY_PIXELS = 25, 25, 61
 """Pixels along the longer side of the raster on which multiple scattering is derived, about: in the first rounds and
 all later ones. On a coarse raster the derivatives are wrong about an object's foot, where they are largest."""
-MOST_SMOOTHED = 91
+MOST_SMOOTHED = 151
 """Pixels along the longer side of a raster, at most, on which the noise of traced multiple scattering is smoothed by
-radiosity; on more of them radiosity takes too much memory."""
+radiosity: there it takes 10 s and 1.6 GB, with 201 of them 27 s and 3.2 GB."""
 STALE, OLD = 8.0, 0.5
 """Changes of an unknown [standard deviations] after which the derivatives of the multiple scattering are computed anew,
 and after which it is traced anew."""
@@ -124,7 +131,7 @@ class _Fit:
         self, stated: Instrument, scans: list[KnownScan], settings: KnownShapeSettings, trace: Trace | None
     ) -> None:
         self.stated, self.scans, self.settings, self.trace = stated, scans, settings, trace
-        self.rounds_before = 0  # of a fit of fewer pixels: their outline and their radiosity are coarse
+        self.rounds_before = 0  # of a fit of fewer pixels, whose radiosity is coarse
         self.layout = Layout(instrument_unknowns(stated, settings), scans)
         self.x = np.zeros(len(self.layout.unknowns))
         self.line_groups = [scan_lines(s.model.raster.shape, s.slow_axis) for s in scans]
@@ -132,8 +139,10 @@ class _Fit:
         self.tiles = [_tiles_of(see(s.model, self.layout.of_scan(i, self.x))) for i, s in enumerate(scans)]
         self.model_error = [np.zeros((len(s.counts), 2)) for s in scans]  # of substrate and object [detector, part]
         self.stage = 0  # of the outline, which is narrowed from one to the next
-        self.is_near = False  # whether misfit is the model's error, no longer that of the unknowns
-        self.is_error_known = False  # whether the errors of lines and tiles are held
+        # settled at the narrowest outline: misfit is the model's error, no longer that of the unknowns
+        self.is_near = False
+        # errors of lines and tiles are then held: estimated from residuals that they have shaped, they only grow
+        self.is_error_known = False
         self.multiple: list[Multiple] = [
             no_multiple(s.model, self.layout.of_scan(i, self.x), self.layout.free[i]) for i, s in enumerate(scans)
         ]
@@ -238,9 +247,8 @@ class _Fit:
             # a wide outline: the data shall tell on which part a pixel lies, not the present unknowns
             value, log_share = parts(scan.model, at, self.multiple[i], OUTLINE[0] * step)
             self.outlined[i] = used.any(0)
-            is_beside = is_beside_outline(log_share, max(OUTLINE[self.stage], BESIDE) / OUTLINE[0])
-            # once the outline is narrow, such a pixel stays out: else it may go in and out for ever
-            self.is_beside[i] = is_beside | (self.is_beside[i] & (self.stage == len(OUTLINE) - 1))
+            before = self.is_beside[i] if self.stage == NARROWEST else None
+            self.is_beside[i] = beside_outline(log_share, max(OUTLINE[self.stage], BESIDE), before)
             self.used[i] = used & ~self.is_beside[i]
             if number == 0:
                 inverse = np.where(self.used[i], 1.0 / scan.sigma, 0.0)
@@ -273,7 +281,7 @@ class _Fit:
 
     def _scattered_again(self, number: int, i: int, at: np.ndarray, seen: Seen, instrument: Instrument) -> Multiple:
         """Compute the multiple scattering of a scan, its derivatives anew where the unknowns have moved far."""
-        scan, traced = self.scans[i], None
+        scan, traced, plan = self.scans[i], None, None
         if np.max(np.abs(self.x - self.traced_at[i]) / self.deviation) < OLD:
             return self.multiple[i]
         if self.trace is not None:
@@ -283,15 +291,16 @@ class _Fit:
             thrift = 1 if self.is_near else THRIFT
             traced = self.trace(i, instrument, own, scan.model.raster, thrift) / albedo * bright
             if max(scan.model.raster.shape) <= MOST_SMOOTHED:
-                predicted = radiosity_at(scan.model, at, self.settings.substrate_um)
-                traced = smoothed_by(traced, predicted, seen.is_object)
+                plan = radiosity_plan(scan.model, at, self.settings.substrate_um)
+                traced = smoothed_by(traced, radiosity_at(scan.model, at, plan), seen.is_object)
             self.traced_at[i] = self.x if self.is_near else self.traced_at[i]
         moved = np.abs(self.x - self.expanded_at[i]) / self.deviation
         if traced is not None and number >= len(RADIOSITY_PIXELS) and np.max(moved) < STALE:
             return self.multiple[i].shifted(traced, at)
         self.expanded_at[i] = self.x
         pixels = RADIOSITY_PIXELS[min(number, len(RADIOSITY_PIXELS) - 1)]
-        return expand_multiple(scan.model, at, self.layout.free[i], self.settings.substrate_um, pixels, traced)
+        about = self.settings.substrate_um, pixels, traced, plan
+        return expand_multiple(scan.model, at, self.layout.free[i], *about)
 
     def fitted(self) -> Instrument:
         """Move the instrument by the present unknowns."""
@@ -383,9 +392,9 @@ def _run(
         is_at_minimum = number > 1 and solved.status > 0
         if is_at_minimum and fit.is_near and change < CONVERGED:
             return done + number + 1, True
-        if is_at_minimum and change < NEAR:
-            fit.is_near |= fit.stage == len(OUTLINE) - 1
-            fit.stage = min(fit.stage + 1, len(OUTLINE) - 1)
+        if is_at_minimum and change < SETTLED:
+            fit.is_near |= fit.stage == NARROWEST
+            fit.stage = min(fit.stage + 1, NARROWEST)
         if fit.is_near and until_near:
             return done + number + 1, False
     return max_rounds, False

@@ -20,7 +20,7 @@ from helio_jax.arrays import pitch, robust_std
 from helio_jax.calibration.common_errors import enlargement
 from helio_jax.calibration.known_model import see
 from helio_jax.calibration.known_objects import KnownObject
-from helio_jax.calibration.known_pixels import CONVERGED, OUTLINE, is_beside_outline, membership, near_foot
+from helio_jax.calibration.known_pixels import CONVERGED, NARROWEST, OUTLINE, beside_outline, membership, near_foot
 from helio_jax.calibration.known_scan import (
     InstrumentFit,
     KnownScan,
@@ -160,10 +160,10 @@ class _Scan:
         own = {name: float(v) for name, v in scan.model.object_of(at).items()}
         used = scan.is_used & ~near_foot(scan, own, see(scan.model, at).distance, settings)
         self.outlined = used.any(0)
-        self.width = OUTLINE[min(number, len(OUTLINE) - 1)] * self.step
+        stage = min(number, NARROWEST)
+        self.width = OUTLINE[stage] * self.step
         visible, every, log_share = columns(self.model, at, wide)
-        is_beside = is_beside_outline(log_share, self.width / wide)
-        self.is_beside = is_beside | (self.is_beside & (number >= len(OUTLINE)))
+        self.is_beside = beside_outline(log_share, OUTLINE[stage], self.is_beside if number > NARROWEST else None)
         self.used = used & ~self.is_beside
         if number == 0:
             self.member = np.exp(log_share)
