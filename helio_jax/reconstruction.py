@@ -17,6 +17,11 @@ from helio_jax.instrument import Instrument
 from helio_jax.validity import CONTRADICTED, MAX_CONTRADICTED, NONE_VALID, REASONS, VALID_RULE, contradicted_share
 
 
+def was_interrupted(status: str) -> bool:
+    """Whether a height map with this status is the best so far of a method that was interrupted."""
+    return any(part.startswith("interrupted") for part in status.split("; "))
+
+
 @dataclass(frozen=True, repr=False)
 class Reconstruction(OnRaster):
     """Heights of the surface seen by the beam (frozen, checked when made).

@@ -63,6 +63,7 @@ def reconstruct_files(
     from helio_jax.figures.trust import anchor_lines, discrepancy_text, trust_lines
     from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.hdf5 import read_micrographs
+    from helio_jax.reconstruction import was_interrupted
     from helio_jax.workflows.heights import reconstruct, reconstruct_scans
     from helio_jax.workflows.scene_file import load_scene
 
@@ -96,7 +97,7 @@ def reconstruct_files(
         _print_instrument(result.provenance.get("instrument", {}))
         if text := discrepancy_text(result):
             print(f"  {text}")
-    if result.status.startswith("interrupted"):
+    if was_interrupted(result.status):
         raise KeyboardInterrupt
     warn(result.trust, strict)
 

@@ -62,6 +62,7 @@ def run(
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
     from helio_jax.figures.trust import trust_lines
+    from helio_jax.reconstruction import was_interrupted
     from helio_jax.workflows.pipeline import Executor, default_folder
     from helio_jax.workflows.pipeline import run as run_scene
     from helio_jax.workflows.scene_file import load_scene
@@ -74,15 +75,14 @@ def run(
     result = run_scene(scene, output, overrides=overrides, stage=Bar, executor=executor, restart=restart, say=say)
     if as_json:
         print(json.dumps(result.as_dict()))
-        warn(result.trust, strict)
-        return
-    print(f"\n{result.name}: {result.method}, {result.status}")
-    print_table(result.scores.as_table())
-    print("\n".join(trust_lines(result.trust)))
-    print("\nfiles:")
-    for label, path in result.files.items():
-        print(f"  {label:<12} {path}")
-    if result.status.startswith("interrupted"):
+    else:
+        print(f"\n{result.name}: {result.method}, {result.status}")
+        print_table(result.scores.as_table())
+        print("\n".join(trust_lines(result.trust)))
+        print("\nfiles:")
+        for label, path in result.files.items():
+            print(f"  {label:<12} {path}")
+    if was_interrupted(result.status):
         raise KeyboardInterrupt
     warn(result.trust, strict)
 

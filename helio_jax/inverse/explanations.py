@@ -29,7 +29,15 @@ from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
-from helio_jax.inverse.fit import Fit, Report, after_one_solve, fit_heights, short_fit, without_noise_bias
+from helio_jax.inverse.fit import (
+    Fit,
+    Report,
+    after_one_solve,
+    fit_heights,
+    interrupted,
+    short_fit,
+    without_noise_bias,
+)
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
@@ -52,9 +60,16 @@ from helio_jax.inverse.shadow_steps import find_shadow_step
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
-from helio_jax.inverse.strain import is_strained, relief_of_strain
+from helio_jax.inverse.strain import is_strained, strain_improvement
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
-from helio_jax.inverse.wider_readout import READOUT, evidence, fit_wider_readout, instrument_improvement, with_widths
+from helio_jax.inverse.wider_readout import (
+    READOUT,
+    Widths,
+    evidence,
+    fit_wider_readout,
+    instrument_improvement,
+    with_widths,
+)
 from helio_jax.micrograph import MicrographStack
 from helio_jax.validity import CHI_SQUARE_LIMIT
 
@@ -70,6 +85,8 @@ MORE_CONTRADICTED = 1.05
 """Gains and offsets that are not as stated may be contradicted in up to so many times as many pixels."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
+MEANWHILE = "while another explanation was tried"
+"""Said of a fit that was interrupted."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -118,7 +135,8 @@ def explain(
 
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as
-    they did before (`MIN_CONTRADICTED`). Arguments as `reconstruct_stack`.
+    they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`). Interrupted
+    after the first fit, it returns the best so far. Arguments as `reconstruct_stack`.
     """
     fits = _Fits(stack, settings, make_predict, report, start)
     none = AlbedoPatches.none(stack.shape[1:])
@@ -149,7 +167,7 @@ def explain(
             if found is None:
                 continue
             if found.fit.is_interrupted:  # whichever is kept
-                best = best._replace(fit=replace(best.fit, is_interrupted=True, status=found.fit.status))
+                best = best._replace(fit=interrupted(best.fit, MEANWHILE))
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
@@ -157,11 +175,13 @@ def explain(
             is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
-                gained += instrument_improvement(best.fit, found.fit, settings.refine)
+                gained += instrument_improvement(best.fit, found.fit)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
+        except KeyboardInterrupt:
+            best = best._replace(fit=interrupted(best.fit, MEANWHILE))
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
     return best._replace(fit=fit, steps=fits.steps)
 
@@ -209,7 +229,7 @@ class _Fits:
     @cached_property
     def off_substrate(self) -> np.ndarray:
         """Pixels that mask bands show above or below the substrate [y, x]."""
-        return off_ground(self.measured, (self.stack.shape[1], self.stack.shape[2]))
+        return off_ground(self.measured, (self.stack.shape[1], self.stack.shape[2]), self.settings.border_std_um)
 
     def anchors_at(self, surface: Surface, labels: np.ndarray, moved: list[Region]) -> Anchors:
         """Anchor the mean levels of regions where the border is flat; else the heights of their walls, part by part.
@@ -328,7 +348,7 @@ class _Fits:
 
     def is_strained(self, fit: Fit) -> bool:
         """Whether the instrument speaks against a fit."""
-        return self.weighs_instrument and is_strained(fit.parameters)
+        return self.weighs_instrument and is_strained(fit.parameters, fit.problem.held)
 
     def say(self, said: str) -> None:
         """Report what is tried."""
@@ -355,20 +375,24 @@ class _Fits:
         fit = replace(fit, problem=problem, parameters=parameters, state=state)
         if fit.is_interrupted:
             return fit
-        after, before = (after_one_solve(posed, state) for posed in (problem, as_held))
-        if improvement(before, after) < GAIN:
-            return fit
         try:
+            after, before = (after_one_solve(posed, state) for posed in (problem, as_held))
+            if improvement(before, after) < GAIN:
+                return fit
             free = self._fit(state.surface, smoothed, *known)
             if not free.is_interrupted and free.changes[-1] > AT_REST * np.ptp(fit.surface.height):
                 self.say("free gains and offsets are given up: that fit did not come to rest")
                 return fit
             free = self._unbiased(free)
+            if free.is_interrupted:
+                fit = interrupted(fit, "while free gains and offsets were tried")
             gained = improvement(self.residuals(fit), self.residuals(free))
-            return free if gained + relief_of_strain(fit.parameters, free.parameters) > GAIN else fit
+            return free if gained + strain_improvement(fit.parameters, free.parameters) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")
             return fit
+        except KeyboardInterrupt:
+            return interrupted(fit, "while free gains and offsets were tried")
 
     def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
         """Fit once, the bias by noise left in; arguments as those of `fitted`."""
@@ -532,7 +556,8 @@ class _Fits:
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit gains or offsets that are not what is stated; None where nothing speaks for that.
 
-        With patches of other albedos and without: they may stand for what wrong gains and offsets do.
+        With patches of other albedos and without: they may stand for what wrong gains and offsets do, and have to
+        explain more by `GAIN` than the fit without them.
         """
         problem, surface = best.fit.problem, best.fit.state.surface
         if problem.is_instrument_unknown or not self.is_strained(best.fit):
@@ -542,19 +567,21 @@ class _Fits:
         fit = best.fit
         for patches in (none, problem.patches) if problem.patches.objects else (none,):
             known = patches, problem.region, problem.anchors
-            fitted = partial(self._with_settings, known)
-            found = fit_wider_readout(best.fit, self.settings, start, fitted, self.say)
+            fitted = partial(self._with_wider_priors, known)
+            found = fit_wider_readout(best.fit, start, fitted, self.say)
             if found is None:
                 continue
-            fit = max(fit, found, key=partial(evidence, best.fit, stated=self.settings.refine))
+            if evidence(fit, found) > GAIN:
+                fit = found
             if found.is_interrupted:
-                fit = replace(fit, is_interrupted=True, status=found.status)
+                fit = interrupted(fit, MEANWHILE)
                 break
         return None if fit is best.fit else best._replace(fit=fit)
 
-    def _with_settings(self, known: tuple, surface: Surface, smoothed: Surface, settings: ReconstructSettings) -> Fit:
-        """Fit as `fitted`, by other settings than stated; `known` as in `pose`: patches, regions, anchors."""
-        return self.fitted(surface, smoothed, *known, settings)
+    def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
+        """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""
+        fit = self.fitted(surface, smoothed, *known, with_widths(self.settings, wider))
+        return replace(fit, prior_widths=wider)
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:

@@ -5,8 +5,8 @@ Every iteration: predict multiple scattering and masked aperture parts on the cu
 robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is constant during a step.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -70,7 +70,9 @@ class Fit:
         changes: root mean square height change of every iteration [um].
         contraction: ratio of the last two changes, or None.
         status: a sentence: how the fit ended.
-        is_interrupted: whether it was stopped from the keyboard.
+        is_interrupted: whether it, or what followed it, was stopped from the keyboard.
+        prior_widths: standard deviations of the priors of gains and offsets over those stated, by the names of the
+            parameters; empty: as stated.
     """
 
     problem: FitProblem
@@ -93,6 +95,7 @@ class Fit:
     contraction: float | None
     status: str
     is_interrupted: bool = False
+    prior_widths: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def chi_square(self) -> list[float]:
@@ -313,6 +316,11 @@ def with_residuals(problem: FitProblem, state: FitState) -> FitState:
     return replace(state, residuals=residuals)
 
 
+def interrupted(fit: Fit, when: str) -> Fit:
+    """Mark a fit as interrupted in what followed it, unless it was interrupted itself; `when`: "while ..."."""
+    return fit if fit.is_interrupted else replace(fit, is_interrupted=True, status=f"interrupted {when}; {fit.status}")
+
+
 def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
     """Subtract the bias by noise from a fit where it matters; `report`: called before that."""
     problem, n_pairs = fit.problem, fit.problem.settings.bias_pairs
@@ -323,8 +331,7 @@ def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
             report(len(fit.changes) - 1, problem.settings.max_rounds, "simulating the bias by noise")
         state = subtract_bias(problem, fit.state, *noise_bias(problem, fit.state, n_pairs))
     except KeyboardInterrupt:
-        changes = list(fit.changes)
-        return replace(fit, is_interrupted=True, status=status_of(changes, problem.settings.tolerance_um, True))
+        return interrupted(fit, "while the bias by noise was simulated")
     return replace(fit, **_shown(problem, state), **_explained(problem, state))
 
 

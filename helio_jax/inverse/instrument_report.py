@@ -12,7 +12,6 @@ import numpy as np
 from helio_jax.inverse.fit import Fit
 from helio_jax.inverse.law_prior import cosine_probability, numbers_of
 from helio_jax.inverse.parameters import LawPrior, mode_weights
-from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
 
 WEAK = 0.5
@@ -95,15 +94,13 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     `discrepancy`: what the model was found to lack, detector -> root mean square over the median signal, where the
     instrument states any, and `discrepancy_std`, that; its modes are in neither list.
     """
-    posterior = fit.posterior
+    posterior, law = fit.posterior, fit.problem.priors.law
     if posterior is None:
-        return {}
+        return {} if law is None else {"law": describe_law(fit)}
     detectors = fit.instrument.detector_names
-    hidden = ("law",) if fit.problem.is_law_held else ()
-    listed = [i for i in listed_one_by_one(posterior.names) if kind_of(posterior.names[i]) not in hidden]
+    listed = [i for i in listed_one_by_one(posterior.names) if kind_of(posterior.names[i]) not in fit.problem.held]
     names = tuple(posterior.names[i] for i in listed)
     matrix, units = units_of(fit.problem, names)
-    law = fit.problem.priors.law
     flat = np.concatenate([np.ravel(getattr(fit.parameters, name)) for name in posterior.fields])[listed]
     covariance, prior = posterior.instrument_covariance[np.ix_(listed, listed)], np.linalg.norm(matrix, axis=1)
     means = iter(number.mean for number in numbers_of(law))
@@ -139,19 +136,22 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
         size = std * np.sqrt(np.sum((modes * mode_weights(modes.shape[-1])) ** 2, (1, 2)))
         found["discrepancy"] = dict(zip(detectors, size.tolist(), strict=True))
         found["discrepancy_std"] = std
-    return found if law is None else found | {"law": describe_law(fit, posterior)}
+    return found if law is None else found | {"law": describe_law(fit)}
 
 
-def describe_law(fit: Fit, posterior: Posterior) -> dict[str, Any]:
+def describe_law(fit: Fit) -> dict[str, Any]:
     """Describe the scattering law; of a fitted one, test whether it is compatible with the cosine law.
 
     `kind`: of the law; `cosine_probability`: `law_prior.cosine_probability`; `is_cosine`: whether it exceeds
-    `LEAST_PROBABILITY`. Of a law that is held: `exponent` and `std`, as the instrument file states them.
+    `LEAST_PROBABILITY`; both only with error bars. Of a law that is held: `exponent` and `std`, as the
+    instrument file states them.
     """
     if fit.problem.is_law_held:
         assert fit.problem.instrument is not None and fit.problem.instrument.law is not None
         return {"kind": "as_stated"} | fit.problem.instrument.law.model_dump()
-    prior, whitened = fit.problem.priors.law, np.ravel(fit.parameters.law)
+    prior, whitened, posterior = fit.problem.priors.law, np.ravel(fit.parameters.law), fit.posterior
+    if posterior is None:
+        return {"kind": fit.problem.settings.law}
     of_law = [i for i, name in enumerate(posterior.names) if kind_of(name) == "law"]
     assert prior is not None
     probability = cosine_probability(prior, whitened, posterior.instrument_covariance[np.ix_(of_law, of_law)])

@@ -137,7 +137,7 @@ def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
     """List the patches between measured steps but for the ground (`Steps.ground`), the largest first.
 
     A measured level is tried above the patch around it: a surface with a free border may bend so far that the
-    substrate elsewhere is no reference.
+    substrate elsewhere is no reference. Where the ground's own level is not determined, heights above it are not known.
     """
     if found is None:
         return []
@@ -149,16 +149,24 @@ def measured_regions(found: Steps | None, raster: Raster) -> list[Region]:
         inside = found.patch == p.number
         beside = found.patch[grown(inside, SKIRT) & ~inside]
         around = by_number[most_frequent(beside)]
-        step = p.level_um - around.level_um if around.number in (0, ground.number) or around.is_determined else None
+        step = p.level_um - around.level_um if around.number == 0 or around.is_determined else None
         level, std = p.level_um - ground.level_um, math.hypot(p.level_std_um, ground.level_std_um)
-        region = Region(inside, level, std, step) if p.is_determined else Region(inside)
+        height = (level, std) if ground.number == 0 or ground.is_determined else (None, 0.0)
+        region = Region(inside, *height, step) if p.is_determined else Region(inside)
         out.append(replace(region, skirt=_reach(found, p.number, raster)))
     return out
 
 
-def off_ground(regions: list[Region], shape: tuple[int, int]) -> np.ndarray:
-    """Find the pixels [y, x] of regions (`measured_regions`) that are certainly not level with the ground."""
-    off = [r.inside for r in regions if r.height is not None and abs(r.height) > CERTAINLY_OFF * r.std]
+def off_ground(regions: list[Region], shape: tuple[int, int], border_std: float) -> np.ndarray:
+    """Find the pixels [y, x] of regions (`measured_regions`) that a flat border must not hold to the ground's level.
+
+    Those that are certainly off it (`CERTAINLY_OFF`), and those that are likely off, by steps that contradict one
+    another: the hold by the border's standard deviation [um] would win.
+    """
+    known = [(r, abs(r.height)) for r in regions if r.height is not None]
+    off = [
+        r.inside for r, height in known if height > CERTAINLY_OFF * r.std or height > r.std > CERTAINLY_OFF * border_std
+    ]
     return np.any([np.zeros(shape, bool), *off], axis=0)
 
 

@@ -41,6 +41,8 @@ from helio_jax.inverse.verdict import (
 from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
+INTERRUPTED_WARNING = "the fit was interrupted: these heights are the best so far, without error bars"
+"""Warning of a fit that the user stopped."""
 GEOMETRY_WARNING = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
     "their stated standard deviations; compare with nearfield"
@@ -130,9 +132,13 @@ def _check_finite(rec: Reconstruction) -> None:
 
 def warnings_of(fit: "Fit") -> tuple[str, ...]:
     """List what to know before the heights of a fit are trusted."""
+    from helio_jax.inverse.wider_readout import warning_of
+
     tolerance = fit.problem.settings.tolerance_um
     found = []
-    if fit.is_interrupted or not has_converged(fit.changes, tolerance):
+    if fit.is_interrupted:
+        found.append(INTERRUPTED_WARNING)
+    if not has_converged(fit.changes, tolerance):
         found.append(
             f"the fit has not converged: its last iteration changed the heights by {fit.changes[-1]:.2f} um (limit "
             f"{tolerance:g} um)"
@@ -146,7 +152,7 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
         found.append(GEOMETRY_WARNING)
     if fit.problem.settings.has_own_law:
         found.append(LAW_WARNING)
-    return tuple(found)
+    return (*found, *warning_of(fit))
 
 
 def sensitivity(fit: "Fit") -> dict[str, float]:
@@ -176,7 +182,7 @@ class _Refined(NamedTuple):
         misfit_of: computes its misfit from a trace.
         anchors: that it was brought to.
         region: that depth jumps part from the rest, from `regions` [y, x].
-        off_substrate: pixels that measured steps part from the substrate (`FitProblem`).
+        off_substrate: pixels that measured steps put off the substrate (`FitProblem`).
     """
 
     rec: Reconstruction
@@ -192,7 +198,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
     from helio_jax.inverse.explanations import explain
     from helio_jax.inverse.instrument_report import describe_instrument
     from helio_jax.inverse.known_heights import check_places
-    from helio_jax.inverse.wider_readout import priors_of, warning_of
+    from helio_jax.inverse.wider_readout import priors_of
 
     if make_predict is None:
         raise GuardError(
@@ -236,7 +242,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
         offset=fit.offset,
         border=settings.border,
         status="; ".join(filter(None, (fit.status, assumed))),
-        warnings=(*about_anchors, *warnings_of(fit), *warning_of(fit, settings.refine)),
+        warnings=(*about_anchors, *warnings_of(fit)),
         provenance={
             "stack": dict(stack.provenance),
             "reconstruct": settings.model_dump(mode="json"),

@@ -122,7 +122,9 @@ def path_error(
     errors = excess_slope_errors(slope_errors(misfit, Optics.of(rec.instrument)), rec.chi_square, expected)
     frame = border_mask(rec.height.shape, settings.border_fraction)
     if settings.border == "flat":
-        known = frame & rec.is_valid & (True if off_substrate is None else ~off_substrate)
+        if off_substrate is not None and (frame & ~off_substrate).any():
+            frame &= ~off_substrate
+        known = frame & rec.is_valid
         return accumulated(errors, raster, known if known.any() else frame, anchors) / np.sqrt(3.0)
     found = accumulated(errors, raster, valid_regions(rec.is_valid) == 0, anchors)
     return (found - np.median(found[frame])) / np.sqrt(3.0)

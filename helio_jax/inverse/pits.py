@@ -25,7 +25,8 @@ LIMIT = 3.0
 LEAST_FLOOR = 0.15
 """Least share of a pit's pixels that show its floor: a wall alone has no level."""
 HOPELESS = 2.0
-"""A region is no pit that with its floor at the best tried depth leaves so many times the misfit of another surface."""
+"""A region is no pit that with its floor at the best tried depth leaves so many times the misfit of another surface, if
+that one explains it (`WELL_EXPLAINED`)."""
 WELL_EXPLAINED = 1.5
 """Largest mean square of the residuals of a region that another surface explains."""
 LEAST_EXPLAINED = 0.5

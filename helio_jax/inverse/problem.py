@@ -29,7 +29,7 @@ from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
 LEVEL_STD = 0.1
 """Standard deviation of a held mean height [um]."""
-_HELD = 1e-5
+_BARELY_HELD = 1e-5
 """Least prior weight of a height, 1/um: holds a pixel that all edges separate from the others."""
 
 
@@ -186,7 +186,7 @@ class FitProblem:
         weight = _border_weight(self.raster.shape, self.reconstruct_settings)
         if self.off_substrate is None or self.reconstruct_settings.border != "flat":
             return weight
-        return np.where(self.off_substrate, _HELD, weight)
+        return np.where(self.off_substrate, _BARELY_HELD, weight)
 
     @property
     def position(self) -> np.ndarray:
@@ -213,6 +213,11 @@ class FitProblem:
     def is_law_held(self) -> bool:
         """Whether the scattering law is that of the instrument file, whose number is not fitted."""
         return self.law_prior is not None and not self.settings.has_own_law
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the parameters of the instrument that are held as stated."""
+        return ("law",) if self.is_law_held else ()
 
     @property
     def priors(self) -> Priors:
@@ -352,7 +357,7 @@ def _border_weight(shape: tuple[int, ...], settings: ReconstructSettings) -> np.
 
     The outermost ring is enough to level the heights; drift needs all of the border to be distinguished from relief.
     """
-    weight = np.full(shape, _HELD)
+    weight = np.full(shape, _BARELY_HELD)
     if settings.border == "flat":
         width = settings.border_fraction if settings.refine.drift_std > 0 else 1.0 / max(shape)
         weight[border_mask((shape[0], shape[1]), width)] = 1.0 / settings.border_std_um

@@ -141,9 +141,9 @@ class Steps:
 
     @property
     def ground(self) -> Patch:
-        """The patch that has most of the image's border, of those whose level is known: the substrate, if any is."""
+        """The patch that has most of the image's border: the substrate, if any is. Its level may be undetermined."""
         shares = border_shares(self.patch)
-        return max((p for p in self.patches if p.number == 0 or p.is_determined), key=lambda p: shares[p.number])
+        return max(self.patches, key=lambda p: shares[p.number])
 
     @property
     def level(self) -> np.ndarray:

@@ -274,7 +274,7 @@ def step(
         is_mixed = (
             problem.is_instrument_unknown
             or problem.is_level_free
-            or problem.priors.law is not None
+            or (problem.priors.law is not None and not problem.is_law_held)
             or problem.discrepancy_std > 0.0
         )
         if (is_instrument_free and is_mixed) or start.parameters.patch.size:

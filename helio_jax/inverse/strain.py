@@ -24,13 +24,16 @@ def instrument_pulls(parameters: Parameters, without: Collection[str] = ()) -> n
     return np.concatenate([np.ravel(getattr(parameters, name)) for name in INSTRUMENT if name not in without])
 
 
-def is_strained(parameters: Parameters) -> bool:
-    """Whether a fit moves the instrument farther than is stated, by more than chance (`STRAIN`)."""
-    pulls = instrument_pulls(parameters)
+def is_strained(parameters: Parameters, held: Collection[str] = ()) -> bool:
+    """Whether a fit moves the instrument farther than is stated, by more than chance (`STRAIN`).
+
+    `held`: names of parameters that are held, and so tell nothing.
+    """
+    pulls = instrument_pulls(parameters, held)
     return float(np.sum(pulls**2)) > pulls.size + STRAIN * math.sqrt(2.0 * pulls.size)
 
 
-def relief_of_strain(parameters: Parameters, others: Parameters) -> float:
+def strain_improvement(parameters: Parameters, others: Parameters) -> float:
     """Compute by how much less a fit of other parameters moves the instrument, in half chi-square."""
     before, after = (float(np.sum(instrument_pulls(p) ** 2)) for p in (parameters, others))
     return 0.5 * (before - after)

@@ -8,19 +8,18 @@ solver knows normal priors only: one as wide as to have the same gradient at the
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
 
 from helio_jax.errors import PredictionError
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.fit import Fit
+from helio_jax.inverse.fit import Fit, interrupted
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.quality import half_chi_square
-from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
-from helio_jax.inverse.strain import instrument_pulls, is_strained, relief_of_strain
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.strain import instrument_pulls, is_strained, strain_improvement
 
 READOUT = {"offset": "offset_std", "log_gain": "gain_std"}
 """Parameters of the read-out, the likelier to be wrong first, and the settings of their prior standard deviations."""
@@ -28,7 +27,12 @@ WARNING = (
     "gains or offsets are not what is stated, and were fitted: {far}; check dark counts, background and the detectors' "
     "gains; a wrong geometry can look alike: heights may be off by more than their stated standard deviations"
 )
-"""Of a fit whose gains and offsets are far from what is stated."""
+"""Of a fit whose gains and offsets are far from what is stated (`FAR`)."""
+NEARLY = (
+    "gains or offsets were fitted with priors wider than stated; the farthest from what is stated: {far}; a wrong "
+    "geometry can look alike: heights may be off by more than their stated standard deviations"
+)
+"""Of a fit with such priors whose gains and offsets are not far from it."""
 FAR = 3.0
 """They are named where they are so many stated standard deviations off."""
 FREEDOM = 3.0
@@ -38,25 +42,26 @@ MAX_FITS = 3
 SAME_WIDTH = 1.2
 """A prior is not made wider again by less than this factor."""
 
-Widths = dict[str, float]
+WHEN = "while wider priors of gains and offsets were tried"
+"""Said of a fit that was interrupted."""
+
+Widths = Mapping[str, float]
 """Standard deviation of the priors of gains and offsets over those stated, by name (`READOUT`)."""
 
 
 def fit_wider_readout(
     fit: Fit,
-    settings: ReconstructSettings,
     start: tuple[Surface, Surface],
-    fitted: Callable[[Surface, Surface, ReconstructSettings], Fit],
+    fitted: Callable[[Surface, Surface, Widths], Fit],
     say: Callable[[str], None],
 ) -> Fit | None:
     """Fit with a heavy-tailed prior of the offsets; where the fit still strains the instrument, of the gains.
 
     Args:
         fit: which strains the instrument.
-        settings: as stated.
         start: surface to fit from, and a smoother one. Not the fit's own, where another is known: a fit that a wrong
             prior held down overshoots from there, and rests at a larger misfit.
-        fitted: fits from a surface, or one nearer to a smoother one, with settings.
+        fitted: fits from a surface, or one nearer to a smoother one, with wider priors.
         say: reports what is tried.
 
     Returns:
@@ -65,52 +70,52 @@ def fit_wider_readout(
     """
     best = fit
     for name in READOUT:
-        found = _with_wider_prior(fit, name, settings, start, fitted, say)
-        best = max(best, found, key=partial(evidence, fit, stated=settings.refine))
+        found = _with_wider_prior(fit, name, start, fitted, say)
+        best = max(best, found, key=partial(evidence, fit))
         if found.is_interrupted:
-            return replace(best, is_interrupted=True, status=found.status)
-        if not is_strained(best.parameters):
+            return interrupted(best, WHEN)
+        if not is_strained(best.parameters, best.problem.held):
             break
     return None if best is fit else best
 
 
-def _with_wider_prior(fit: Fit, name: str, settings: ReconstructSettings, start, fitted, say) -> Fit:
+def _with_wider_prior(fit: Fit, name: str, start, fitted, say) -> Fit:
     """Fit with a heavy-tailed prior of the gains or the offsets; the best of these fits and the one without."""
     best, (surface, smoothed) = fit, start
     for _ in range(MAX_FITS):
-        before = widths(best, settings.refine)
+        before = widths(best)
         width = normal_widths(best.parameters, before)[name]
         if width < SAME_WIDTH * before[name]:
             break
-        say(f"{READOUT[name]} {width:.0f} times the stated one")
+        say(f"{READOUT[name]} {width:.2g} times as large as stated")
         try:
-            found = fitted(surface, smoothed, with_widths(settings, {name: width}))
+            found = fitted(surface, smoothed, {name: width})
         except PredictionError as e:
             say(f"the wider prior is given up: {e}")
             break
-        better = max(best, found, key=partial(evidence, best, stated=settings.refine))
+        better = max(best, found, key=partial(evidence, best))
         if found.is_interrupted:
-            return replace(better, is_interrupted=True, status=found.status)
+            return interrupted(better, WHEN)
         if better is best:
             break
         best, surface = better, better.state.surface
     return best
 
 
-def evidence(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+def evidence(fit: Fit, other: Fit) -> float:
     """Compute by how much another fit explains data and instrument better than a fit, in half chi-square."""
     of_data = half_chi_square(fit.residuals) - half_chi_square(other.residuals)
-    return of_data + instrument_improvement(fit, other, stated)
+    return of_data + instrument_improvement(fit, other)
 
 
-def instrument_improvement(fit: Fit, other: Fit, stated: RefineSettings) -> float:
+def instrument_improvement(fit: Fit, other: Fit) -> float:
     """Compute by how much less likely a fit's instrument is than another fit's, in half chi-square.
 
     Gains and offsets count by the heavy-tailed prior where one of the fits has it.
     """
-    both = [(each.parameters, widths(each, stated)) for each in (fit, other)]
+    both = [(each.parameters, widths(each)) for each in (fit, other)]
     if both[0][1] == both[1][1]:
-        return relief_of_strain(fit.parameters, other.parameters)
+        return strain_improvement(fit.parameters, other.parameters)
     before, after = (
         0.5 * float(np.sum(instrument_pulls(parameters, READOUT) ** 2)) + heavy_tailed_penalty(parameters, factors)
         for parameters, factors in both
@@ -118,13 +123,15 @@ def instrument_improvement(fit: Fit, other: Fit, stated: RefineSettings) -> floa
     return before - after
 
 
-def warning_of(fit: Fit, stated: RefineSettings) -> tuple[str, ...]:
+def warning_of(fit: Fit) -> tuple[str, ...]:
     """Name the gains and offsets that were fitted with wider priors and lie far from what is stated; one at least."""
-    if max(widths(fit, stated).values()) <= 1.0:
+    factors = widths(fit)
+    if max(factors.values()) <= 1.0:
         return ()
+    stated = {key: getattr(fit.problem.settings, key) / factors[name] for name, key in READOUT.items()}
     changes = {
-        "gain": (fit.gain - 1.0, stated.gain_std),
-        "offset": (fit.offset / fit.problem.median_signal, stated.offset_std),
+        "gain": (fit.gain - 1.0, stated["gain_std"]),
+        "offset": (fit.offset / fit.problem.median_signal, stated["offset_std"]),
     }
     named = [
         (abs(value) / std, f"{what} of {name!r} {value:+.1%} (stated: 0 +- {std:.1%})")
@@ -132,7 +139,7 @@ def warning_of(fit: Fit, stated: RefineSettings) -> tuple[str, ...]:
         for name, value in zip(fit.instrument.detector_names, values, strict=True)
     ]
     far = [text for pull, text in named if pull > FAR]
-    return (WARNING.format(far=", ".join(far or [max(named)[1]])),)
+    return (WARNING.format(far=", ".join(far)) if far else NEARLY.format(far=max(named)[1]),)
 
 
 def priors_of(fit: Fit) -> dict[str, float]:
@@ -140,10 +147,9 @@ def priors_of(fit: Fit) -> dict[str, float]:
     return {key: getattr(fit.problem.settings, key) for key in READOUT.values()}
 
 
-def widths(fit: Fit, stated: RefineSettings) -> Widths:
-    """Compute the widths of a fit's priors of gains and offsets over those stated."""
-    priors = priors_of(fit)
-    return {name: priors[key] / getattr(stated, key) for name, key in READOUT.items()}
+def widths(fit: Fit) -> Widths:
+    """Return the widths of a fit's priors of gains and offsets over those stated."""
+    return dict.fromkeys(READOUT, 1.0) | dict(fit.prior_widths)
 
 
 def normal_widths(parameters: Parameters, factors: Widths) -> Widths:

@@ -145,14 +145,30 @@ def test_levels_count_from_the_ground():
     patch[2:-2, 2:-2] = 0
     (mesa,) = patches_of(patch, 0.0, -100.0, std=2.0)
     assert (mesa.height, mesa.std) == (100.0, 2.0) and np.array_equal(mesa.inside, patch == 0)
-    assert np.array_equal(off_ground([mesa], SHAPE), patch == 0)
+    assert np.array_equal(off_ground([mesa], SHAPE, 2.0), patch == 0)
 
 
 def test_substrate_beyond_a_ridge_is_substrate():
     """Over both walls of a ridge its level is 1 +- 3 um. Rejects taking every other patch for off the ground."""
     patch = np.zeros(SHAPE, int)
     patch[:, SHAPE[1] // 2 - 2 :], patch[:, SHAPE[1] // 2 + 3 :] = 1, 2
-    assert np.array_equal(off_ground(patches_of(patch, 0.0, 100.0, 1.0, std=3.0), SHAPE), patch == 1)
+    assert np.array_equal(off_ground(patches_of(patch, 0.0, 100.0, 1.0, std=3.0), SHAPE, 2.0), patch == 1)
+
+
+def test_a_level_that_steps_disagree_about_is_not_held_to_the_ground():
+    """40 +- 2 and 150 +- 2 um give 95 +- 55 um: held to 0 +- 2 um it would come out there. 5 +- 8 um is held."""
+    patch = np.zeros(SHAPE, int)
+    patch[:, SHAPE[1] // 2 + 4 :] = 1
+    for level, std, is_off in ((95.0, 55.0, True), (5.0, 8.0, False)):
+        assert off_ground(patches_of(patch, 0.0, level, std=std), SHAPE, 2.0).any() == is_off
+
+
+def test_above_a_ground_of_unknown_level_no_height_is_known():
+    """Masks in the ground that no step explains: levels above the largest patch, a mesa, are not above the ground."""
+    patch = np.full(SHAPE, 1)
+    patch[2:-2, 2:-2], patch[10:-10, 10:-10] = 0, 2
+    mesa, block = patches_of(patch, 0.0, np.nan, 40.0)
+    assert mesa.height is None and block.height is None and block.step == 40.0
 
 
 @pytest.mark.parametrize("best", [-130.0, 45.0])

@@ -16,7 +16,7 @@ from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.explanations import _Fits
 from helio_jax.inverse.parameters import NAMES, Parameters
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.strain import INSTRUMENT, STRAIN, is_strained, relief_of_strain
+from helio_jax.inverse.strain import INSTRUMENT, STRAIN, is_strained, strain_improvement
 from helio_jax.micrograph import Calibration
 from helio_jax.workflows.known_scene import known_scene
 
@@ -40,7 +40,7 @@ def test_strain_is_chi_square_of_the_pulls():
     for factor, is_far in ((0.99, False), (1.01, True)):
         assert is_strained(parameters_with(aim=np.full((3, 2), factor * limit), **rest)) is is_far
     far, near = (parameters_with(offset=np.full(3, pull)) for pull in (4.0, 1.0))
-    assert relief_of_strain(far, near) == pytest.approx(0.5 * 3 * (16.0 - 1.0))
+    assert strain_improvement(far, near) == pytest.approx(0.5 * 3 * (16.0 - 1.0))
 
 
 @pytest.mark.parametrize(("is_unknown", "is_fitted"), [(False, True), (True, False)])

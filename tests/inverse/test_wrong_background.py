@@ -51,18 +51,18 @@ def test_a_prior_may_be_wider_than_a_scene_may_state():
 
 @dataclass(frozen=True)
 class StandIn:
-    """What is read of a fit: offsets [stated standard deviations], half its chi-square, and how it ended."""
+    """What is read of a fit: offsets [stated standard deviations], half its chi-square, priors, and how it ended."""
 
     off: float
     misfit: float
-    settings: ReconstructSettings
+    prior_widths: dict[str, float] = field(default_factory=dict)
     is_interrupted: bool = False
     status: str = "converged"
     state: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(surface=None))
 
     @property
     def parameters(self) -> Parameters:
-        return parameters_with(offset=np.full(3, self.off * STATED.refine.offset_std / self.settings.refine.offset_std))
+        return parameters_with(offset=np.full(3, self.off / self.prior_widths.get("offset", 1.0)))
 
     @property
     def residuals(self) -> np.ndarray:
@@ -70,24 +70,23 @@ class StandIn:
 
     @property
     def problem(self) -> SimpleNamespace:
-        return SimpleNamespace(settings=self.settings.refine)
+        return SimpleNamespace(held=())
 
 
-STATED = ReconstructSettings()
-HELD = StandIn(10.0, 600.0, STATED)
+HELD = StandIn(10.0, 600.0)
 
 
 def with_wider_priors(*ends):
     """Fit stand-ins one after another: offset, misfit and whether interrupted; None: nothing can be predicted."""
     left = list(ends)
 
-    def fitted(start, smoothed, settings):
+    def fitted(start, smoothed, wider):
         end = left.pop(0)
         if end is None:
             raise PredictionError("no surface")
-        return StandIn(*end[:2], settings, *end[2:])
+        return StandIn(*end[:2], wider, *end[2:])
 
-    return fit_wider_readout(HELD, STATED, (None, None), fitted, lambda said: None)  # type: ignore[arg-type]
+    return fit_wider_readout(HELD, (None, None), fitted, lambda said: None)  # type: ignore[arg-type]
 
 
 def test_the_fit_that_explains_most_is_kept():
@@ -107,7 +106,8 @@ def test_a_fit_that_fails_does_not_take_an_earlier_one_with_it():
 def test_an_interrupted_fit_ends_the_search(misfit, kept):
     """The better one is kept, marked as interrupted. Catches an interrupt that is lost with the worse fit."""
     found = with_wider_priors((20.0, 300.0), (28.0, misfit, True, "interrupted"))
-    assert found is not None and found.misfit == kept and found.is_interrupted and found.status == "interrupted"
+    assert found is not None and found.misfit == kept and found.is_interrupted
+    assert found.status.startswith("interrupted")
 
 
 @pytest.mark.slow
