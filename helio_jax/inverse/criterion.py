@@ -357,8 +357,9 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
     assumed = (s.mask_error * hidden) ** 2 + (0.5 * _largest_change(hidden)) ** 2
     inverse_sigma = 1.0 / jnp.sqrt(variance + assumed)
     slopes = jnp.asarray(surface.slope_x), jnp.asarray(surface.slope_y)
+    largest = NOISY * noise * steepness(*slopes)
     bias = second_order_noise_bias(
-        surface, factors.terms[0], optics, None, inverse_sigma, NOISY * noise * steepness(*slopes)
+        surface, factors.terms[0], jnp.zeros_like(signal), optics, None, inverse_sigma, largest
     )
     of_median = "offset", "drift", "discrepancy", "lines"  # stated as shares of the median signal
     ratio = median / (f.priors.offset / s.offset_std)

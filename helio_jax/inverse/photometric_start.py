@@ -17,7 +17,7 @@ from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.linear import PhotometricSolution, signal_of, solve_known_albedo
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.inverse.state import Predict, linearised_in_normal, prediction_std
+from helio_jax.inverse.state import Predict, multiple_in_normal, prediction_std
 from helio_jax.micrograph import MicrographStack
 
 
@@ -27,8 +27,9 @@ def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normal
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     corrections = predict(surface.height, normals, **patches.known)
     sigma = prediction_std(corrections, normals, settings.refine)
-    masked, multiple = linearised_in_normal(corrections, normals, optics)
-    visible = form_factor(optics, surface.height) - masked
+    slope, multiple = multiple_in_normal(corrections, normals, optics)
+    visible = form_factor(optics, surface.height) - corrections.masked
+    visible[:, 2] -= slope
     spread = variance + sigma**2
     (a, b), _ = solve_known_albedo(signal - multiple, spread, visible, normals, stack.instrument.beam_shift)
     weight = np.ones(stack.shape[1:])

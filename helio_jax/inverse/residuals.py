@@ -158,7 +158,8 @@ class FixedTerms(eqx.Module):
         inverse_sigma: robust weight over standard deviation, 0 where not observed [detector, y, x].
         form_factors: their expansion.
         multiple: multiple scattering as predicted, per albedo of the own patch [detector, y, x].
-        intercept: of its linear model in the own normal (`state.linearised_in_normal`), likewise [detector, y, x].
+        multiple_slope, intercept: of its linear model in the own normal (`state.multiple_in_normal`), likewise
+            [detector, y, x].
         occluded: change of the data by one standard deviation of where the occluded side stands, likewise
             [detector, y, x].
         surroundings: change of the data by one standard deviation of how the sample goes on beyond the image, likewise
@@ -187,6 +188,7 @@ class FixedTerms(eqx.Module):
     inverse_sigma: Any
     form_factors: FormFactors
     multiple: Any
+    multiple_slope: Any
     intercept: Any
     occluded: Any
     surroundings: Any
@@ -234,8 +236,8 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     exponent = p.multiple * parameters.log_multiple
     if fixed.law_response is not None:
         exponent = exponent + fixed.law_response.exponent(parameters.law)
-    # its own scale only: the intercept holds several times the multiple scattering, which `factors` subtract again
-    multiple = fixed.intercept + jnp.expm1(exponent)[:, None, None] * fixed.multiple
+    # its own scale only: intercept and slope are several times the multiple scattering
+    multiple = fixed.intercept - fixed.multiple_slope * normal[2] + jnp.expm1(exponent)[:, None, None] * fixed.multiple
     signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
     if parameters.surroundings.size:
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
@@ -249,7 +251,13 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
 
 
 def second_order_noise_bias(
-    surface: Surface, visible: Any, optics: Optics, law: Law | None, inverse_sigma: Any, largest: Any
+    surface: Surface,
+    visible: Any,
+    multiple_slope: Any,
+    optics: Optics,
+    law: Law | None,
+    inverse_sigma: Any,
+    largest: Any,
 ) -> jax.Array:
     """Compute the bias of the mean signal of facets by the noise of their fitted slopes [detector, y, x].
 
@@ -260,6 +268,7 @@ def second_order_noise_bias(
     Args:
         surface: fitted.
         visible: form factors [detector, 3, y, x].
+        multiple_slope: fall of the multiple scattering with n_z [detector, y, x].
         optics: of these.
         law: of the scattering; None: the cosine law.
         inverse_sigma: of the data [detector, y, x].
@@ -271,7 +280,9 @@ def second_order_noise_bias(
     def signal(x: jax.Array, y: jax.Array) -> jax.Array:
         normal = unit_normal(x, y, optics.beam_shift)
         single = single_scattering(visible, normal)
-        return single if law is None else single * mean_over_aperture(law, optics, surface.height, normal)
+        if law is not None:
+            single = single * mean_over_aperture(law, optics, surface.height, normal)
+        return single - multiple_slope * normal[2]
 
     def along(function, way):
         return lambda *slopes: jax.jvp(function, slopes, way)[1]

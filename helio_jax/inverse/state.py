@@ -41,8 +41,7 @@ class Held:
     Attributes:
         corrections: made for `surface`.
         surface: heights and slopes.
-        masked: masked form factors as a linear model in the own normal [detector, 3, y, x].
-        intercept: of that model: multiple scattering plus what `masked` subtracts of it [detector, y, x].
+        multiple_slope, intercept: of the multiple scattering (`multiple_in_normal`) [detector, y, x].
         sigma: standard deviation of the data, prediction errors included, infinite where not observed [detector, y, x].
         moves: derivative of the masked form factors by distance, polar angle, azimuth [move, detector, 3, y, x].
         moved: the moves at which they were made [move, detector].
@@ -53,7 +52,7 @@ class Held:
 
     corrections: Corrections
     surface: Surface
-    masked: np.ndarray
+    multiple_slope: np.ndarray
     intercept: np.ndarray
     sigma: np.ndarray
     moves: np.ndarray
@@ -118,26 +117,24 @@ class FitState:
         return FitState(surface, self.parameters.replaced(lines=lines), self.residuals[:, *thin], held)
 
 
-def linearised_in_normal(
-    corrections: Corrections, normals: np.ndarray, optics: Optics
-) -> tuple[np.ndarray, np.ndarray]:
-    """Make masks and multiple scattering a linear model of the own normal, about the corrections' or given ones.
+def multiple_in_normal(corrections: Corrections, normals: np.ndarray, optics: Optics) -> tuple[np.ndarray, np.ndarray]:
+    """Make multiple scattering a linear model of the own normal, intercept - slope * n_z: the slope, the intercept.
 
-    The slope of multiple scattering is added to the masked form factor and changes nothing at the normal of the
-    corrections. It makes the iterations converge faster beside steep walls, where slope and multiple scattering depend
-    on one another (`responses.normal_slope`). Corrections are made for denoised normals: the noise of the fitted ones
-    enters by this slope, and biases the gains where the slope is too large.
+    The slope changes nothing at the normals of the corrections. It makes the iterations converge faster beside steep
+    walls, where slope and multiple scattering depend on one another (`responses.normal_slope`). Corrections are made
+    for denoised normals: the noise of the fitted ones enters by this slope, and biases the gains where it is too large.
 
     Args:
         corrections: of a surface.
-        normals: its unit normals [y, x, 3].
+        normals: its unit normals [y, x, 3], unless the corrections name their own.
         optics: of the scan.
+
+    Returns:
+        [detector, y, x] each.
     """
     up = (normals if corrections.normals is None else corrections.normals)[..., 2]
     slope = normal_slope(corrections.multiple, up, substrate_signal(optics))
-    masked = np.array(corrections.masked)
-    masked[:, 2] += slope
-    return masked, corrections.multiple + slope * up
+    return slope, corrections.multiple + slope * up
 
 
 def prediction_std(corrections: Corrections, normals: np.ndarray, settings: RefineSettings) -> np.ndarray:
@@ -161,13 +158,13 @@ def _largest_change(image: np.ndarray) -> np.ndarray:
 def _held(problem: FitProblem, corrections: Corrections, surface: Surface, parameters: Parameters) -> Held:
     """Derive what a solve needs of corrections made for a surface, without responses."""
     normals, moved = surface.normals(problem.shift), problem.moves(parameters)
-    masked, intercept = linearised_in_normal(corrections, normals, problem.optics)
+    slope, intercept = multiple_in_normal(corrections, normals, problem.optics)
     albedo = problem.patches_at(parameters).albedo
     variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
     moves = np.zeros((len(moved), *corrections.masked.shape))
     law = np.asarray(parameters.law)
-    return Held(corrections, surface, masked, intercept, sigma, moves, moved, (), np.zeros(law.size), law)
+    return Held(corrections, surface, slope, intercept, sigma, moves, moved, (), np.zeros(law.size), law)
 
 
 def set_corrections(problem: FitProblem, state: FitState, corrections: Corrections, surface: Surface) -> FitState:

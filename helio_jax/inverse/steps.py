@@ -139,11 +139,11 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
     largest = NOISY * noise * steepness(*slopes)
     inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
-    corrections, moves = (held.masked, held.moves, held.moved), problem.moves(state.parameters)
+    corrections, moves = (held.corrections.masked, held.moves, held.moved), problem.moves(state.parameters)
     with jax.enable_x64(True):
         factors = expand_form_factors(problem.optics, moves, state.surface.height, corrections)
         known = moved_optics(problem.optics, moves), problem.law_at(state.parameters)
-        bias = _noise_bias(state.surface, factors.terms[0], *known, inverse_sigma, largest)
+        bias = _noise_bias(state.surface, factors.terms[0], held.multiple_slope, *known, inverse_sigma, largest)
     return PixelTerms(jax.tree.map(np.asarray, factors), np.asarray(bias))
 
 
@@ -204,6 +204,7 @@ def freeze(
         inverse_sigma=inverse_sigma * problem.stride,
         form_factors=pixels.factors,
         multiple=held.corrections.multiple,
+        multiple_slope=held.multiple_slope,
         intercept=held.intercept,
         occluded=_or_nothing(held.corrections.occluded, problem),
         surroundings=_or_nothing(held.corrections.surroundings, problem),
