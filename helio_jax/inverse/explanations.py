@@ -85,8 +85,9 @@ MORE_CONTRADICTED = 1.05
 """Gains and offsets that are not as stated may be contradicted in up to so many times as many pixels."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
-MEANWHILE = "while another explanation was tried"
-"""Said of a fit that was interrupted."""
+OTHER_TRIED = "while another explanation was tried"
+FREE_TRIED = "while free gains and offsets were tried"
+"""Said of a fit that was interrupted meanwhile."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -167,7 +168,7 @@ def explain(
             if found is None:
                 continue
             if found.fit.is_interrupted:  # whichever is kept
-                best = best._replace(fit=interrupted(best.fit, MEANWHILE))
+                best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
@@ -181,7 +182,7 @@ def explain(
         except PredictionError as e:
             fits.say(f"another explanation is given up: {e}")
         except KeyboardInterrupt:
-            best = best._replace(fit=interrupted(best.fit, MEANWHILE))
+            best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
     return best._replace(fit=fit, steps=fits.steps)
 
@@ -385,14 +386,14 @@ class _Fits:
                 return fit
             free = self._unbiased(free)
             if free.is_interrupted:
-                fit = interrupted(fit, "while free gains and offsets were tried")
+                fit = interrupted(fit, FREE_TRIED)
             gained = improvement(self.residuals(fit), self.residuals(free))
             return free if gained + strain_improvement(fit.parameters, free.parameters) > GAIN else fit
         except PredictionError as e:
             self.say(f"free gains and offsets are given up: {e}")
             return fit
         except KeyboardInterrupt:
-            return interrupted(fit, "while free gains and offsets were tried")
+            return interrupted(fit, FREE_TRIED)
 
     def _fit(self, surface: Surface, smoothed: Surface, *known: Any) -> Fit:
         """Fit once, the bias by noise left in; arguments as those of `fitted`."""
@@ -574,7 +575,7 @@ class _Fits:
             if evidence(fit, found) > GAIN:
                 fit = found
             if found.is_interrupted:
-                fit = interrupted(fit, MEANWHILE)
+                fit = interrupted(fit, OTHER_TRIED)
                 break
         return None if fit is best.fit else best._replace(fit=fit)
 

@@ -92,7 +92,7 @@ def describe_instrument(fit: Fit) -> dict[str, Any]:
     instrument that contradicts the file or a fit that has not converged. `law`: `describe_law`, but for the
     cosine law.
     `discrepancy`: what the model was found to lack, detector -> root mean square over the median signal, where the
-    instrument states any, and `discrepancy_std`, that; its modes are in neither list.
+    instrument states any, and `discrepancy_std`, that; its modes are in neither list. Without error bars: `law` alone.
     """
     posterior, law = fit.posterior, fit.problem.priors.law
     if posterior is None:

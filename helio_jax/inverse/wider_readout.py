@@ -42,8 +42,8 @@ MAX_FITS = 3
 SAME_WIDTH = 1.2
 """A prior is not made wider again by less than this factor."""
 
-WHEN = "while wider priors of gains and offsets were tried"
-"""Said of a fit that was interrupted."""
+WIDER_TRIED = "while wider priors of gains and offsets were tried"
+"""Said of a fit that was interrupted meanwhile."""
 
 Widths = Mapping[str, float]
 """Standard deviation of the priors of gains and offsets over those stated, by name (`READOUT`)."""
@@ -73,7 +73,7 @@ def fit_wider_readout(
         found = _with_wider_prior(fit, name, start, fitted, say)
         best = max(best, found, key=partial(evidence, fit))
         if found.is_interrupted:
-            return interrupted(best, WHEN)
+            return interrupted(best, WIDER_TRIED)
         if not is_strained(best.parameters, best.problem.held):
             break
     return None if best is fit else best
@@ -95,7 +95,7 @@ def _with_wider_prior(fit: Fit, name: str, start, fitted, say) -> Fit:
             break
         better = max(best, found, key=partial(evidence, best))
         if found.is_interrupted:
-            return interrupted(better, WHEN)
+            return interrupted(better, WIDER_TRIED)
         if better is best:
             break
         best, surface = better, better.state.surface
