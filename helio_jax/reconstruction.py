@@ -22,6 +22,12 @@ def was_interrupted(status: str) -> bool:
     return any(part.startswith("interrupted") for part in status.split("; "))
 
 
+def end_if_interrupted(status: str) -> None:
+    """Raise KeyboardInterrupt where a method was interrupted: what follows would take its heights for finished ones."""
+    if was_interrupted(status):
+        raise KeyboardInterrupt
+
+
 @dataclass(frozen=True, repr=False)
 class Reconstruction(OnRaster):
     """Heights of the surface seen by the beam (frozen, checked when made).

@@ -63,7 +63,7 @@ def reconstruct_files(
     from helio_jax.figures.trust import anchor_lines, discrepancy_text, trust_lines
     from helio_jax.formats.anchors import read_anchors
     from helio_jax.formats.hdf5 import read_micrographs
-    from helio_jax.reconstruction import was_interrupted
+    from helio_jax.reconstruction import end_if_interrupted, was_interrupted
     from helio_jax.workflows.heights import reconstruct, reconstruct_scans
     from helio_jax.workflows.scene_file import load_scene
 
@@ -84,7 +84,7 @@ def reconstruct_files(
     write(result, output)
     if write_joined:
         write(scans[0] if joined is None else joined.stack, write_joined)
-    if write_instrument:
+    if write_instrument and not was_interrupted(result.status):  # without error bars no instrument was fitted
         toml.write_instrument(result, write_instrument)
     if as_json:
         about = {"method": result.method, "status": result.status, "trust": result.trust}
@@ -97,8 +97,7 @@ def reconstruct_files(
         _print_instrument(result.provenance.get("instrument", {}))
         if text := discrepancy_text(result):
             print(f"  {text}")
-    if was_interrupted(result.status):
-        raise KeyboardInterrupt
+    end_if_interrupted(result.status)
     warn(result.trust, strict)
 
 

@@ -62,7 +62,7 @@ def run(
 ) -> None:
     """Simulate a scene, reconstruct its height map, score it against the truth and write a report."""
     from helio_jax.figures.trust import trust_lines
-    from helio_jax.reconstruction import was_interrupted
+    from helio_jax.reconstruction import end_if_interrupted
     from helio_jax.workflows.pipeline import Executor, default_folder
     from helio_jax.workflows.pipeline import run as run_scene
     from helio_jax.workflows.scene_file import load_scene
@@ -82,8 +82,7 @@ def run(
         print("\nfiles:")
         for label, path in result.files.items():
             print(f"  {label:<12} {path}")
-    if was_interrupted(result.status):
-        raise KeyboardInterrupt
+    end_if_interrupted(result.status)
     warn(result.trust, strict)
 
 

@@ -193,6 +193,27 @@ def mean_over_aperture(law: Law, optics: Optics, height: Any, normal: Any) -> ja
     return total / weight
 
 
+def by_law(law: Law | None, single: Any, optics: Optics, height: Any, normal: Any) -> Any:
+    """Weight single scattering by the cosine law [detector, ...] by a law; None is the cosine law.
+
+    Arguments as those of `mean_over_aperture`.
+    """
+    return single if law is None else single * mean_over_aperture(law, optics, height, normal)
+
+
+def numbers_by_law(law: Law | None, *known: Any) -> np.ndarray:
+    """Compute `by_law` of NumPy arrays, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(by_law(law, *known))
+
+
+def level_ratio(law: Law, optics: Optics) -> np.ndarray:
+    """Compute the signal of the level substrate by a law over that by the cosine law [detector]."""
+    with jax.enable_x64(True):
+        up = jnp.array([[0.0], [0.0], [1.0]])
+        return np.asarray(mean_over_aperture(law, optics, jnp.zeros(1), up))[:, 0]
+
+
 def _dot(a: Any, b: Any) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

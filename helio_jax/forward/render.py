@@ -16,7 +16,7 @@ from jaxtyping import Float
 from helio_jax.errors import SceneError
 from helio_jax.forward.compiling import batched_in_chunks, compiled
 from helio_jax.forward.form_factor import form_factor_at
-from helio_jax.forward.laws import Law, mean_over_aperture
+from helio_jax.forward.laws import Law, by_law
 from helio_jax.forward.masking import N_SLICES, choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast, in_own_precision
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
@@ -69,9 +69,7 @@ def detection_probability(
     """
     phi = form_factor_at(optics, surface.height)
     normal = unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift)
-    single = single_scattering(phi - corrections.masked, normal)
-    if law is not None:
-        single = single * mean_over_aperture(law, optics, surface.height, normal)
+    single = by_law(law, single_scattering(phi - corrections.masked, normal), optics, surface.height, normal)
     return albedo * single + corrections.multiple
 
 

@@ -38,6 +38,7 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
+from helio_jax.inverse.law_prior import in_units_of_cosine_law, in_units_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
@@ -137,8 +138,9 @@ def explain(
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as
     they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`). Interrupted
-    after the first fit, it returns the best so far. Arguments as `reconstruct_stack`.
+    after the first fit, it returns the best of those that were compared. Arguments as `reconstruct_stack`.
     """
+    stack = in_units_of_law(stack, settings.refine)
     fits = _Fits(stack, settings, make_predict, report, start)
     none = AlbedoPatches.none(stack.shape[1:])
     if start is None:
@@ -189,7 +191,7 @@ def explain(
 
 @dataclass(frozen=True)
 class _Fits:
-    """Fits of one stack from different starts; fields as the arguments of `explain`."""
+    """Fits of one stack, in the units of the law, from different starts; fields as the arguments of `explain`."""
 
     stack: MicrographStack
     settings: ReconstructSettings
@@ -251,6 +253,11 @@ class _Fits:
             _, found = anchors_of_steps(parts, *about)
             anchors = anchors.and_also(found.across(labels).differences())
         return anchors
+
+    @cached_property
+    def by_cosine_law(self) -> MicrographStack:
+        """The stack in the units of the cosine law, which photometric starts and the search for objects take."""
+        return in_units_of_cosine_law(self.stack, self.settings.refine)
 
     @cached_property
     def predict(self) -> Predict:
@@ -381,7 +388,9 @@ class _Fits:
             if improvement(before, after) < GAIN:
                 return fit
             free = self._fit(state.surface, smoothed, *known)
-            if not free.is_interrupted and free.changes[-1] > AT_REST * np.ptp(fit.surface.height):
+            if free.is_interrupted:  # it may not have come to rest
+                return interrupted(fit, FREE_TRIED)
+            if free.changes[-1] > AT_REST * np.ptp(fit.surface.height):
                 self.say("free gains and offsets are given up: that fit did not come to rest")
                 return fit
             free = self._unbiased(free)
@@ -417,7 +426,7 @@ class _Fits:
     @cached_property
     def albedo_search(self) -> AlbedoSearch:
         """The photometric solution with an albedo of its own in every pixel, and the patches that it shows."""
-        return search_albedo(self.stack, self.settings, self.predict_start)
+        return search_albedo(self.by_cosine_law, self.settings, self.predict_start)
 
     @property
     def is_substrate_dark(self) -> bool:
@@ -429,16 +438,16 @@ class _Fits:
         if self.settings.border != "flat":
             return False
         frame = border_mask(self.stack.shape[1:], self.settings.border_fraction)
-        level = np.nanmedian(signal_of(self.stack)[0][:, frame], axis=1)
+        level = np.nanmedian(signal_of(self.by_cosine_law)[0][:, frame], axis=1)
         ratio = float(np.median(level / substrate_signal(Optics.of(self.stack.instrument))))
         return ratio < math.exp(-max(LEAST_COMMON, UNLIKELY_GAIN * self.settings.refine.gain_std))
 
     def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
         """Find the photometric solution that a fit starts from, and a smoother one."""
-        known, smoothed = start_of_known_albedo(self.stack, self.settings, patches, self.predict_start)
+        known, smoothed = start_of_known_albedo(self.by_cosine_law, self.settings, patches, self.predict_start)
         if not self.pose(known, patches).is_instrument_unknown or not self.albedo_search.is_corrected:
             return known, smoothed
-        free = start_of_free_albedo(self.stack, self.albedo_search.height, self.albedo_search.solution)
+        free = start_of_free_albedo(self.by_cosine_law, self.albedo_search.height, self.albedo_search.solution)
         return min((known, free), key=lambda surface: self.short_fit(surface, patches)[0]), smoothed
 
     @cached_property
@@ -488,7 +497,7 @@ class _Fits:
             return None
         none, (surface, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
         objects = find_objects(
-            self.stack,
+            self.by_cosine_law,
             self.settings,
             surface,
             self.predict_trial,

@@ -31,11 +31,13 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence
 from helio_jax.inverse.samples import thinning
-from helio_jax.inverse.state import FitState, Predict, predict_corrections, update_corrections
+from helio_jax.inverse.state import FitState, Predict, between, predict_corrections, update_corrections
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
+ALTERNATING = 2.0 / 3.0
+"""Aitken's extrapolation below which changes alternate and fall by less than a half from one to the next."""
 INFLATING = (
     (("distance", "tilt", "aim"), 1.0),
     (("discrepancy",), 1.3),
@@ -239,6 +241,9 @@ def after_one_solve(problem: FitProblem, state: FitState) -> np.ndarray:
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
+    Where changes alternate, the next iteration starts between the last two surfaces (Aitken's relaxation), or masks and
+    multiple scattering that overshoot would swing for ever.
+
     Interrupted from the keyboard after the first iteration, it returns the best so far. Where a solve ends in a surface
     that cannot be traced, the step is halved; where that does not help, the surface before it is kept.
 
@@ -248,13 +253,14 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         predict: multiple scattering and masked form factors on a surface.
         report: called before each outer iteration.
 
-    Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
+    Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987); relaxation: Kuettler
+        and Wall, Comput. Mech. 43 (2008) 61, eq. 44.
     """
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
     reached: FitState | None = None
     last_change = np.zeros(start.height.shape)
-    extrapolation = 1.0
+    extrapolation = relaxation = 1.0
     is_interrupted, is_traceable = False, True
     said = "start"
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
@@ -283,9 +289,12 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         changes.append(float(np.sqrt(np.mean(last_change**2))))
         said = f"cost {found.cost:.4g}, height change {changes[-1]:.2f} um"
         if number:
-            extrapolation = aitken(change_before, last_change)
+            extrapolation = relaxation * aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
+        is_alternating = number > 0 and 0.0 < extrapolation < ALTERNATING
+        relaxation = extrapolation if is_alternating and number + 1 < s.max_rounds else 1.0
+        state = between(before, state, relaxation)
     undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result
     remaining = (remaining_error(changes, extrapolation) + undone) * last_change
     return Fit(

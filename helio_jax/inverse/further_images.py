@@ -68,6 +68,7 @@ def with_further_images(
     changes = {"signal": signal, "variance": variance}
     if stack.parallax is not None:
         changes["parallax"] = problem.parallax.copy()
+        changes["parallax"][:n] = known.parallax
         changes["parallax"][n:] = [
             parallax_of_image(image, surface.height, problem.raster, shift)
             for image, shift in zip(further, np.asarray(stack.instrument.beam_shifts)[n:], strict=True)

@@ -8,9 +8,11 @@ from scipy.stats import chi2
 
 from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError
-from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw
+from helio_jax.forward.laws import KNOTS_DEG, LobeLaw, MonotoneLaw, PowerLaw, RoughLaw, level_ratio
+from helio_jax.forward.optics import Optics
 from helio_jax.inverse.parameters import HELD, LawPrior
 from helio_jax.inverse.settings import RefineSettings
+from helio_jax.micrograph import MicrographStack
 
 LEAST_IMAGES = 5
 """Least number of images from which a monotone law is fitted: three give the facet and its albedo."""
@@ -53,6 +55,46 @@ def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> La
         n = len(KNOTS_DEG)
         return LawPrior(MonotoneLaw(np.zeros(n)), MonotoneLaw(np.full(n, s.law_std)))
     return None
+
+
+def stated_level_ratio(stack: MicrographStack, settings: RefineSettings) -> np.ndarray | None:
+    """Compute the signal of the level substrate by a stack's stated law, where a fit takes it, over the cosine law's.
+
+    [detector, 1, 1]; None where the fit takes another law, whose prior mean is the cosine law.
+    """
+    stated = stack.instrument.law
+    if settings.law != "as_stated" or stated is None:
+        return None
+    return level_ratio(PowerLaw(stated.exponent), Optics.of(stack.instrument))[:, None, None]
+
+
+def in_units_of_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
+    """Bring a stack that its substrate calibrates to the substrate's level by the law of the fit.
+
+    A calibration brings it to that by the cosine law.
+    """
+    return stack if stack.calibration is None else _scaled(stack, stated_level_ratio(stack, settings))
+
+
+def in_units_of_cosine_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
+    """Bring a stack in the units of the law of the fit to those of the cosine law, which photometric starts take."""
+    ratio = stated_level_ratio(stack, settings)
+    return _scaled(stack, None if ratio is None else 1.0 / ratio)
+
+
+def _scaled(stack: MicrographStack, factor: np.ndarray | None) -> MicrographStack:
+    """Multiply the readings of a stack by a factor of every detector [detector, 1, 1]; None: by none."""
+    if factor is None:
+        return stack
+    background = stack.background
+    if background is not None:
+        background = background * (factor if background.ndim == 3 else factor[:, 0, 0])
+    return stack.replace(
+        counts=stack.counts * factor,
+        variance=None if stack.variance is None else stack.variance * factor**2,
+        background=background,
+        parallax=None if stack.parallax is None else stack.parallax * factor,
+    )
 
 
 def check_law(settings: RefineSettings, stated: CampaignLaw | None, n_images: int) -> None:

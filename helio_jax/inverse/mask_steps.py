@@ -121,7 +121,7 @@ def find_steps(stack: MicrographStack) -> Steps:
     patch = _patches(measured, images, levels)
     result = _joined(measured, patch, scan, levels)
     # once more with the directions as seen from the lower level of each step, above most of the border
-    ground = result.ground.level_um
+    ground = result.ground.level_um if math.isfinite(result.ground.level_um) else 0.0
     heights = [result.patches[s.below].level_um - ground for s in result.steps[:n]]
     moved = [z if math.isfinite(z) else 0.0 for z in heights]
     if any(abs(z) > 1e-3 * stack.instrument.sample_distance for z in moved):

@@ -42,7 +42,9 @@ from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import Reconstruction
 
 INTERRUPTED_WARNING = "the fit was interrupted: these heights are the best so far, without error bars"
-"""Warning of a fit that the user stopped."""
+"""Warning of a fit that the user stopped ..."""
+BIASED = "; their bias by noise was not subtracted (relief some per cent too flat where a drift is unknown)"
+"""... where that bias matters."""
 GEOMETRY_WARNING = (
     "the geometry was fitted, too: on surfaces that do not scatter by the cosine law heights may be off by more than "
     "their stated standard deviations; compare with nearfield"
@@ -137,7 +139,8 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
     tolerance = fit.problem.settings.tolerance_um
     found = []
     if fit.is_interrupted:
-        found.append(INTERRUPTED_WARNING)
+        is_biased = fit.problem.is_biased_by_noise and fit.problem.settings.bias_pairs
+        found.append(INTERRUPTED_WARNING + (BIASED if is_biased else ""))
     if not has_converged(fit.changes, tolerance):
         found.append(
             f"the fit has not converged: its last iteration changed the heights by {fit.changes[-1]:.2f} um (limit "

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.fft import idctn
 
 from helio_jax.forward.form_factor import form_factor_at
-from helio_jax.forward.laws import Law, mean_over_aperture
+from helio_jax.forward.laws import Law, by_law, mean_over_aperture
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface, one_sided, unit_normal
@@ -230,18 +230,18 @@ def expected_data(surface: Surface, parameters: Parameters, fixed: FixedTerms) -
     moves, law = moves_of(parameters, p, len(fixed.data)), law_of(parameters, p)
     normal = unit_normal(surface.slope_x, surface.slope_y, fixed.optics.beam_shift)
     single = single_scattering(factors.visible(surface.height, moves), normal)
-    if law is not None:
-        single = single * mean_over_aperture(law, moved_optics(fixed.optics, moves), surface.height, normal)
+    single = by_law(law, single, moved_optics(fixed.optics, moves), surface.height, normal)
     albedo = smooth_albedo(parameters.albedo, surface.height.shape, p.albedo)
     exponent = p.multiple * parameters.log_multiple
     if fixed.law_response is not None:
         exponent = exponent + fixed.law_response.exponent(parameters.law)
     # its own scale only: intercept and slope are several times the multiple scattering
     multiple = fixed.intercept - fixed.multiple_slope * normal[2] + jnp.expm1(exponent)[:, None, None] * fixed.multiple
-    signal = albedo * (single - fixed.noise_bias) + multiple + parameters.occluded * fixed.occluded
+    signal = single - fixed.noise_bias + multiple + parameters.occluded * fixed.occluded
     if parameters.surroundings.size:
         signal = signal + jnp.sum(parameters.surroundings) * fixed.surroundings
-    if parameters.patch.size:  # the first scattering of every order is by the own pixel
+    signal = albedo * signal  # the first scattering of every order is by the own pixel
+    if parameters.patch.size:
         signal = albedo_of_patches(parameters.patch, p.patch, fixed.patches) * signal
     read = readout_of(parameters, p, fixed.drift_modes, fixed.slow_axis)(signal) + fixed.modes.change(surface.height)
     if parameters.discrepancy.size:
@@ -279,9 +279,7 @@ def second_order_noise_bias(
 
     def signal(x: jax.Array, y: jax.Array) -> jax.Array:
         normal = unit_normal(x, y, optics.beam_shift)
-        single = single_scattering(visible, normal)
-        if law is not None:
-            single = single * mean_over_aperture(law, optics, surface.height, normal)
+        single = by_law(law, single_scattering(visible, normal), optics, surface.height, normal)
         return single - multiple_slope * normal[2]
 
     def along(function, way):

@@ -18,6 +18,7 @@ from scipy.ndimage import map_coordinates
 from helio_jax.arrays import substrate_mask
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.laws import Law, by_law
 from helio_jax.forward.masking import masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
@@ -70,10 +71,11 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray, level: np.ndarray) -> np.
 
 
 @compiled
-def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Raster) -> jax.Array:
+def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Raster, law: Law | None) -> jax.Array:
     """Compute the change of single scattering by masks [detector, y, x] along a change of the surface."""
     slope = jax.jvp(lambda s: masked_form_factor(s, optics, raster), (surface,), (change,))[1]
-    return -single_scattering(slope, unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift))
+    normal = unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift)
+    return -by_law(law, single_scattering(slope, normal), optics, surface.height, normal)
 
 
 @compiled
@@ -100,13 +102,16 @@ def _with_substrate_at(optics: Optics, level: Any) -> Optics:
     return eqx.tree_at(lambda o: o.sample_distance, optics, optics.sample_distance - level)
 
 
-def region_responses(surface: Surface, optics: Optics, raster: Raster, region: np.ndarray) -> tuple[Response, ...]:
-    """Compute how masks follow the levels of plateaus above the largest region, number 0.
+def region_responses(
+    surface: Surface, optics: Optics, raster: Raster, region: np.ndarray, law: Law | None = None
+) -> tuple[Response, ...]:
+    """Compute how masks follow the levels of plateaus above the largest region, number 0, at albedo 1.
 
     Args:
         surface: of the corrections.
         optics, raster: of the scan.
         region: number of the plateau of every pixel [y, x].
+        law: of the scattering; None: the cosine law.
     """
     found, substrate = [], region == 0
     for number in np.unique(region[region > 0]):
@@ -114,7 +119,7 @@ def region_responses(surface: Surface, optics: Optics, raster: Raster, region: n
         change = Surface(inside.astype(float), *np.zeros((2, *region.shape)))
         with jax.enable_x64(True):
             at, along = cast((surface, change), jnp.float64)
-            masked = _masked_change(at, along, optics, raster)
+            masked = _masked_change(at, along, optics, raster, law)
         found.append(Response(inside / inside.sum() - substrate / substrate.sum(), np.asarray(masked)))
     return tuple(found)
 
@@ -126,8 +131,11 @@ def relief_responses(
     raster: Raster,
     has_enough_images: np.ndarray,
     distance: float,
+    law: Law | None = None,
 ) -> tuple[Response, ...]:
-    """Compute how masks and multiple scattering follow level, scale and tilt of all heights.
+    """Compute how masks and multiple scattering follow level, scale and tilt of all heights, at albedo 1.
+
+    That of multiple scattering is by the cosine law.
 
     Args:
         surface: of the corrections.
@@ -135,6 +143,7 @@ def relief_responses(
         optics, raster: of the scan.
         has_enough_images: where the data determine the surface [y, x].
         distance: of the sample from the plate, the scale of level changes, um.
+        law: of the single scattering; None: the cosine law.
     """
     changes = _relief_changes(surface, raster, has_enough_images, distance)
     weights = np.zeros((len(changes), *has_enough_images.shape))
@@ -155,7 +164,7 @@ def relief_responses(
     for i, (change, smooth_change) in enumerate(zip(changes, smooth_changes, strict=True)):
         with jax.enable_x64(True):
             at, along = cast((surface, change), jnp.float64)
-            masked = np.asarray(_masked_change(at, along, optics, raster))
+            masked = np.asarray(_masked_change(at, along, optics, raster, law))
             thinned = jax.tree.map(lambda f: f[thin], smooth_change)
             levels = jnp.asarray(level), jnp.asarray(np.mean(thinned.height[is_substrate]))
             at, along = cast((coarse, thinned), jnp.float64)

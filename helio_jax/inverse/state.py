@@ -117,6 +117,15 @@ class FitState:
         return FitState(surface, self.parameters.replaced(lines=lines), self.residuals[:, *thin], held)
 
 
+def between(first: FitState, second: FitState, share: float) -> FitState:
+    """Return the state at a share of the way from one to another, with the corrections of the second."""
+    if share == 1.0:
+        return second
+    parts = ((s.surface, s.parameters, s.residuals) for s in (first, second))
+    mixed = jax.tree.map(lambda a, b: np.asarray(a + share * (b - a)), *parts)
+    return replace(second, surface=mixed[0], parameters=mixed[1], residuals=mixed[2])
+
+
 def multiple_in_normal(corrections: Corrections, normals: np.ndarray, optics: Optics) -> tuple[np.ndarray, np.ndarray]:
     """Make multiple scattering a linear model of the own normal, intercept - slope * n_z: the slope, the intercept.
 
@@ -209,14 +218,16 @@ def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -
 
 def with_responses(problem: FitProblem, state: FitState) -> FitState:
     """Compute how the corrections follow the levels of plateaus and, with a free border, changes of all heights."""
-    surface, raster = state.held.surface, problem.raster
+    surface, raster, law = state.held.surface, problem.raster, problem.law_at(state.parameters)
     optics = moved_optics(problem.optics, state.held.moved)
-    responses = region_responses(surface, optics, raster, problem.region)
+    responses = region_responses(surface, optics, raster, problem.region, law)
     if problem.is_level_free or problem.is_level_held:
         smooth = state.held.corrections.normals
         normals = surface.normals(problem.shift) if smooth is None else smooth
         known = problem.has_enough_images, float(problem.optics.sample_distance)
-        responses += relief_responses(surface, normals, optics, raster, *known)
+        responses += relief_responses(surface, normals, optics, raster, *known, law)
+    albedo = problem.patches_at(state.parameters).albedo  # of the own pixel, which scatters first
+    responses = tuple(r._replace(change=albedo * r.change) for r in responses)
     return replace(state, held=replace(state.held, responses=responses))
 
 

@@ -93,6 +93,8 @@ def _with_wider_prior(fit: Fit, name: str, start, fitted, say) -> Fit:
         except PredictionError as e:
             say(f"the wider prior is given up: {e}")
             break
+        except KeyboardInterrupt:
+            return interrupted(best, WIDER_TRIED)
         better = max(best, found, key=partial(evidence, best))
         if found.is_interrupted:
             return interrupted(better, WIDER_TRIED)

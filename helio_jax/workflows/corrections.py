@@ -17,14 +17,14 @@ import numpy as np
 
 from helio_jax.arrays import pitch
 from helio_jax.errors import SceneError
-from helio_jax.forward.laws import Law
+from helio_jax.forward.laws import Law, numbers_by_law
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.render import Corrections, masking_corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
-from helio_jax.scene.scattering import COSINE_LAW, Term
+from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.trace.denoise import passes_for
 from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
@@ -106,8 +106,7 @@ def make_predictor(
             found = radiosity_corrections(surface, optics, Raster.of(stack), plan)
             return found if albedo is None else Corrections(found.masked, _mean(albedo) * found.multiple)
         smooth = rasters[0][0].denoised(height, normals)
-        terms = COSINE_LAW if law is None else law.terms()
-        found = [trace_beam(raster, *smooth, surface, normals, optics, albedo, terms) for raster, _ in rasters]
+        found = [trace_beam(raster, *smooth, surface, normals, optics, albedo, law) for raster, _ in rasters]
         return found[0] if len(found) == 1 else _joined(found, [of_beam for _, of_beam in rasters])
 
     def trace_beam(
@@ -118,7 +117,7 @@ def make_predictor(
         normals: np.ndarray,
         optics: Optics,
         albedo: np.ndarray | None,
-        law: tuple[Term, ...],
+        law: Law | None,
     ) -> Corrections:
         """Trace the images of one beam; arguments as those of `predict`, and the denoised heights and normals."""
         height = surface.height
@@ -128,9 +127,10 @@ def make_predictor(
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
+        known = limit, albedo, COSINE_LAW if law is None else law.terms()
         images = np.array(
             [
-                [raster.smoothed(s.multiple(settings, limit, albedo, law), smooth, smooth_normals, passes) for s in way]
+                [raster.smoothed(s.multiple(settings, *known), smooth, smooth_normals, passes) for s in way]
                 for way in either_way
             ]
         )
@@ -152,8 +152,9 @@ def make_predictor(
                 masked = [by_march + side.masked(is_masked) - sheet for side in sides]
         occluded = None
         if len(sides) > 1:
-            normal = np.moveaxis(normals, -1, 0)
-            either = [m - single_scattering(f, normal) for m, f in zip(traced, masked, strict=True)]
+            at = optics, height, np.moveaxis(normals, -1, 0)
+            single = [numbers_by_law(law, single_scattering(f, at[-1]), *at) for f in masked]
+            either = [m - s for m, s in zip(traced, single, strict=True)]
             occluded = hidden.deviation * np.subtract(*either)
         masks, found = (np.tensordot(expected, np.array(of_sides), 1) for of_sides in (masked, traced))
         return Corrections(masks, found, occluded, smooth_normals, surroundings)

@@ -14,7 +14,7 @@ from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.reconstruction import Reconstruction, end_if_interrupted
 from helio_jax.workflows.calibrate_rotated import calibrate_rotated
 from helio_jax.workflows.corrections import make_predictor
 from helio_jax.workflows.provenance import this_run
@@ -229,10 +229,12 @@ class _Reconstructing:
     workers: int | None
 
     def fit(self, stack: MicrographStack, report: Report | None) -> Reconstruction:
-        """Reconstruct without error bars or a test of the result."""
+        """Reconstruct without error bars or a test of the result; an interrupt ends it."""
         refine = self.settings.refine.model_copy(update={"samples": 0})
         quick = self.settings.model_copy(update={"refine": refine})
-        return reconstruct_stack(stack, quick, self._make_predict(stack), report, start=stack.parallax_height)
+        rec = reconstruct_stack(stack, quick, self._make_predict(stack), report, start=stack.parallax_height)
+        end_if_interrupted(rec.status)
+        return rec
 
     def fitted(self, stack: MicrographStack, report: Report | None) -> "Fit":
         """Fit the heights without error bars."""

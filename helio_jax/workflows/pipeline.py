@@ -21,7 +21,7 @@ from helio_jax.formats.safe import atomic_path, check_outputs, files_within, mak
 from helio_jax.inverse.mask_steps import find_steps
 from helio_jax.measure.facets import Facets, find_facets
 from helio_jax.micrograph import Micrographs, MicrographSet, MicrographStack
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.reconstruction import Reconstruction, end_if_interrupted
 from helio_jax.scores.metrics import Scores, Truth, evaluate_height
 from helio_jax.trace.scan import Executor, trace_scene
 from helio_jax.workflows.checkpoint import CheckpointedRun, Shard, is_finished
@@ -161,9 +161,9 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     if not scene.is_file():
         raise ResumeError(f"the scene {scene} of {parts.folder} is gone: put it back, or remove the folder")
     if is_run:
-        return list(
-            run(scene, output.parent, overrides=overrides, stage=stage, executor=executor, say=say).files.values()
-        )
+        result = run(scene, output.parent, overrides=overrides, stage=stage, executor=executor, say=say)
+        end_if_interrupted(result.status)
+        return list(result.files.values())
     with stage("tracing") as progress:
         options = SimulateOptions(noise=noise, executor=executor, progress=progress, say=say)
         simulate_file(scene, output, overrides=overrides, options=options)

@@ -25,6 +25,7 @@ from helio_jax.inverse.fisher import fisher
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.planning.coverage import scans_per_pixel, shifts_about
 from helio_jax.planning.timing import Timing, measure_move, seconds_per_height
+from helio_jax.reconstruction import end_if_interrupted
 from helio_jax.scene.scan import Raster
 from helio_jax.scene.views import views_of
 from helio_jax.workflows import pipeline
@@ -341,7 +342,10 @@ def check(scene: SceneFile, draws: int, n_samples: int = N_SAMPLES) -> Check:
     clean = pipeline.simulate(scene).only()
     seeds = (scene.noise.model_copy(update={"seed": scene.noise.seed + i, "enabled": True}) for i in range(draws))
     noisy = (pipeline.record(scene.model_copy(update={"noise": n}), clean) for n in seeds)
-    recs = [pipeline.reconstruct(stack.only(), "refine", settings=scene.reconstruct) for stack in noisy]
+    recs = []
+    for stack in noisy:
+        recs.append(pipeline.reconstruct(stack.only(), "refine", settings=scene.reconstruct))
+        end_if_interrupted(recs[-1].status)
     use = np.logical_and.reduce([~border, *(r.is_valid for r in recs)])
     if not use.any():
         raise GuardError(f"no pixel is valid in all {draws} reconstructions of the check: see helio run on this scene")

@@ -13,7 +13,7 @@ from helio_jax.formats.hdf5 import read
 from helio_jax.formats.history import history_of
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographSet, MicrographStack
-from helio_jax.reconstruction import Reconstruction
+from helio_jax.reconstruction import Reconstruction, end_if_interrupted
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_errors import explain_errors
@@ -75,6 +75,7 @@ def rerun(path: str | Path, report: Callable[[str], None] = lambda text: None) -
             raise InputFileError(explain_errors(where, e, ReconstructSettings, history.settings)) from None
         report("reconstructing")
         found = pipeline.reconstruct(found, settings=settings)
+        end_if_interrupted(found.status)
     what = "height" if isinstance(before, Reconstruction) else "counts"
     pairs = [(getattr(a, what), getattr(b, what)) for a, b in zip(_parts(before), _parts(found), strict=True)]
     is_equal = all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)

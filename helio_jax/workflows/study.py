@@ -22,6 +22,7 @@ from helio_jax.figures.sweep import save_sweep
 from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
 from helio_jax.formats.toml import to_toml
 from helio_jax.micrograph import MicrographStack
+from helio_jax.reconstruction import end_if_interrupted
 from helio_jax.scene.files import read_bytes
 from helio_jax.texts import parse_json
 from helio_jax.workflows import pipeline
@@ -153,6 +154,7 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
     try:
         if study.reconstruct:
             result = pipeline.run(scene, point.folder, executor=options.executor, say=options.say, report=study.report)
+            end_if_interrupted(result.status)  # resumed, the study runs this point again
             row |= {"method": result.method, **result.scores.as_dict()}
         else:
             stack = pipeline.simulate_file(scene, point.folder / "micrographs.h5", options=options)

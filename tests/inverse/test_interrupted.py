@@ -31,7 +31,7 @@ def test_the_fit_so_far_is_kept(monkeypatch, place):
     """Interrupted while its residuals are traced, or a pit is looked for. Catches an interrupt that loses the fit."""
     tried = []
     first = Explanation(StandIn(), np.zeros(SHAPE, bool))  # type: ignore[arg-type]
-    stack = SimpleNamespace(shape=(3, *SHAPE), counts=np.zeros((3, *SHAPE)))
+    stack = SimpleNamespace(shape=(3, *SHAPE), counts=np.zeros((3, *SHAPE)), calibration=None)
 
     def stop(self, *known):
         raise KeyboardInterrupt

@@ -17,12 +17,20 @@ from helio_jax.forward.render import Corrections
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.inverse.fit import Fit, fit_heights, with_posterior
 from helio_jax.inverse.instrument_report import describe_instrument
-from helio_jax.inverse.law_prior import cosine_probability, law_prior, numbers_of
-from helio_jax.inverse.parameters import LawPrior
+from helio_jax.inverse.law_prior import (
+    cosine_probability,
+    in_units_of_cosine_law,
+    in_units_of_law,
+    law_prior,
+    numbers_of,
+)
+from helio_jax.inverse.linear import signal_of
+from helio_jax.inverse.parameters import LawPrior, smooth_albedo
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, update_corrections
 from helio_jax.inverse.steps import expected
+from helio_jax.micrograph import Calibration
 from helio_jax.workflows.pipeline import record
 
 N, PITCH = 21, 48.0
@@ -160,6 +168,48 @@ def test_predicted_multiple_scattering_counts_as_it_is_under_a_law():
     found = Corrections(Corrections.none(single.shape).masked, multiple)
     state = update_corrections(problem, FitState.at(problem, surface), lambda *_, **__: found)
     assert np.allclose(expected(problem, state, is_noisy=False), single + multiple, rtol=1e-4)
+
+
+def test_smooth_albedo_weights_all_orders():
+    """The own pixel scatters atoms of every order first: its albedo weights single and multiple scattering alike.
+
+    Rejects an albedo of single scattering alone, by which a bright pixel beside a wall came out too dark.
+    """
+    surface, optics = hills(), hx.Optics.of(INSTRUMENT)
+    single = np.asarray(hx.render(surface, optics, RASTER, corrections="none"))
+    multiple = 0.3 * single.mean() * (1.0 + np.random.default_rng(3).uniform(size=single.shape))
+    settings = ReconstructSettings(refine=RefineSettings(albedo_std=0.1, albedo_modes=3))
+    problem = FitProblem.of(single + multiple, 1e-12 * single, INSTRUMENT, RASTER, surface, settings)
+    found = Corrections(Corrections.none(single.shape).masked, multiple)
+    state = update_corrections(problem, FitState.at(problem, surface), lambda *_, **__: found)
+    modes = np.zeros((3, 3))
+    modes[0, 1] = 1.0
+    there = replace(state, parameters=state.parameters.replaced(albedo=modes))
+    albedo = np.asarray(smooth_albedo(modes, surface.height.shape, settings.refine.albedo_std))
+    assert np.ptp(albedo) > 0.1
+    assert np.allclose(expected(problem, there, is_noisy=False), albedo * (single + multiple), rtol=1e-4)
+
+
+def test_calibrated_substrate_has_the_level_of_the_stated_law():
+    """A border brought to the cosine law's level is what a fit by cos^1.3 expects of the substrate, gains as stated.
+
+    And what starts by the cosine law gets it back. Rejects a level that is 7 % off at the prior means.
+    """
+    flat, optics = hx.Surface(*np.zeros((3, N, N))), hx.Optics.of(INSTRUMENT)
+    cosine, power = (
+        np.asarray(hx.render(flat, optics, RASTER, corrections="none", law=law)) for law in (None, hx.PowerLaw(0.3))
+    )
+    instrument = INSTRUMENT.model_copy(update={"law": CampaignLaw(exponent=0.3, std=0.05)})
+    about = {"n_rays": 1.0, "variance": 1e-6 * cosine, "calibration": Calibration("border")}
+    stack, settings = hx.MicrographStack(cosine, RASTER.x, RASTER.y, instrument, **about), RefineSettings()
+    brought = in_units_of_law(stack, settings)
+    assert np.abs(power / cosine - 1.0).min() > 0.07
+    assert np.allclose(brought.counts, power, rtol=1e-6)
+    assert np.allclose(signal_of(brought)[1] / signal_of(stack)[1], (power / cosine) ** 2, rtol=1e-6)
+    assert np.allclose(in_units_of_cosine_law(brought, settings).counts, cosine, rtol=1e-6)
+    assert in_units_of_law(stack, RefineSettings(law="cosine")) is stack
+    known = stack.replace(calibration=None)  # in units of a known beam
+    assert in_units_of_law(known, settings) is known
 
 
 def test_multiple_scattering_follows_the_law():
