@@ -24,8 +24,8 @@ from helio_jax.forward.surface import unit_normal
 
 SMOOTHING = 1.0
 """Standard deviation of the Gaussian that averages traced over predicted multiple scattering [pixels]: noise is 3.5
-times smaller. Over more the ratio is not constant: at an object's foot the result is up to 1.1 % of the signal too
-large, 1.8 % with 2 pixels."""
+times smaller. The ratio changes at an object's foot, where the result is up to 1.1 % of the signal too large; averaged
+over 2 pixels, 1.8 %."""
 _LEAST_SHARE = 1e-15
 """Added to shares and squares whose logarithm or root is taken."""
 

@@ -118,8 +118,8 @@ def error_shares(fit: KnownFit) -> list[float]:
 
 
 ON_TWINS = (
-    "on 14 simulated scans the errors were 1.2 times the standard deviations stated (root mean square; plate rotation "
-    "1.4, tilts 1.3 times); what a real scan has and these lack is in none of them"
+    "on 14 simulated scans the errors were 1.2 times the standard deviations stated (root mean square; of single "
+    "parameters up to 1.4); what a real scan has and these lack is in none of them"
 )
 """Measured: docs/calibrate.md. A sentence of every verdict: what its standard deviations were found to be worth."""
 

@@ -165,7 +165,8 @@ def law_of(rec: Reconstruction) -> str:
         return f"surfaces scatter by the law of the instrument file, cos^(1 + m) with m = {exponent:.3g} +- {std:.2g}"
     kind, judged = str(law.get("kind")).replace("_", " "), "compatible" if law.get("is_cosine") else "NOT compatible"
     if "is_cosine" not in law:
-        return f"surfaces scatter by a {kind} law, whose numbers were fitted, without error bars"
+        found = ", ".join(f"{name} {value:.3g}" for name, value in numbers(law, "numbers").items())
+        return f"surfaces scatter by a {kind} law, whose numbers were fitted, without error bars: {found}"
     chance = numbers(law).get("cosine_probability", math.nan)
     return (
         f"surfaces scatter by a {kind} law, whose numbers were fitted: {judged} with the cosine law (probability "

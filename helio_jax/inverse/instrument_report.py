@@ -143,15 +143,16 @@ def describe_law(fit: Fit) -> dict[str, Any]:
     """Describe the scattering law; of a fitted one, test whether it is compatible with the cosine law.
 
     `kind`: of the law; `cosine_probability`: `law_prior.cosine_probability`; `is_cosine`: whether it exceeds
-    `LEAST_PROBABILITY`; both only with error bars. Of a law that is held: `exponent` and `std`, as the
-    instrument file states them.
+    `LEAST_PROBABILITY`; both only with error bars, without them its `numbers`, name -> value. Of a law that is held:
+    `exponent` and `std`, as the instrument file states them.
     """
     if fit.problem.is_law_held:
         assert fit.problem.instrument is not None and fit.problem.instrument.law is not None
         return {"kind": "as_stated"} | fit.problem.instrument.law.model_dump()
     prior, whitened, posterior = fit.problem.priors.law, np.ravel(fit.parameters.law), fit.posterior
     if posterior is None:
-        return {"kind": fit.problem.settings.law}
+        found = {n.name: n.mean + n.std * float(w) for n, w in zip(numbers_of(prior), whitened, strict=True)}
+        return {"kind": fit.problem.settings.law, "numbers": found}
     of_law = [i for i, name in enumerate(posterior.names) if kind_of(name) == "law"]
     assert prior is not None
     probability = cosine_probability(prior, whitened, posterior.instrument_covariance[np.ix_(of_law, of_law)])

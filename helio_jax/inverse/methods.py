@@ -52,7 +52,7 @@ GEOMETRY_WARNING = (
 """Warning of a fit whose aperture angles or distance are unknown."""
 
 LAW_WARNING = (
-    "numbers of the scattering law were fitted: on traced samples they were off by up to 7 of their stated standard "
+    "numbers of the scattering law were fitted: on traced samples they were off by up to 5 of their stated standard "
     "deviations (docs/limits.md), so that even a sample of the cosine law may be said not to be one: simulate the "
     "sample to test it"
 )

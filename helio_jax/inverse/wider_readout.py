@@ -87,7 +87,7 @@ def _with_wider_prior(fit: Fit, name: str, start, fitted, say) -> Fit:
         width = normal_widths(best.parameters, before)[name]
         if width < SAME_WIDTH * before[name]:
             break
-        say(f"{READOUT[name]} {width:.2g} times as large as stated")
+        say(f"{READOUT[name]} {width:.3g} times as large as stated")
         try:
             found = fitted(surface, smoothed, {name: width})
         except PredictionError as e:
