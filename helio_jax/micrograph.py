@@ -254,6 +254,18 @@ class MicrographStack(OnRaster):
         """Return this stack, so that a stack can be used as a set of one."""
         return self
 
+    def scaled(self, factor: np.ndarray) -> "MicrographStack":
+        """Multiply counts, variance, background and parallax by a factor of every detector [detector, 1, 1]."""
+        background = self.background
+        if background is not None:
+            background = background * (factor if background.ndim == 3 else factor[:, 0, 0])
+        return self.replace(
+            counts=self.counts * factor,
+            variance=None if self.variance is None else self.variance * factor**2,
+            background=background,
+            parallax=None if self.parallax is None else self.parallax * factor,
+        )
+
     def replace(self, **changes: Any) -> "MicrographStack":
         """Return a validated copy with some fields changed."""
         return replace(self, **changes)

@@ -38,7 +38,7 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
-from helio_jax.inverse.law_prior import in_units_of_cosine_law, in_units_of_law
+from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
 from helio_jax.inverse.mask_steps import find_steps
@@ -140,7 +140,7 @@ def explain(
     they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`). Interrupted
     after the first fit, it returns the best of those that were compared. Arguments as `reconstruct_stack`.
     """
-    stack = in_units_of_law(stack, settings.refine)
+    stack = with_level_of_law(stack, settings.refine)
     fits = _Fits(stack, settings, make_predict, report, start)
     none = AlbedoPatches.none(stack.shape[1:])
     if start is None:
@@ -191,7 +191,10 @@ def explain(
 
 @dataclass(frozen=True)
 class _Fits:
-    """Fits of one stack, in the units of the law, from different starts; fields as the arguments of `explain`."""
+    """Fits of one stack from different starts; fields as the arguments of `explain`.
+
+    The stack is scaled to the level of the fit's law (`with_level_of_law`).
+    """
 
     stack: MicrographStack
     settings: ReconstructSettings
@@ -256,8 +259,8 @@ class _Fits:
 
     @cached_property
     def by_cosine_law(self) -> MicrographStack:
-        """The stack in the units of the cosine law, which photometric starts and the search for objects take."""
-        return in_units_of_cosine_law(self.stack, self.settings.refine)
+        """The stack scaled to the level of the cosine law, which photometric starts and the search for objects take."""
+        return with_level_of_cosine_law(self.stack, self.settings.refine)
 
     @cached_property
     def predict(self) -> Predict:

@@ -37,7 +37,7 @@ from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
 ALTERNATING = 2.0 / 3.0
-"""Aitken's extrapolation below which changes alternate and fall by less than a half from one to the next."""
+"""Aitken's extrapolation below which the next iteration is relaxed: each change undoes more than half of the last."""
 INFLATING = (
     (("distance", "tilt", "aim"), 1.0),
     (("discrepancy",), 1.3),
@@ -292,7 +292,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
             extrapolation = relaxation * aitken(change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-        is_alternating = number > 0 and 0.0 < extrapolation < ALTERNATING
+        is_alternating = 0.0 < extrapolation < ALTERNATING
         relaxation = extrapolation if is_alternating and number + 1 < s.max_rounds else 1.0
         state = between(before, state, relaxation)
     undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result

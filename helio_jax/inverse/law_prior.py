@@ -57,44 +57,33 @@ def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> La
     return None
 
 
-def stated_level_ratio(stack: MicrographStack, settings: RefineSettings) -> np.ndarray | None:
-    """Compute the signal of the level substrate by a stack's stated law, where a fit takes it, over the cosine law's.
+def with_level_of_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
+    """Scale a calibrated stack: its substrate gets the signal that the stated law of the fit gives a level substrate.
 
-    [detector, 1, 1]; None where the fit takes another law, whose prior mean is the cosine law.
+    Calibration gives it that of the cosine law. A stack in units of a known beam stays as it is.
+    """
+    ratio = None if stack.calibration is None else _stated_level_ratio(stack, settings)
+    return stack if ratio is None else stack.scaled(ratio)
+
+
+def with_level_of_cosine_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
+    """Scale a stack whose substrate has the signal of the fit's stated law to that of the cosine law.
+
+    Photometric starts take the cosine law.
+    """
+    ratio = _stated_level_ratio(stack, settings)
+    return stack if ratio is None else stack.scaled(1.0 / ratio)
+
+
+def _stated_level_ratio(stack: MicrographStack, settings: RefineSettings) -> np.ndarray | None:
+    """Compute the signal of a level substrate by the law of the instrument file over that by the cosine law.
+
+    [detector, 1, 1]; None where the file states none, or the fit takes another law, whose prior mean is the cosine law.
     """
     stated = stack.instrument.law
     if settings.law != "as_stated" or stated is None:
         return None
     return level_ratio(PowerLaw(stated.exponent), Optics.of(stack.instrument))[:, None, None]
-
-
-def in_units_of_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
-    """Bring a stack that its substrate calibrates to the substrate's level by the law of the fit.
-
-    A calibration brings it to that by the cosine law.
-    """
-    return stack if stack.calibration is None else _scaled(stack, stated_level_ratio(stack, settings))
-
-
-def in_units_of_cosine_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
-    """Bring a stack in the units of the law of the fit to those of the cosine law, which photometric starts take."""
-    ratio = stated_level_ratio(stack, settings)
-    return _scaled(stack, None if ratio is None else 1.0 / ratio)
-
-
-def _scaled(stack: MicrographStack, factor: np.ndarray | None) -> MicrographStack:
-    """Multiply the readings of a stack by a factor of every detector [detector, 1, 1]; None: by none."""
-    if factor is None:
-        return stack
-    background = stack.background
-    if background is not None:
-        background = background * (factor if background.ndim == 3 else factor[:, 0, 0])
-    return stack.replace(
-        counts=stack.counts * factor,
-        variance=None if stack.variance is None else stack.variance * factor**2,
-        background=background,
-        parallax=None if stack.parallax is None else stack.parallax * factor,
-    )
 
 
 def check_law(settings: RefineSettings, stated: CampaignLaw | None, n_images: int) -> None:

@@ -127,13 +127,9 @@ def make_predictor(
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
         passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
-        known = limit, albedo, COSINE_LAW if law is None else law.terms()
-        images = np.array(
-            [
-                [raster.smoothed(s.multiple(settings, *known), smooth, smooth_normals, passes) for s in way]
-                for way in either_way
-            ]
-        )
+        terms = COSINE_LAW if law is None else law.terms()
+        multiple = [[s.multiple(settings, limit, albedo, terms) for s in way] for way in either_way]
+        images = np.array([[raster.smoothed(m, smooth, smooth_normals, passes) for m in way] for way in multiple])
         expected = np.array(hidden.shares if len(sides) > 1 else (1.0,))
         traced, surroundings = images.mean(0), None
         if len(images) > 1:
@@ -152,8 +148,8 @@ def make_predictor(
                 masked = [by_march + side.masked(is_masked) - sheet for side in sides]
         occluded = None
         if len(sides) > 1:
-            at = optics, height, np.moveaxis(normals, -1, 0)
-            single = [numbers_by_law(law, single_scattering(f, at[-1]), *at) for f in masked]
+            normal = np.moveaxis(normals, -1, 0)
+            single = [numbers_by_law(law, single_scattering(f, normal), optics, height, normal) for f in masked]
             either = [m - s for m, s in zip(traced, single, strict=True)]
             occluded = hidden.deviation * np.subtract(*either)
         masks, found = (np.tensordot(expected, np.array(of_sides), 1) for of_sides in (masked, traced))

@@ -263,8 +263,7 @@ class _Trial:
         if self.flat is None:
             return stack
         scale = (self.flat / self.flat[list(candidate.order)])[:, None, None]
-        assert stack.variance is not None  # calibration gave it
-        return stack.replace(counts=stack.counts * scale, variance=stack.variance * scale**2)
+        return stack.scaled(scale)
 
     def quick(self, candidate: Candidate) -> float:
         """Compute the cost without masking and multiple scattering."""

@@ -19,10 +19,10 @@ from helio_jax.inverse.fit import Fit, fit_heights, with_posterior
 from helio_jax.inverse.instrument_report import describe_instrument
 from helio_jax.inverse.law_prior import (
     cosine_probability,
-    in_units_of_cosine_law,
-    in_units_of_law,
     law_prior,
     numbers_of,
+    with_level_of_cosine_law,
+    with_level_of_law,
 )
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.parameters import LawPrior, smooth_albedo
@@ -202,14 +202,14 @@ def test_calibrated_substrate_has_the_level_of_the_stated_law():
     instrument = INSTRUMENT.model_copy(update={"law": CampaignLaw(exponent=0.3, std=0.05)})
     about = {"n_rays": 1.0, "variance": 1e-6 * cosine, "calibration": Calibration("border")}
     stack, settings = hx.MicrographStack(cosine, RASTER.x, RASTER.y, instrument, **about), RefineSettings()
-    brought = in_units_of_law(stack, settings)
+    brought = with_level_of_law(stack, settings)
     assert np.abs(power / cosine - 1.0).min() > 0.07
     assert np.allclose(brought.counts, power, rtol=1e-6)
     assert np.allclose(signal_of(brought)[1] / signal_of(stack)[1], (power / cosine) ** 2, rtol=1e-6)
-    assert np.allclose(in_units_of_cosine_law(brought, settings).counts, cosine, rtol=1e-6)
-    assert in_units_of_law(stack, RefineSettings(law="cosine")) is stack
+    assert np.allclose(with_level_of_cosine_law(brought, settings).counts, cosine, rtol=1e-6)
+    assert with_level_of_law(stack, RefineSettings(law="cosine")) is stack
     known = stack.replace(calibration=None)  # in units of a known beam
-    assert in_units_of_law(known, settings) is known
+    assert with_level_of_law(known, settings) is known
 
 
 def test_multiple_scattering_follows_the_law():
