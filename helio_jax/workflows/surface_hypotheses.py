@@ -7,16 +7,18 @@ free border (`CONTINUATIONS`).
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from helio_jax.arrays import pitch, substrate_level
 from helio_jax.errors import GuardError, PredictionError
+from helio_jax.forward.surface import slopes_of_normal
 from helio_jax.instrument import Instrument
 from helio_jax.scene.body import Body
 from helio_jax.scene.border import continue_border, extend_border
 from helio_jax.scene.hidden_side import is_foot, occluded_vertices, undercut_vertices, with_cavities
+from helio_jax.scene.midpoints import first_of_halves, with_midpoints
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import surface_body
 from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
@@ -183,13 +185,16 @@ class ScanRaster:
     ) -> SurfaceHypothesis:
         """Make the surface with its hidden side at a place, continued in one of `CONTINUATIONS`.
 
-        Walls are half-way between the pixels, unless most of what is occluded lies behind round bodies.
+        Where the beam sees all of it, the mesh has points between the pixels, too (`with_midpoints`). Walls are
+        half-way between the pixels, unless most of what is occluded lies behind round bodies.
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
         behind = self.with_hidden_side(at, normals, hidden, place)
         substrate = self.flat_surroundings
-        if not self.has_flat_surroundings:
+        if self.has_flat_surroundings:
+            at, behind = self.with_foot(at), self.with_foot(behind)
+        else:
             level, substrate = substrate_level(height), {}
             if way == "relief":
                 at, behind = self.continued(at, behind, level)
@@ -199,14 +204,26 @@ class ScanRaster:
         if hidden.has_walls:
             at, behind, number = with_upright_walls(at, behind, shift)
             pixel = pixel[number]
+        has_walls = at[0].size > n_points
+        if not has_walls and not self.is_occluded(height).any():
+            rows, columns = map(first_of_halves, at[0].shape)
+            pixel = pixel.reshape(at[0].shape)[np.ix_(rows, columns)].ravel()
+            at = behind = with_midpoints(at, *self.slopes(normals, at[0].shape), self.pitches, shift)
         body = with_cavities(surface_body(*at, **substrate), at, behind)
         point = np.stack(seen, -1).reshape(-1, 3) + self.lift * normal
         beam_x, beam_y = (
             at + (own - view) * height
             for at, own, view in zip((self.x, self.y), self.instrument.beam_shift, shift, strict=True)
         )
-        has_walls, hits = at[0].size > n_points, Hits.on_mesh(point, normal)
+        hits = Hits.on_mesh(point, normal)
         return SurfaceHypothesis(self, beam_x, beam_y, hits, body, pixel, Intersector(body), has_walls)
+
+    def slopes(self, normals: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the slopes along the raster of unit normals [y, x, 3], NaN around the image in a larger grid."""
+        around = (shape[0] - len(self.x)) // 2
+        slopes = slopes_of_normal(normals, self.view_shift)[:2]
+        a, b = (np.pad(np.asarray(slope), around, constant_values=np.nan) for slope in slopes)
+        return a, b
 
     def hidden_side(self, height: np.ndarray, normals: np.ndarray) -> HiddenSide:
         """Decide whether walls or round bodies hide a part of the surface from the beam."""
@@ -239,10 +256,11 @@ class ScanRaster:
         normals: np.ndarray,
         passes: int = 1,
         width: float = SMOOTH_NORMALS,
+        degree: Literal[1, 2] = 1,
     ) -> np.ndarray:
         """Smooth images [image, y, x] along a surface of heights [y, x], um, and unit normals [y, x, 3]."""
         points = np.stack(self.surface(self.x, self.y, height), -1)
-        return smooth_along_surface(images, normals, points, max(self.pitches), passes, width)
+        return smooth_along_surface(images, normals, points, max(self.pitches), passes, width, degree)
 
     def denoised(self, height: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Average heights [y, x], um, and unit normals [y, x, 3] over neighbours on the same facet.
@@ -260,6 +278,20 @@ class ScanRaster:
     def surface(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Grid:
         """Compute the surface points of heights [y, x] that are seen at positions x, y of the raster [um]."""
         return x - height * self.view_shift[0], y - height * self.view_shift[1], height
+
+    def with_foot(self, grid: Grid) -> Grid:
+        """Add a ring of points one pitch outside a grid, on the flat surroundings [y + 2, x + 2].
+
+        Atoms start from the points of the image: at its border they would start from the rim of a vertical sheet.
+        """
+        x, y = (np.pad(position, 1, mode="reflect", reflect_type="odd") for position in (self.x, self.y))
+        about = self.flat_surroundings
+        slope, shift = np.asarray(about["tilt"]), np.asarray(self.view_shift)
+        level = (about["level"] + slope[0] * x + slope[1] * y) / (1.0 + slope @ shift)
+        ring = self.surface(x, y, level)
+        for around, field in zip(ring, grid, strict=True):
+            around[1:-1, 1:-1] = field
+        return ring
 
     def continued(self, at: Grid, behind: Grid, level: float) -> tuple[Grid, Grid]:
         """Continue a grid's relief beyond the image; the occluded side of what is added stays on the beam's sheet."""

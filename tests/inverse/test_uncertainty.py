@@ -24,6 +24,7 @@ from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState
 from helio_jax.inverse.steps import freeze
 from helio_jax.workflows import pipeline
+from helio_jax.workflows.corrections import make_predictor
 
 
 def random_problem(shape=(4, 5), n_parameters=3, n_common=2, seed=0) -> Linearised:
@@ -95,9 +96,10 @@ def test_pulls_of_repeated_noise(bshem):
 
     pulls = []
     for seed in range(4):
-        stack, height, _ = bump_stack(bshem, n=56)
+        stack, height, normal = bump_stack(bshem, n=56)
         rng = np.random.default_rng(seed)
-        expected = stack.counts / 1e6 * 3.5e4
+        multiple = make_predictor(stack, 4_000_000)(height, normal).multiple
+        expected = 3.5e4 * (stack.counts / 1e6 + multiple)
         noisy = rng.poisson(expected).astype(float)
         one = stack.replace(counts=noisy, variance=expected, n_rays=3.5e4)
         rec = pipeline.reconstruct(one, "refine", refine={"max_rounds": 2, "rays": 100_000})
