@@ -6,6 +6,7 @@ alignment is added to the variance.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +14,9 @@ from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch
-from helio_jax.errors import GuardError
+from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Detector, Instrument
-from helio_jax.micrograph import OF_ONE_SCAN, MicrographSet, MicrographStack, ScanAlignment
+from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
@@ -127,6 +128,22 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     return stacks[0].instrument.model_copy(update={"beam": beam, "detector": tuple(detectors)})
 
 
+def _calibration(stacks: tuple[MicrographStack, ...]) -> Calibration | None:
+    """Return the calibration of joined scans, that of the first with the warnings of all; None: they have none.
+
+    Raises:
+        InputFileError: some are calibrated in another way than others.
+    """
+    found = [stack.calibration for stack in stacks]
+    kinds = {None if c is None else (c.method, c.without_multiple) for c in found}
+    if len(kinds) > 1:
+        names = ", ".join(f"{s.name}: {'none' if s.calibration is None else s.calibration.method}" for s in stacks)
+        raise InputFileError(f"scans that are joined must be calibrated alike, got {names}: calibrate all of them anew")
+    if found[0] is None:
+        return None
+    return replace(found[0], warnings=tuple(dict.fromkeys(w for c in found if c for w in c.warnings)))
+
+
 def is_lit(height: np.ndarray, x: np.ndarray, y: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Find the points of a surface that a beam reaches [y, x]; pixels beside a shadow count as shadowed.
 
@@ -220,7 +237,7 @@ def resample(
                 level = np.broadcast_to(stack.background[k], image.shape)  # type: ignore[index]
                 background.append(SplineImage.of(level, known, stack.x, stack.y).at(places)[0])
     first = scans.stacks[0]
-    dropped = dict.fromkeys((*OF_ONE_SCAN, "calibration", "dwell_map"))
+    dropped = dict.fromkeys((*OF_ONE_SCAN, "dwell_map"))
     return first.replace(
         counts=np.stack(counts),
         x=x,
@@ -232,6 +249,7 @@ def resample(
         parallax=None if height is None else np.stack(parallax),
         parallax_height=height,
         n_rays=first.n_rays if len({s.n_rays for s in scans.stacks}) == 1 else None,
+        calibration=_calibration(scans.stacks),
         dwell=first.dwell if len({s.dwell for s in scans.stacks}) == 1 else None,
         name=f"{first.name} and {len(scans.stacks) - 1} more",
         alignment=ScanAlignment(scan_times(scans.stacks, motions)),

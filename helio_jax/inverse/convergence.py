@@ -8,18 +8,23 @@ SLOWEST = 0.9
 """Largest contraction per iteration that a fit is credited with: without convergence the error is nine last changes."""
 
 
-def aitken(change_before: np.ndarray, change: np.ndarray) -> float:
-    """Extrapolate a linearly convergent iteration: distance to its limit in units of the last change, plus one.
+def extrapolation(step: np.ndarray, change_before: np.ndarray, change: np.ndarray) -> float:
+    """Estimate by what share of the last change an iteration reaches its limit, if it is linear along the last step.
 
     Above 1 where changes keep their sign, below where they alternate (a mask that is predicted too wide raises the
-    surface in it, and the next one is predicted too narrow). Changes that agree, or grow, give infinity or less than 0.
+    surface in it, and the next one is predicted too narrow), 1 where the change has nothing to do with the one before.
+    Changes that agree, or grow, give infinity or less than 0.
 
-    Source: Aitken's Delta^2 for vectors: Irons and Tuck, Int. J. Numer. Meth. Eng. 1 (1969) 275; Kuettler and Wall,
-        Comput. Mech. 43 (2008) 61, eq. 44.
+    Args:
+        step: between the starts of the last two iterations.
+        change_before, change: by these iterations.
+
+    Source: secant method along the step, as Aitken's Delta^2 for vectors (Irons and Tuck, Int. J. Numer. Meth. Eng. 1
+        (1969) 275; Kuettler and Wall, Comput. Mech. 43 (2008) 61, eq. 44), which takes any change that is larger than
+        the one before, or square to it, for one that alternates.
     """
-    apart = change_before - change
-    square = float(np.sum(apart**2))
-    return float(np.sum(change_before * apart)) / square if square else np.inf
+    falls = float(np.sum(step * (change_before - change)))
+    return float(np.sum(step**2)) / falls if falls else np.inf
 
 
 def contraction_of(changes: Sequence[float]) -> float | None:
@@ -27,7 +32,7 @@ def contraction_of(changes: Sequence[float]) -> float | None:
     return changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else None
 
 
-def remaining_error(changes: Sequence[float], extrapolation: float) -> float:
+def remaining_error(changes: Sequence[float], extrapolated: float) -> float:
     """Estimate the distance of the heights from the limit of further iterations, in units of the last change.
 
     Slow convergence: the extrapolation, nine changes at most. Iterates that oscillate, or are limited by Monte Carlo
@@ -36,13 +41,13 @@ def remaining_error(changes: Sequence[float], extrapolation: float) -> float:
 
     Args:
         changes: root mean square of the height changes of every iteration.
-        extrapolation: from `aitken` by the last two; unused with fewer.
+        extrapolated: `extrapolation` by the last two; unused with fewer.
     """
     known = [c for c in (contraction_of(changes), contraction_of(changes[:-1])) if c is not None]
     if not known:
         return 1.0
     contraction, most = max(known), SLOWEST / (1.0 - SLOWEST)
-    slow = extrapolation - 1.0 if 0.0 < extrapolation < 1.0 + most else most
+    slow = extrapolated - 1.0 if 0.0 < extrapolated < 1.0 + most else most
     oscillating = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
     return max(slow, oscillating)
 

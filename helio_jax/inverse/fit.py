@@ -20,12 +20,12 @@ from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Instrument
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
-from helio_jax.inverse.convergence import aitken, contraction_of, remaining_error, status_of
+from helio_jax.inverse.convergence import contraction_of, extrapolation, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, ModelError
 from helio_jax.inverse.edges import AxisEdges
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
-from helio_jax.inverse.parameters import HELD, Parameters, smooth_albedo
+from helio_jax.inverse.parameters import HELD, Parameters
 from helio_jax.inverse.posterior import MAX_PIXELS, Linearised, Posterior, linearise, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
@@ -36,8 +36,9 @@ from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
-ALTERNATING = 2.0 / 3.0
-"""Aitken's extrapolation below which the next iteration is relaxed: each change undoes more than half of the last."""
+ALTERNATING, LEAST_RELAXATION = 2.0 / 3.0, 0.3
+"""Extrapolation below which the next iteration is relaxed: each change undoes more than half of the last; and the least
+share of a change that is kept."""
 INFLATING = (
     (("distance", "tilt", "aim"), 1.0),
     (("discrepancy",), 1.3),
@@ -73,6 +74,7 @@ class Fit:
         contraction: ratio of the last two changes, or None.
         status: a sentence: how the fit ended.
         is_interrupted: whether it, or what followed it, was stopped from the keyboard.
+        is_bias_subtracted: whether the bias by noise was subtracted.
         prior_widths: standard deviations of the priors of gains and offsets over those stated, by the names of the
             parameters; empty: as stated.
     """
@@ -97,6 +99,7 @@ class Fit:
     contraction: float | None
     status: str
     is_interrupted: bool = False
+    is_bias_subtracted: bool = False
     prior_widths: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -241,8 +244,8 @@ def after_one_solve(problem: FitProblem, state: FitState) -> np.ndarray:
 def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
-    Where changes alternate, the next iteration starts between the last two surfaces (Aitken's relaxation), or masks and
-    multiple scattering that overshoot would swing for ever.
+    Where changes alternate, the next iteration starts between the last two surfaces (relaxed by `extrapolation`), or
+    masks and multiple scattering that overshoot would swing for ever.
 
     Interrupted from the keyboard after the first iteration, it returns the best so far. Where a solve ends in a surface
     that cannot be traced, the step is halved; where that does not help, the surface before it is kept.
@@ -253,16 +256,14 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         predict: multiple scattering and masked form factors on a surface.
         report: called before each outer iteration.
 
-    Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987); relaxation: Kuettler
-        and Wall, Comput. Mech. 43 (2008) 61, eq. 44.
+    Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
     """
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
     reached: FitState | None = None
-    last_change = np.zeros(start.height.shape)
-    extrapolation = relaxation = 1.0
+    last_start, last_change, extrapolated = start.height, np.zeros(start.height.shape), 1.0
     is_interrupted, is_traceable = False, True
-    said = "start"
+    said, solved = "start", state
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
     for number in range(s.max_rounds):
         before = state
@@ -278,25 +279,26 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         except KeyboardInterrupt:
             if not changes:
                 raise
-            state, is_interrupted = replace(state, surface=before.surface), True
+            state, is_interrupted = solved, True
             break
         except PredictionError:
             if reached is None:
                 raise
             state, is_traceable = with_residuals(problem, reached), False
             break
-        change_before, last_change = last_change, state.surface.height - before.surface.height
+        step_before, last_start = before.surface.height - last_start, before.surface.height
+        change_before, last_change = last_change, state.surface.height - last_start
+        solved = state
         changes.append(float(np.sqrt(np.mean(last_change**2))))
         said = f"cost {found.cost:.4g}, height change {changes[-1]:.2f} um"
         if number:
-            extrapolation = relaxation * aitken(change_before, last_change)
+            extrapolated = extrapolation(step_before, change_before, last_change)
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
-        is_alternating = 0.0 < extrapolation < ALTERNATING
-        relaxation = extrapolation if is_alternating and number + 1 < s.max_rounds else 1.0
-        state = between(before, state, relaxation)
+        if n_fixed < number < s.max_rounds - 1 and 0.0 < extrapolated < ALTERNATING:
+            state = with_residuals(problem, between(before, state, max(extrapolated, LEAST_RELAXATION)))
     undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result
-    remaining = (remaining_error(changes, extrapolation) + undone) * last_change
+    remaining = (remaining_error(changes, extrapolated) + undone) * last_change
     return Fit(
         problem=problem,
         **_shown(problem, state),
@@ -341,7 +343,7 @@ def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
         state = subtract_bias(problem, fit.state, *noise_bias(problem, fit.state, n_pairs))
     except KeyboardInterrupt:
         return interrupted(fit, "while the bias by noise was simulated")
-    return replace(fit, **_shown(problem, state), **_explained(problem, state))
+    return replace(fit, **_shown(problem, state), **_explained(problem, state), is_bias_subtracted=True)
 
 
 def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
@@ -368,13 +370,11 @@ def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:
 def _shown(problem: FitProblem, state: FitState) -> dict[str, Any]:
     """Compute the fields of a `Fit` that follow from its state."""
     s, parameters, surface = problem.settings, state.parameters, levelled(problem, state)
-    with jax.enable_x64(True):
-        smooth = np.asarray(smooth_albedo(jnp.asarray(parameters.albedo), surface.height.shape, s.albedo_std))
     return {
         "state": state,
         "surface": surface,
         "normals": surface.normals(problem.shift),
-        "albedo": smooth * problem.patches_at(parameters).albedo,
+        "albedo": problem.albedo_at(parameters),
         "gain": np.exp(s.gain_std * parameters.log_gain),
         "offset": problem.priors.offset * parameters.offset,
         "instrument": problem.fitted_instrument(parameters),

@@ -55,6 +55,8 @@ def with_further_images(
         anchors=known.anchors,
         parallax=parallax_of(stack),
     )
+    if stack.parallax is not None:
+        problem.parallax[:n] = known.parallax
     problem = replace(
         problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share
     )

@@ -139,8 +139,8 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
     tolerance = fit.problem.settings.tolerance_um
     found = []
     if fit.is_interrupted:
-        is_biased = fit.problem.is_biased_by_noise and fit.problem.settings.bias_pairs
-        found.append(INTERRUPTED_WARNING + (BIASED if is_biased else ""))
+        has_bias = fit.problem.is_biased_by_noise and fit.problem.settings.bias_pairs
+        found.append(INTERRUPTED_WARNING + (BIASED if has_bias and not fit.is_bias_subtracted else ""))
     if not has_converged(fit.changes, tolerance):
         found.append(
             f"the fit has not converged: its last iteration changed the heights by {fit.changes[-1]:.2f} um (limit "

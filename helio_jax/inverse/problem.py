@@ -23,7 +23,7 @@ from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.law_prior import check_law, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
-from helio_jax.inverse.parameters import LawPrior, Parameters, Priors, law_of, moves_of
+from helio_jax.inverse.parameters import LawPrior, Parameters, Priors, law_of, moves_of, smooth_albedo
 from helio_jax.inverse.quality import MIN_REGION, regions
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 
@@ -269,6 +269,13 @@ class FitProblem:
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""
         return self.patches.with_albedo(self.settings.patch_albedo_std * np.asarray(parameters.patch))
+
+    def albedo_at(self, parameters: Parameters) -> np.ndarray:
+        """Compute the albedo of every pixel [y, x], smooth and by patches, relative to the substrate's."""
+        with jax.enable_x64(True):
+            modes = jnp.asarray(parameters.albedo)
+            smooth = np.asarray(smooth_albedo(modes, self.signal.shape[1:], self.settings.albedo_std))
+        return smooth * self.patches_at(parameters).albedo
 
     def law_at(self, parameters: Parameters) -> Law | None:
         """Return the scattering law of parameters, of NumPy numbers; None: the cosine law."""

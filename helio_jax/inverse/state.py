@@ -118,12 +118,13 @@ class FitState:
 
 
 def between(first: FitState, second: FitState, share: float) -> FitState:
-    """Return the state at a share of the way from one to another, with the corrections of the second."""
-    if share == 1.0:
-        return second
-    parts = ((s.surface, s.parameters, s.residuals) for s in (first, second))
-    mixed = jax.tree.map(lambda a, b: np.asarray(a + share * (b - a)), *parts)
-    return replace(second, surface=mixed[0], parameters=mixed[1], residuals=mixed[2])
+    """Return a state whose surface and parameters are at a share of the way from one to another.
+
+    Corrections and residuals are those of the second: the residuals have to be computed anew.
+    """
+    parts = ((s.surface, s.parameters) for s in (first, second))
+    surface, parameters = jax.tree.map(lambda a, b: np.asarray(a + share * (b - a)), *parts)
+    return replace(second, surface=surface, parameters=parameters)
 
 
 def multiple_in_normal(corrections: Corrections, normals: np.ndarray, optics: Optics) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +169,7 @@ def _held(problem: FitProblem, corrections: Corrections, surface: Surface, param
     """Derive what a solve needs of corrections made for a surface, without responses."""
     normals, moved = surface.normals(problem.shift), problem.moves(parameters)
     slope, intercept = multiple_in_normal(corrections, normals, problem.optics)
-    albedo = problem.patches_at(parameters).albedo
+    albedo = problem.albedo_at(parameters)
     variance = problem.variance + (prediction_std(corrections, normals, problem.settings) * albedo) ** 2
     sigma = np.where(problem.is_observed, np.sqrt(variance), np.inf)
     moves = np.zeros((len(moved), *corrections.masked.shape))
@@ -226,7 +227,7 @@ def with_responses(problem: FitProblem, state: FitState) -> FitState:
         normals = surface.normals(problem.shift) if smooth is None else smooth
         known = problem.has_enough_images, float(problem.optics.sample_distance)
         responses += relief_responses(surface, normals, optics, raster, *known, law)
-    albedo = problem.patches_at(state.parameters).albedo  # of the own pixel, which scatters first
+    albedo = problem.albedo_at(state.parameters)  # of the own pixel, which scatters first
     responses = tuple(r._replace(change=albedo * r.change) for r in responses)
     return replace(state, held=replace(state.held, responses=responses))
 

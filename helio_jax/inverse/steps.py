@@ -138,7 +138,7 @@ def pixel_terms(problem: FitProblem, state: FitState, limit: float) -> PixelTerm
     """Expand form factors and estimate the noise bias at a state; `limit` as in `freeze`."""
     held, slopes, noise = state.held, (state.surface.slope_x, state.surface.slope_y), problem.slope_noise
     largest = NOISY * noise * steepness(*slopes)
-    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.patches_at(state.parameters).albedo
+    inverse_sigma = cauchy_weight(state.residuals, limit) / held.sigma * problem.albedo_at(state.parameters)
     corrections, moves = (held.corrections.masked, held.moves, held.moved), problem.moves(state.parameters)
     with jax.enable_x64(True):
         factors = expand_form_factors(problem.optics, moves, state.surface.height, corrections)

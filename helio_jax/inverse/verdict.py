@@ -137,7 +137,7 @@ def _traced_state(problem: "FitProblem", state: "FitState", trace: Trace) -> tup
     from helio_jax.inverse.steps import expected
 
     state = predict_corrections(problem, state, trace)
-    albedo = problem.patches_at(state.parameters).albedo
+    albedo = problem.albedo_at(state.parameters)
     model = expected(problem, state, is_noisy=True)
     std = data_std(problem.variance, model, state.held.corrections, albedo)
     return state, np.where(problem.is_observed, model - problem.signal, np.nan), std
@@ -154,7 +154,7 @@ def misfit_of_state(problem: "FitProblem", state: "FitState", trace: Trace) -> M
     state, difference, std = _traced_state(problem, state, trace)
     optics = moved_optics(problem.optics, problem.moves(state.parameters))
     gain = np.exp(problem.priors.gain * state.parameters.log_gain)[:, None, None, None]
-    phi = gain * problem.patches_at(state.parameters).albedo * form_factor(optics, state.surface.height)
+    phi = gain * problem.albedo_at(state.parameters) * form_factor(optics, state.surface.height)
     return Misfit(difference, std, phi, state.surface.normals(problem.shift))
 
 

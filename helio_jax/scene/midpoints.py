@@ -1,7 +1,7 @@
 """Points half-way between those of a grid, by heights and slopes.
 
 Triangles between the points of a raster cut creases: the foot of a slope by up to half a pitch, where they hide the
-lowest part of the slope from the pixel beside it, and ridges and tips, of which what stands around then sees too little.
+lowest part of the slope from the pixel beside it, and ridges and tips, of which what stands around sees too little.
 """
 
 import numpy as np

@@ -14,8 +14,8 @@ from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse import fit
-from helio_jax.inverse.convergence import aitken, remaining_error
-from helio_jax.inverse.fit import fit_heights, with_posterior, without_noise_bias
+from helio_jax.inverse.convergence import extrapolation, remaining_error
+from helio_jax.inverse.fit import fit_heights, with_posterior, with_residuals, without_noise_bias
 from helio_jax.inverse.noise_bias import noise_bias
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
@@ -34,7 +34,7 @@ def test_how_far_rounds_that_creep_have_to_go(factor):
     before = (factor - 1.0) * x
     x = x + before
     change = (factor - 1.0) * x
-    left = remaining_error([np.std(before), np.std(change)], aitken(before, change))
+    left = remaining_error([np.std(before), np.std(change)], extrapolation(before, before, change))
     assert left == pytest.approx(factor / (1.0 - factor))
     assert np.allclose(x + (1.0 + left) * change, 0.0, atol=1e-9)
 
@@ -47,9 +47,23 @@ def test_rounds_that_tremble_are_a_change_off():
     """
     fits = np.random.default_rng(1).normal(size=(3, 100, 200))
     before, change = np.diff(fits, axis=0)
-    left = remaining_error([np.std(before), np.std(change)], aitken(before, change))
+    left = remaining_error([np.std(before), np.std(change)], extrapolation(before, before, change))
     assert left == 1.0
     assert np.std(left * change) == pytest.approx(np.sqrt(2.0) * np.std(fits[-1]), rel=0.05)
+
+
+def test_only_changes_that_undo_the_last_alternate():
+    """0.8 of a change undone: 1 / 1.8, also from a relaxed start. Changes square to the last, or larger ones: 1.
+
+    Catches Aitken's formula, which gives 0.5 and 0.01 for these.
+    """
+    first, other = np.random.default_rng(1).normal(size=(2, *SHAPE))
+    other -= np.sum(first * other) / np.sum(first**2) * first
+    assert extrapolation(first, first, -0.8 * first) == pytest.approx(1.0 / 1.8)
+    assert extrapolation(0.5 * first, first, (1.0 - 0.5 * 1.8) * first) == pytest.approx(1.0 / 1.8)
+    assert extrapolation(first, first, other) == pytest.approx(1.0)
+    assert extrapolation(first, first, 10.0 * other) == pytest.approx(1.0)
+    assert extrapolation(first, first, 0.3 * first + other) > 1.0
 
 
 def bump():
@@ -182,14 +196,8 @@ def test_a_fit_whose_surface_cannot_be_traced_goes_on(bshem, limit, is_reached):
         assert fit.surface.height.max() == pytest.approx(seen[0])
 
 
-@pytest.mark.parametrize("is_relaxed", [True, False])
-def test_predictions_that_overshoot_come_to_rest(bshem, monkeypatch, is_relaxed):
-    """Predictions that answer an error of the surface by nearly its opposite: relaxed, the fit finds the bump to 5 %.
-
-    Without relaxation it still swings by more than 4 um after eight iterations (limit 1 um).
-    """
-    if not is_relaxed:
-        monkeypatch.setattr(fit, "ALTERNATING", 0.0)
+def overshooting(bshem):
+    """Return a fit, its start, and predictions that answer an error of the surface by nearly its opposite."""
     surface, _ = bump()
     start = Surface(0.6 * surface.height, 0.6 * surface.slope_x, 0.6 * surface.slope_y)
     signal = np.asarray(signal_of(bshem, surface))
@@ -201,12 +209,40 @@ def test_predictions_that_overshoot_come_to_rest(bshem, monkeypatch, is_relaxed)
         error = np.asarray(signal_of(bshem, Surface(height, *slopes))) - signal
         return Corrections(Corrections.none(signal.shape).masked, 0.95 * error)
 
+    return problem, start, predict
+
+
+@pytest.mark.parametrize("is_relaxed", [True, False])
+def test_predictions_that_overshoot_come_to_rest(bshem, monkeypatch, is_relaxed):
+    """Predictions that answer an error of the surface by nearly its opposite: relaxed, the fit finds the bump to 5 %.
+
+    Without relaxation it still swings by more than 4 um after eight iterations (limit 1 um).
+    """
+    if not is_relaxed:
+        monkeypatch.setattr(fit, "ALTERNATING", 0.0)
+    problem, start, predict = overshooting(bshem)
     found = fit_heights(problem, start, predict)
     if is_relaxed:
         assert "converged" in found.status
         assert found.surface.height.max() == pytest.approx(100.0, rel=0.05)
     else:
         assert found.changes[-1] > 4.0
+
+
+def test_interrupted_after_a_relaxed_iteration(bshem):
+    """What is shown is the last surface that a solve ended in, with its residuals, not the start between two."""
+    problem, start, predict = overshooting(bshem)
+    kept = {}
+
+    def report(number, of, said):
+        kept[number] = said
+        if len(kept) == 4:
+            raise KeyboardInterrupt
+
+    found = fit_heights(problem, start, predict, report)
+    again = with_residuals(problem, found.state)
+    assert found.is_interrupted and len(found.changes) == 3
+    assert np.abs(again.residuals - found.residuals).max() < 0.01 * np.abs(again.residuals).max()
 
 
 def nothing_more(height, normals, *instrument, **albedo):

@@ -12,11 +12,15 @@ import helio_jax as hx
 from helio_jax.alignment.correction import correct_motions
 from helio_jax.alignment.resample import is_lit, joined_instrument, resample
 from helio_jax.alignment.rigid import Rigid
+from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.forward.form_factor import form_factor
+from helio_jax.forward.laws import PowerLaw, level_ratio
+from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections
 from helio_jax.instrument import Instrument
-from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.law_prior import with_level_of_law
+from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack
 from helio_jax.workflows import several_scans
 from helio_jax.workflows.corrections import _joined
@@ -260,6 +264,28 @@ def test_priors_of_a_calibration_reach_the_heights(crystal):
         hx.reconstruct_scans(calibrated, "nearfield", **how)[0],
     ):
         assert rec.provenance["reconstruct"]["refine"]["gain_std"] == 0.123
+
+
+def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
+    """The calibration brings a level substrate to the cosine law's signal, a fit by the stated law to that law's.
+
+    Catches joined scans that are fitted at the cosine law's level, for no calibration goes with them. Scans of
+    which one is not calibrated are refused.
+    """
+    scans, _ = crystal
+    stated = CampaignLaw(exponent=0.2, std=0.01)
+    instruments = [s.instrument.model_copy(update={"law": stated}) for s in scans.stacks]
+    calibration = Calibration("border", {}, warnings=("dark",))
+    stacks = [s.replace(calibration=calibration, instrument=i) for s, i in zip(scans.stacks, instruments, strict=True)]
+    joined = several_scans.join_scans(MicrographSet(tuple(stacks))).stack
+    assert joined.calibration == calibration
+    scaled = with_level_of_law(joined, RefineSettings())
+    ratio = level_ratio(PowerLaw(0.2), Optics.of(joined.instrument))
+    np.testing.assert_allclose(scaled.counts, joined.counts * ratio[:, None, None])
+    np.testing.assert_allclose(scaled.parallax, joined.parallax * ratio[:, None, None])
+    assert np.abs(ratio - 1.0).max() > 0.01
+    with pytest.raises(InputFileError, match="must be calibrated alike"):
+        several_scans.join_scans(MicrographSet((stacks[0].replace(calibration=None), *stacks[1:])))
 
 
 def test_command_joins_the_scans_of_several_files(crystal, tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from helio_jax.inverse.convergence import SLOWEST, aitken, remaining_error
+from helio_jax.inverse.convergence import SLOWEST, extrapolation, remaining_error
 from helio_jax.inverse.parameters import NAMES as FIELDS
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Posterior
@@ -91,17 +91,17 @@ def test_what_is_left_of_a_fit_that_converges_geometrically(contraction):
     """
     height = 100.0 * (1.0 - contraction ** np.arange(4))
     changes = np.diff(height)
-    assert remaining_error(list(changes), aitken(changes[-2], changes[-1])) * changes[-1] == pytest.approx(
-        100.0 - height[-1]
-    )
+    assert remaining_error(list(changes), extrapolation(changes[-2], changes[-2], changes[-1])) * changes[
+        -1
+    ] == pytest.approx(100.0 - height[-1])
 
 
 def test_what_is_left_of_other_fits():
     """A single round, none left, two that diverge, the last by swinging. Catches infinite and negative error bars."""
     assert remaining_error([7.0], 1.0) == 1.0
     assert remaining_error([0.0, 0.0], np.inf) == 1.0
-    assert remaining_error([1.0, 3.0], aitken(1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
-    assert remaining_error([1.0, 3.0], aitken(1.0, -3.0)) == 1.0
+    assert remaining_error([1.0, 3.0], extrapolation(1.0, 1.0, 3.0)) == SLOWEST / (1.0 - SLOWEST)
+    assert remaining_error([1.0, 3.0], extrapolation(1.0, 1.0, -3.0)) == 1.0
 
 
 def test_an_error_of_all_heights_is_added_in_squares():
@@ -123,8 +123,8 @@ def test_an_error_of_all_heights_is_added_in_squares():
 
 def test_one_small_change_among_large_ones_is_no_convergence():
     """Off by a whole change where only the last fall is large. Catches the last ratio alone (0.53 changes for 0.35)."""
-    assert remaining_error([81.0, 92.0, 32.0], aitken(1.0, -0.35)) == 1.0
-    assert remaining_error([81.0, 8.1, 0.81], aitken(1.0, -0.1)) == pytest.approx(1.0 / 9.0)
+    assert remaining_error([81.0, 92.0, 32.0], extrapolation(1.0, 1.0, -0.35)) == 1.0
+    assert remaining_error([81.0, 8.1, 0.81], extrapolation(1.0, 1.0, -0.1)) == pytest.approx(1.0 / 9.0)
 
 
 def test_error_bars_above_a_tilted_plane():
