@@ -51,6 +51,7 @@ scene/                what is imaged: settings tables and geometry; no tracing
   body                Body: triangles and spheres with material names
   border              continuation of a surface beyond its image
   waves               continuation of waves beyond an image
+  midpoints           points half-way between those of a grid, by its heights and slopes
   wall_grid           grid of heights whose walls are half-way between pixels
   wall_outlines       smooth outlines of walls between pixels
   scattering          the [material] tables: scattering laws

@@ -255,7 +255,10 @@ class MicrographStack(OnRaster):
         return self
 
     def scaled(self, factor: np.ndarray) -> "MicrographStack":
-        """Multiply counts, variance, background and parallax by a factor of every detector [detector, 1, 1]."""
+        """Multiply counts, variance, background and parallax by a factor of every detector [detector, 1, 1].
+
+        What a simulated stack holds besides, counts by order and from the plate, stays as it was traced.
+        """
         background = self.background
         if background is not None:
             background = background * (factor if background.ndim == 3 else factor[:, 0, 0])

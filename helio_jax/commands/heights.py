@@ -22,6 +22,7 @@ from helio_jax.commands.app import (
     given_options,
     print_result,
     print_table,
+    say,
     set_options,
     warn,
 )
@@ -84,7 +85,9 @@ def reconstruct_files(
     write(result, output)
     if write_joined:
         write(scans[0] if joined is None else joined.stack, write_joined)
-    if write_instrument and not was_interrupted(result.status):  # without error bars no instrument was fitted
+    if write_instrument and was_interrupted(result.status):
+        say(f"warning: {write_instrument} is not written: an interrupted fit has no error bars of the instrument")
+    elif write_instrument:
         toml.write_instrument(result, write_instrument)
     if as_json:
         about = {"method": result.method, "status": result.status, "trust": result.trust}

@@ -60,7 +60,8 @@ def law_prior(settings: RefineSettings, stated: CampaignLaw | None = None) -> La
 def with_level_of_law(stack: MicrographStack, settings: RefineSettings) -> MicrographStack:
     """Scale a calibrated stack: its substrate gets the signal that the stated law of the fit gives a level substrate.
 
-    Calibration gives it that of the cosine law. A stack in units of a known beam stays as it is.
+    Calibration gives it that of the cosine law (about, where all facets of rotated scans are given one albedo). A stack
+    in units of a known beam stays as it is.
     """
     ratio = None if stack.calibration is None else _stated_level_ratio(stack, settings)
     return stack if ratio is None else stack.scaled(ratio)
