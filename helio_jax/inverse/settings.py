@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from helio_jax.inverse.anchor_settings import AnchorSettings
 from helio_jax.settings import Settings
 
-PATHS_PER_PIXEL, LEAST_PATHS = 100, 1_500_000
+PATHS_PER_PIXEL, LEAST_PATHS = 100, 3_000_000
 """Default paths per prediction of the multiple scattering: with 14 per pixel their noise on the flat about sphere A was
 1.4 to 2.6 times that of 35 000 atoms per pixel (both averaged over 4 pixels), and the flat rose towards the sphere."""
 START_THRIFT = 4
@@ -101,7 +101,7 @@ class RefineSettings(Settings):
     (`forward/radiosity.py`), so it differs by some per cent beside depth jumps."""
     rays: int | None = Field(default=None, ge=1000, le=10**10)
     """Paths per traced prediction of the multiple scattering, over the whole image (8 or more per pixel); default: 100
-    per pixel, but 1.5 million at least."""
+    per pixel, but 3 million at least."""
 
     def paths(self, n_pixels: int) -> int:
         """Number of paths of a prediction for so many pixels."""

@@ -19,6 +19,9 @@ _RIDGE = 0.1
 """Ridge penalty on the slopes and curvatures of the local polynomials, relative to the weight of the centre pixel."""
 _N_TERMS = {1: 3, 2: 6}
 """Number of terms of a polynomial in two coordinates, by its degree."""
+_VARIANCE = {1: 1.0, 2: 2.5}
+"""Variance that a pass leaves, over that with planes, by the degree: the integral of (2 - r^2 / 2)^2 exp(-r^2) over that
+of exp(-r^2)."""
 _SAME_LEVEL = 1.0, 0.25
 """Largest distance of a neighbour from the pixel's tangent plane: pitches, and more per pixel between them. A curved
 surface whose normals turn by half a radian keeps below it."""
@@ -62,10 +65,10 @@ def smooth_along_surface(
     return np.moveaxis(smooth, -1, 0)
 
 
-def passes_for(paths: float, wanted: float) -> int:
+def passes_for(paths: float, wanted: float, degree: Literal[1, 2] = 1) -> int:
     """Return the number of passes that averages over at least `wanted` paths, with `paths` in each pixel."""
     passes = 1
-    while paths * (4**passes - 1) / 3 < wanted:
+    while paths * (4**passes - 1) / 3 / _VARIANCE[degree] < wanted:
         passes += 1
     return passes
 

@@ -31,6 +31,8 @@ from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
 
 RAYS = 8
 """Paths per pixel and branch."""
+DEGREE: Literal[1, 2] = 2
+"""Degree of the polynomials that smooth the traced image."""
 SMOOTH_PATHS = 40
 """The traced image is averaged over neighbours until this many paths count in every pixel."""
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
@@ -131,11 +133,11 @@ def make_predictor(
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
         settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
-        passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS), MAX_BURIED[masks_by]
+        passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
         terms = COSINE_LAW if law is None else law.terms()
         multiple = [[s.multiple(settings, limit, albedo, terms) for s in way] for way in either_way]
         images = np.array(
-            [[raster.smoothed(m, smooth, smooth_normals, passes, degree=2) for m in way] for way in multiple]
+            [[raster.smoothed(m, smooth, smooth_normals, passes, degree=DEGREE) for m in way] for way in multiple]
         )
         expected = np.array(hidden.shares if len(sides) > 1 else (1.0,))
         traced, surroundings = images.mean(0), None
