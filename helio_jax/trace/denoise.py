@@ -20,8 +20,8 @@ _RIDGE = 0.1
 _N_TERMS = {1: 3, 2: 6}
 """Number of terms of a polynomial in two coordinates, by its degree."""
 _VARIANCE = {1: 1.0, 2: 2.5}
-"""Variance that a pass leaves, over that with planes, by the degree: the integral of (2 - r^2 / 2)^2 exp(-r^2) over that
-of exp(-r^2)."""
+"""Variance that a pass leaves, over that with planes, by the degree: integral of (2 - r^2 / 2)^2 exp(-r^2) over that of
+exp(-r^2)."""
 _SAME_LEVEL = 1.0, 0.25
 """Largest distance of a neighbour from the pixel's tangent plane: pitches, and more per pixel between them. A curved
 surface whose normals turn by half a radian keeps below it."""
