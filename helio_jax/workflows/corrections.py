@@ -38,9 +38,6 @@ SMOOTH_PATHS = 40
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
 for the test of a result, which is to be traced even where it is bad."""
-LIFT_PIXELS = 0.01
-"""How far off a reconstructed (noisy) surface the multiply scattered atoms start [pixels]. Off it, they see what stands
-around lower by as much: 0.1 made the multiple scattering about a pyramid of 4.7 pixels' height 5 % too low."""
 
 
 def make_predictor(
@@ -92,7 +89,7 @@ def make_predictor(
             if substrate_um is None
             else max(0.5 * substrate_um, half + 2.0 * max(dx, dy))
         )
-        about = *np.meshgrid(stack.x, stack.y), LIFT_PIXELS * min(dx, dy), reach, border == "flat"
+        about = *np.meshgrid(stack.x, stack.y), reach, border == "flat"
         rasters = [(ScanRaster(i, instrument.beam_shift, *about), list(of_beam)) for i, of_beam in instrument.by_beam()]
         return Optics.of(instrument), rasters
 
