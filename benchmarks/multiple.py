@@ -77,7 +77,7 @@ def random_scenes(families: list[str], numbers: range, seed: int, size: int) -> 
 def regions(normals: np.ndarray) -> dict[str, np.ndarray]:
     """Divide the pixels by their distance from steep parts; regions of fewer than 4 pixels are left out."""
     is_steep = normals[..., 2] < STEEP
-    away = distance_transform_edt(~is_steep) if is_steep.any() else np.full(is_steep.shape, np.inf)
+    away = np.asarray(distance_transform_edt(~is_steep)) if is_steep.any() else np.full(is_steep.shape, np.inf)
     found = {"steep": is_steep, "1-3": (away >= 1.0) & (away <= 3.0), "3-9": (away > 3.0) & (away <= 9.0)}
     return {name: region for name, region in found.items() if region.sum() > 3}
 
@@ -86,8 +86,8 @@ def run(name: str, scene: SceneFile, rays: int, paths: int, seed: int) -> Row:
     """Trace a scene, predict its multiple scattering from the true heights, and compare."""
     started = time.perf_counter()
     stack = pipeline.simulate(scene, rays=rays, seed=seed).only()
-    assert stack.by_order is not None and stack.n_rays is not None
     truth = true_surface(scene, stack.x, stack.y)
+    assert stack.by_order is not None and stack.n_rays is not None and truth.normals is not None
     settings = scene.reconstruct
     predict = make_predictor(stack, paths, settings.refine.substrate_um, border=settings.border)
     found = predict(truth.height, truth.normals).multiple
