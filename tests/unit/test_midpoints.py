@@ -1,13 +1,9 @@
-"""Points between those of a grid, by its slopes; and the multiple scattering that is traced on such a mesh."""
+"""Points between those of a grid, by its heights and slopes."""
 
 import numpy as np
 import pytest
 
-import helio_jax as hx
 from helio_jax.scene.midpoints import first_of_halves, with_midpoints
-from helio_jax.workflows.corrections import make_predictor
-from helio_jax.workflows.scene_file import SceneFile
-from helio_jax.workflows.truth import true_surface
 
 DX, DY, SHIFT = 30.0, 20.0, (0.5, -0.1)
 
@@ -65,24 +61,3 @@ def test_a_crease_is_met_wherever_it_lies(place, sign):
 
 def test_number_of_the_first_of_halves():
     assert first_of_halves(3).tolist() == [0, 0, 1, 1, 2]
-
-
-def test_multiple_scattering_about_a_pyramid(bshem):
-    """Predicted at the true heights, on the flat within 6 pixels of the walls: that of the tracer to 6 % (noise 1 %).
-
-    Measured: 4 % too low. Rejects straight lines between the pixels (7 %), and atoms that start 0.1 pixels off the
-    surface (9 %).
-    """
-    size, pitch = 31, 30.0
-    axis = pitch * (np.arange(size) - 0.5 * (size - 1))
-    pyramid = {"kind": "pyramid", "size_um": 8000.0, "base_um": 500.0, "top_um": 200.0, "height_um": 110.0}
-    tables = bshem.model_dump(mode="json", exclude_none=True, exclude={"uncertainty"})
-    tables |= {"name": "pyramid", "sample": pyramid | {"azimuth_deg": 20.0}}
-    tables["scan"] = {"nx": size, "ny": size, "pixel_size_um": pitch, "pitch": "sample"}
-    scene = SceneFile.model_validate(tables)
-    one = hx.simulate(scene, rays=256, branches=4).only()
-    truth = true_surface(scene, axis, axis)
-    found = make_predictor(one, 3_000_000)(truth.height, truth.normals).multiple
-    traced = one.by_order[1:].sum(0) / one.n_rays
-    near = (truth.height < 1.0) & (np.hypot(*np.meshgrid(axis, axis)) < 250.0 * np.sqrt(2.0) + 6.0 * pitch)
-    assert found[:, near].mean() == pytest.approx(traced[:, near].mean(), rel=0.06)
