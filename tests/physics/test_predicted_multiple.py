@@ -37,8 +37,8 @@ def test_multiple_scattering_about_a_pyramid(bshem):
 def test_border_of_a_noisy_flat(bshem):
     """Heights 0.03 pitches off: the multiple scattering of the outermost pixels is of the size of that inside.
 
-    Atoms start from the pixels. Measured: 3 times its mean, 2 times its maximum, for noise is smoothed less there. Rejects
-    a vertical sheet from the image's border to the substrate: 200 times.
+    Atoms start from the pixels. Measured: 3 times its mean, 2 times its maximum, for noise is smoothed less there.
+    Rejects a vertical sheet from the image's border to the substrate: 200 times.
     """
     size, pitch = 40, 30.0
     axis = pitch * (np.arange(size) - 0.5 * (size - 1))
