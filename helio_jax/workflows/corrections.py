@@ -136,6 +136,7 @@ def make_predictor(
         images = np.array(
             [[raster.smoothed(m, smooth, smooth_normals, passes, degree=DEGREE) for m in way] for way in multiple]
         )
+        images = np.maximum(images, 0.0)  # a polynomial falls below 0 beside a steep fall to it
         expected = np.array(hidden.shares if len(sides) > 1 else (1.0,))
         traced, surroundings = images.mean(0), None
         if len(images) > 1:
