@@ -3,7 +3,7 @@
     python benchmarks/multiple.py [--shapes pyramid,half ball,...] [--families smooth,free,mesa,overhang] [--members 3]
         [--rays 1024] [--seed 11] [--tiny] [--output benchmarks/out]
 
-The prediction is made at the true heights and normals: what it is off, is no fit's fault. Errors are those of the mean
+The prediction is made at the true heights and normals, so that no error is that of a fit. Errors are those of the mean
 over all detectors and the pixels of a region: slopes of more than 20 degrees, and what is level within 1 to 3, and 3 to
 9, pixels of them. In per cent of the multiple scattering there (and, in brackets, of a level substrate's signal).
 """
@@ -45,11 +45,10 @@ def shapes(size: int) -> dict[str, SceneFile]:
     """Make the scenes of named shapes, on rasters of about so many pixels a side."""
 
     def coarse(name: str) -> SceneFile:
-        scan = load_scene(ROOT / "scenes" / f"{name}.toml").scan
+        path = ROOT / "scenes" / f"{name}.toml"
+        scan = load_scene(path).scan
         pitch = scan.pixel_size_um * scan.nx / size
-        return load_scene(
-            ROOT / "scenes" / f"{name}.toml", {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": pitch}
-        )
+        return load_scene(path, {"scan.nx": size, "scan.ny": size, "scan.pixel_size_um": pitch})
 
     def on_substrate(sample: dict[str, Any], pitch: float) -> SceneFile:
         scene = load_scene(ROOT / "scenes" / "sphere_a.toml")
@@ -119,14 +118,8 @@ def main() -> None:
     given = parser.parse_args()
     paths = PATHS
     if given.tiny:
-        given.shapes, given.families, given.members, given.rays, given.size, paths = (
-            "pyramid",
-            "smooth",
-            1,
-            16,
-            17,
-            50_000,
-        )
+        given.shapes, given.families, given.members = "pyramid", "smooth", 1
+        given.rays, given.size, paths = 16, 17, 50_000
     wanted = [name for name in given.shapes.split(",") if name]
     scenes = [(name, scene) for name, scene in shapes(given.size).items() if name in wanted]
     families = [name for name in given.families.split(",") if name]

@@ -247,8 +247,8 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     Where changes alternate, the next iteration starts between the last two surfaces (relaxed by `extrapolation`), or
     masks and multiple scattering that overshoot would swing for ever.
 
-    Interrupted from the keyboard after the first iteration, it returns the best so far. Where a solve ends in a surface
-    that cannot be traced, the step is halved; where that does not help, the surface before it is kept.
+    Interrupted from the keyboard after the first iteration, it returns what the last whole one ended in. Where a solve
+    ends in a surface that cannot be traced, the step is halved; where that does not help, the one before it is kept.
 
     Args:
         problem: data, instrument, priors.
@@ -261,9 +261,10 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     s, state = problem.settings, FitState.at(problem, start)
     changes: list[float] = []
     reached: FitState | None = None
+    solved = state
     last_start, last_change, extrapolated = start.height, np.zeros(start.height.shape), 1.0
     is_interrupted, is_traceable = False, True
-    said, solved = "start", state
+    said = "start"
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
     for number in range(s.max_rounds):
         before = state

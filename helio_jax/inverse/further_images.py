@@ -42,6 +42,9 @@ def with_further_images(
     signal, variance = signal_of(stack)
     signal[:n], variance[:n] = fit.problem.signal, fit.problem.variance
     surface, known = fit.state.surface, fit.problem
+    parallax = parallax_of(stack)
+    if parallax is not None:
+        parallax[0][:n] = known.parallax
     problem = FitProblem.of(
         signal,
         variance,
@@ -53,10 +56,8 @@ def with_further_images(
         scan_order(stack),
         patches=known.patches,
         anchors=known.anchors,
-        parallax=parallax_of(stack),
+        parallax=parallax,
     )
-    if stack.parallax is not None:
-        problem.parallax[:n] = known.parallax
     problem = replace(
         problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share
     )
@@ -68,9 +69,8 @@ def with_further_images(
     prediction = state.held.sigma**2 - problem.variance
     signal[n:], variance[n:] = further, per_second / seconds[n:]
     changes = {"signal": signal, "variance": variance}
-    if stack.parallax is not None:
+    if parallax is not None:
         changes["parallax"] = problem.parallax.copy()
-        changes["parallax"][:n] = known.parallax
         changes["parallax"][n:] = [
             parallax_of_image(image, surface.height, problem.raster, shift)
             for image, shift in zip(further, np.asarray(stack.instrument.beam_shifts)[n:], strict=True)

@@ -84,11 +84,9 @@ def make_predictor(
     @lru_cache(maxsize=1)
     def prepared(given: str) -> tuple[Optics, list[tuple[ScanRaster, list[int]]]]:
         instrument = Instrument.model_validate_json(given).idealised()
-        reach = (
-            half + _surroundings(instrument)
-            if substrate_um is None
-            else max(0.5 * substrate_um, half + 2.0 * max(dx, dy))
-        )
+        reach = half + _surroundings(instrument)
+        if substrate_um is not None:
+            reach = max(0.5 * substrate_um, half + 2.0 * max(dx, dy))
         about = *np.meshgrid(stack.x, stack.y), reach, border == "flat"
         rasters = [(ScanRaster(i, instrument.beam_shift, *about), list(of_beam)) for i, of_beam in instrument.by_beam()]
         return Optics.of(instrument), rasters

@@ -103,8 +103,8 @@ class SurfaceHypothesis:
         experiment = make_experiment(intersector, r.instrument, settings, laws)
         x, y = self.beam_x.ravel(), self.beam_y.ravel()
         try:
-            start = self._lifted("multiple")
-            tally = trace_pixels(experiment, x, y, settings.workers, first=start, max_lost=max_buried)
+            first = self._lifted("multiple")
+            tally = trace_pixels(experiment, x, y, settings.workers, first=first, max_lost=max_buried)
         except GuardError as e:
             found = str(e).split(";")[0]
             raise PredictionError(

@@ -327,7 +327,7 @@ def test_traced_rough_surface(tmp_path):
 def test_a_calibrated_stack_is_fitted_at_the_level_of_its_law():
     """Micrographs in units of the beam, and the same at the cosine law's level as a calibration leaves them: one map.
 
-    Through `explain`, as `refine` runs it: heights agree to 0.2 um, and the gains with 0. Catches a stack that is not
+    Through `explain`, as `refine` runs it: heights agree to 0.2 um, gains are 1 to 0.5 %. Catches a stack that is not
     brought to the level of its law (gains off by the ratio of the levels), or brought there twice.
     """
     stated, surface = CampaignLaw(exponent=0.27, std=0.05), hills()

@@ -64,10 +64,10 @@ def test_noise_falls_with_the_passes():
 
 
 @pytest.mark.parametrize("passes", [1, 2])
-def test_degree_2_keeps_what_falls_off_with_the_distance(passes):
-    """1 / distance from a wall, 3 pixels off: to 2 %, and a polynomial of degree 2 exactly; 1.6 times the noise.
+def test_degree_2_keeps_curvature(passes):
+    """A polynomial of degree 2 comes out to 0.5 %, with sqrt(2.5) times the noise that planes leave, to 20 %.
 
-    Rejects planes, which raise it by 3 % in one pass and by 20 % in two.
+    Rejects planes, which raise it by half its Laplacian in one pass, 0.3, and by 1.5 in two.
     """
     up = np.broadcast_to([0.0, 0.0, 1.0], (*SHAPE, 3))
     inner = slice(8, -8), slice(8, -8)

@@ -156,15 +156,15 @@ def test_lee_of_a_sphere(case):
 
 
 def test_masks_in_the_lee(case):
-    """In the lee the mean predicted single scattering is within 1 % of the flat's signal of the true one.
+    """In the lee the mean predicted single scattering is within 0.8 % of the flat's signal of the true one.
 
-    Measured: 0.8 %. Rejects on B the masks of the sheet along the beam (1.5 % too dark for two detectors); on A, whose
+    Measured: 0.6 %. Rejects on B the masks of the sheet along the beam (1.5 % too dark for two detectors); on A, whose
     lee is shallower, they are 0.5 % off.
     """
     normals, single, _, free, masked, _ = case
     lee = lee_of(normals)
     error = (free - masked - single)[:, lee].mean(1) / np.median(single)
-    assert np.all(np.abs(error) < 0.01), error
+    assert np.all(np.abs(error) < 0.008), error
 
 
 def test_foot_on_a_wall():

@@ -17,7 +17,7 @@ def test_multiple_scattering_about_a_pyramid(bshem):
     """Predicted at the true heights, on the flat within 6 pixels of the walls: that of the tracer to 6 % (noise 1 %).
 
     Measured: 4 % too low. Rejects straight lines between the pixels (7 %), and atoms that start 0.1 pixels off the
-    surface (9 %).
+    surface (10 %).
     """
     size, pitch = 31, 30.0
     axis = pitch * (np.arange(size) - 0.5 * (size - 1))
