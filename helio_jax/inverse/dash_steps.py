@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from helio_jax.inverse.band_fit import kind_of
-from helio_jax.inverse.dash_lines import Dips, Line, find_dips, find_line
+from helio_jax.inverse.dash_lines import Line, find_dashes, find_line
 from helio_jax.inverse.edge_place import Images
 from helio_jax.inverse.low_steps import SHAPE_STD, LowStep, Scan, fit_step
 from helio_jax.inverse.mask_edges import Edge
@@ -22,7 +22,10 @@ MAX_BAND = 1.5
 _BORDER = 3.0
 """Distance from the border within which a line ends there [pixels]."""
 _BESIDE = 2.0
-"""Dips so near to a line are its own [pixels]."""
+"""Dashes so near to a line are its own [pixels]."""
+
+_LEAST_MASK = 0.2
+"""Shortest mask band that is listed [heights of the step]."""
 
 
 def find_low_steps(
@@ -45,17 +48,17 @@ def find_low_steps(
     middle = images.place.mean((0, 1))
     place = (images.place - middle) / images.side
     signal = images.signal - images.floor[:, None, None]
-    dips = find_dips(signal, images.variance, images.lit - images.floor, is_explained)
+    dashes = find_dashes(signal, images.variance, images.lit - images.floor, is_explained)
     v = np.stack([o.mean for o in openings]) + beam_shift
     scan, found = Scan(place, signal, images.variance, openings, beam_shift, images.spot / images.side), []
     for _ in range(MAX_LINES):
-        line = find_line(dips, place, v)
+        line = find_line(dashes, place, v, beam_shift)
         if line is None:
             break
-        low = fit_step(line, scan) if _share(line, place) >= MIN_SHARE else None
+        low = fit_step((line, line.reversed), scan) if _share(line, place) >= MIN_SHARE else None
         if low is not None and _is_through(low, place):
             found.append(_records(low, middle, images.side, names, v))
-        dips = _without(dips, place, line if low is None else low.line)
+        dashes = dashes.without(_beside(line if low is None else low.line, place))
     return found
 
 
@@ -75,14 +78,13 @@ def _is_through(low: LowStep, place: np.ndarray) -> bool:
     """Return whether a low step goes through the image, and is one."""
     first, last = _way(low.line, place)
     ends_there = low.line.start < first + _BORDER and low.line.end > last - _BORDER
-    return ends_there and low.height * max(s.length for s in low.signals) <= MAX_BAND
+    return ends_there and low.height * low.longest <= MAX_BAND
 
 
-def _without(dips: Dips, place: np.ndarray, line: Line) -> Dips:
-    """Leave out the dips beside a line."""
+def _beside(line: Line, place: np.ndarray) -> np.ndarray:
+    """Mark the pixels beside a line [y, x]."""
     u, w = place @ line.normal - line.offset, place @ line.along
-    beside = (np.abs(u) < _BESIDE) & (w > line.start - _BESIDE) & (w < line.end + _BESIDE)
-    return Dips(dips.is_dip & ~beside, dips.is_counted)
+    return (np.abs(u) < _BESIDE) & (w > line.start - _BESIDE) & (w < line.end + _BESIDE)
 
 
 def _records(
@@ -92,7 +94,9 @@ def _records(
     line, height = low.line, side * low.height
     std = math.hypot(side * low.std, SHAPE_STD * height)
     dark = tuple(k for k, s in enumerate(low.signals) if kind_of(s) == "dark")
-    dark = dark or (int(np.argmax([s.length for s in low.signals])),)
+    lengths = [s.length for s in low.signals]
+    if not dark and max(lengths) > _LEAST_MASK:
+        dark = (int(np.argmax(lengths)),)
     start, end = (middle + side * (line.offset * line.normal + at * line.along) for at in (line.start, line.end))
     edge = Edge(start, end, dark)
     bands = []

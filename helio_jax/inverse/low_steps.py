@@ -28,19 +28,24 @@ _MODEL_ERROR = 0.03
 _WALL_ERROR = 0.25
 """Relative error on the wall: how it is inclined and what it sees is modelled roughly."""
 _FUZZ = 0.1
-"""How straight an edge is [pixels]."""
+"""How straight an edge is: in a pixel it may be so far before its line, at it, or as far behind it [pixels]."""
+_NODE, _LEAST_SPOT = math.sqrt(2.0), 0.05
+"""Nodes of the mean across a disc, -1, 0 and 1 times this, with weights 1/4, 1/2 and 1/4 [standard deviations]
+(Gauss-Chebyshev, second kind); and the smallest spot that is averaged over, as a standard deviation [pixels]."""
 _BEND = 0.2
 """How far the middle of an edge is from the line between its ends: on a curved surface an oblique beam bends it
 [pixels]."""
 _OUTLIER = 3.0
 """Residual from which on a pixel loses weight [standard deviations]."""
 _LONGEST = 0.02, 4.0
-"""Longest band of a step that is tried [pixels]."""
+"""Range of the longest image of a step that is tried [pixels]."""
 _WIDEST = 0.8
 """Greatest width of a wall [pixels]."""
-_SCATTER = 1.0, 0.6, 2.0
+_SCATTER = 1.0, 0.25, 2.0
 """Multiple scattering over the prediction: prior mean, standard deviation, and most."""
 _WALKERS = 32
+_CHAINS = 3
+"""Independent chains of samples."""
 _ROUNDS = (4000, 40, 0.8, 0.03), (2000, 40, 0.2, 0.008), (1000, 160, 0.06, 0.003)
 """Random starts, of which the best become walkers; moves of each, of which the second half counts; range of the first
 shifts [pixels] and turns [rad] of the line: in each round, about the best of the last one."""
@@ -52,7 +57,8 @@ _AGAINST = 25.0
 """Evidence against a step beyond the ends of its line, from which on it ends there: of three pixels or more that should
 be dark [minus log likelihood]."""
 _GAIN = 30.0
-"""Least gain of a step that is believed [minus log likelihood]."""
+"""Least gain of a step that is believed [minus log likelihood]; of one that falls the other way half that of the first,
+in every round."""
 SHAPE_STD = 0.05
 """Standard deviation of heights by the shape of the wall, as a fraction: staircases of facets a quarter of a pixel wide
 come out 10 % too low."""
@@ -76,6 +82,16 @@ class LowStep:
     width: float
     gain: float
     signals: tuple[WallSignal, ...]
+
+    @property
+    def longest(self) -> float:
+        """Longest image of the step per height: of mask band, wall or shadow."""
+        return longest_image(self.signals)
+
+
+def longest_image(signals: Sequence[WallSignal]) -> float:
+    """Return the longest mask band, wall or shadow of a vertical wall [heights], of the signals of all detectors."""
+    return max(max(s.length, abs(s.shift)) for s in signals)
 
 
 @dataclass(frozen=True)
@@ -108,7 +124,7 @@ class _Strip:
         upper, lower: signal of the two sides there [detector, pixel].
         half: half the length of the line.
         walls: signal across a wall along the line [detector].
-        fuzz: how far the edge may be from its line in a pixel: there, at its line, or as far before it.
+        spot: standard deviation of the beam's spot.
     """
 
     u: np.ndarray
@@ -119,7 +135,7 @@ class _Strip:
     lower: np.ndarray
     half: float
     walls: tuple[LowWall, ...]
-    fuzz: float
+    spot: float
 
     @classmethod
     def of(cls, line: Line, scan: Scan, signals: Sequence[WallSignal], beyond: float = 0.5) -> "_Strip | None":
@@ -138,8 +154,7 @@ class _Strip:
             sides.append(values[:, beside] @ weight.T / weight.sum(1))
         walls = tuple(LowWall.of(s, o, line.normal) for s, o in zip(signals, scan.openings, strict=True))
         std = np.sqrt(np.maximum(noise[:, inside], 0.0))
-        fuzz = math.hypot(_FUZZ, scan.spot)
-        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, fuzz)
+        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, scan.spot)
 
     def costs(self, walkers: np.ndarray) -> np.ndarray:
         """Compute minus the logarithm of the likelihood of every pixel [walker, pixel]; walkers as in `_prior`."""
@@ -147,23 +162,38 @@ class _Strip:
         height, width = np.exp(log_height), np.maximum(width, 1e-3)
         u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
         places = []
-        for place, share in ((-self.fuzz, 0.25), (0.0, 0.5), (self.fuzz, 0.25)):
+        for place, share in ((-_FUZZ, 0.25), (0.0, 0.5), (_FUZZ, 0.25)):
             total = np.full(u.shape, -math.log(share))
-            is_upper = u + place < 0.0
-            for k, wall in enumerate(self.walls):
-                model, is_wall = wall.profile(u + place, height, width, scatter)
-                side = np.where(is_upper, self.upper[k], self.lower[k])
-                error = np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
-                std = np.sqrt(self.std[k] ** 2 + (side * error) ** 2)
-                rest = (self.data[k] - side * model) / std
-                total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / side)
+            for k in range(len(self.walls)):
+                model, error = self._signal(k, u + place, height, width, scatter)
+                std = np.sqrt(self.std[k] ** 2 + error**2)
+                rest = (self.data[k] - model) / std
+                total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / self.lower[k])
             places.append(-total)
         total = -np.logaddexp(np.logaddexp(places[0], places[1]), places[2])
         return total / _TEMPERATURE
 
+    def _signal(self, k: int, u: np.ndarray, *wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the signal of detector k and the error of the model, averaged over the spot [walker, pixel].
+
+        Args:
+            k: detector.
+            u: distance from the edge [walker, pixel].
+            wall: height, width and scattering, as of `LowWall.profile`.
+        """
+        signal, error = np.zeros(u.shape), np.zeros(u.shape)
+        nodes = ((-_NODE, 0.25), (0.0, 0.5), (_NODE, 0.25)) if self.spot > _LEAST_SPOT else ((0.0, 1.0),)
+        for node, weight in nodes:
+            at = u + self.spot * node
+            model, is_wall = self.walls[k].profile(at, *wall)
+            side = weight * np.where(at < 0.0, self.upper[k], self.lower[k])
+            signal += side * model
+            error += side * np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
+        return signal, error
+
     def without(self) -> np.ndarray:
         """Compute the same of a surface without a step [pixel]."""
-        far = np.array([[self.fuzz + 2.0 * _NEAR, 0.0, 0.0, 0.1, 1.0, 0.0]])
+        far = np.array([[2.0 * (_FUZZ + self.spot + _NEAR), 0.0, 0.0, 0.1, 1.0, 0.0]])
         return np.minimum(self.costs(far)[0], replace(self, upper=self.lower).costs(far)[0])
 
 
@@ -173,12 +203,12 @@ def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
     Args:
         walkers: shift of the line [pixels], turn [rad], logarithm of the height, width of the wall [pixels], scattering
             over the prediction, and bend [pixels] [walker, 6].
-        longest: band of the detector that shows the longest one, over the height.
+        longest: `longest_image`.
     """
     _, _, log_height, width, scatter, bend = walkers.T
-    band = np.exp(log_height) * longest
+    image = np.exp(log_height) * longest
     mean, std, most = _SCATTER
-    is_out = (band < _LONGEST[0]) | (band > _LONGEST[1]) | (width < 0.0) | (width > _WIDEST)
+    is_out = (image < _LONGEST[0]) | (image > _LONGEST[1]) | (width < 0.0) | (width > _WIDEST)
     is_out |= (scatter < 0.0) | (scatter > most)
     # all inclinations of the wall are equally likely
     inclined = np.log1p((width * np.exp(-log_height)) ** 2) + log_height
@@ -271,21 +301,40 @@ def _extended(line: Line, scan: Scan, signals: Sequence[WallSignal], walker: np.
     return line._replace(start=middle - ends[0], end=middle + ends[1])
 
 
-def fit_step(line: Line, scan: Scan) -> LowStep | None:
+def fit_step(ways: Sequence[Line], scan: Scan) -> LowStep | None:
     """Measure the step along a line of dashes.
 
+    The posterior may have several maxima, and a chain finds one: several are run, and differences between those that
+    explain the pixels about as well are part of the standard deviation.
+
     Args:
-        line: near the upper edge.
+        ways: lines near the upper edge, such as one and its reverse; the one that explains the pixels best is taken.
         scan: data.
 
     Returns:
         The step; None where too few pixels show its sides, or no step explains them.
     """
-    rng, found = np.random.default_rng(0), None
+    first, chosen = None, ways[0]
+    for way in ways:
+        low = _one_chain(way, scan, 0, _GAIN if first is None else max(_GAIN, 0.5 * first.gain))
+        if low is not None and (first is None or low.gain > first.gain):
+            first, chosen = low, way
+    if first is None:
+        return None
+    further = (_one_chain(chosen, scan, seed, _GAIN) for seed in range(1, _CHAINS))
+    chains = [first, *(low for low in further if low is not None)]
+    best = max(chains, key=lambda low: low.gain)
+    height, std = np.array([(low.height, low.std) for low in chains if low.gain > best.gain - _LOST]).T
+    return replace(best, height=float(height.mean()), std=float(np.sqrt(np.mean(std**2) + height.var())))
+
+
+def _one_chain(line: Line, scan: Scan, seed: int, least_gain: float) -> LowStep | None:
+    """Measure the step along a line of dashes by one chain of samples, as `fit_step`; None below a gain."""
+    rng, found = np.random.default_rng(seed), None
     for tries, moves, *spread in _ROUNDS:
         shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
         signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
-        strip, longest = _Strip.of(line, scan, signals), max(s.length for s in signals)
+        strip, longest = _Strip.of(line, scan, signals), longest_image(signals)
         if strip is None or longest <= 0.0:
             return None
         points, costs = _sampled(
@@ -296,7 +345,7 @@ def fit_step(line: Line, scan: Scan) -> LowStep | None:
         )
         best = points[np.argmin(costs)]
         gain = float(strip.without().sum() - strip.costs(best[None]).sum())
-        if gain < _GAIN:
+        if gain < least_gain:
             return None
         drawn = points[costs < costs.min() + _LOST]
         height, width = np.exp(drawn[:, 2]), float(drawn[:, 3].mean())

@@ -3,7 +3,11 @@
 As `wall_signal`, with a wall that falls by its height h over a horizontal width w: the point at the distance u from the
 upper edge in the raster lies, where it is the lower level, at the horizontal distance x = u + h (t . n) from the edge,
 and is masked from the part of the aperture with q > x / h. The beam sees the wall between u = 0 and u = w - h (t . n).
-Multiple scattering is that of a vertical wall, in proportion to the solid angle of an inclined one at its foot.
+
+An atom that leaves the lower level at x goes to the wall with the probability F = (1 - cos e) / 2, where e is the
+elevation of the upper edge, tan e = h / x, and leaves it as one that the beam brings there. All further paths pass
+between wall and level once more: they are those of a vertical wall in proportion to 1 - cos of the inclination, twice
+the probability that an atom goes from the wall to the level.
 
 Source: own derivation; tests/inverse/test_low_steps.py.
 """
@@ -24,8 +28,9 @@ class LowWall(NamedTuple):
     Attributes:
         masked: fraction of the aperture masked from the lower level, by horizontal distance from the upper edge.
         reach: distance from which on nothing is masked [heights]; unit of the arguments of `masked`.
-        level: multiple scattering at the distance d from the foot of a vertical wall, by d / (1 + d) [heights].
-        wall: the same on the wall, by height above the foot over that of the wall.
+        level: multiple scattering at the distance d from the foot of a vertical wall, less that of the paths that only
+            the wall scatters, by d / (1 + d) [heights].
+        wall: multiple scattering on a vertical wall, by height above the foot over that of the wall.
         facet: direct signal of a wall, in that of the level, by its inclination over 90 deg.
         shift: t . n.
     """
@@ -45,7 +50,8 @@ class LowWall(NamedTuple):
         tilt = 0.5 * np.pi * t[:, None]
         facet = np.maximum(np.cos(tilt) + np.sin(tilt) * (opening.tau @ normal), 0.0) @ opening.weight
         distance = t / np.maximum(1.0 - t, 1e-3)
-        return cls(signal.masked(reach * t), reach, signal.on_level(distance), signal.on_wall(t), facet, signal.shift)
+        further = signal.on_level(distance) - _to_wall(distance, 1.0) * facet[-1]
+        return cls(signal.masked(reach * t), reach, further, signal.on_wall(t), facet, signal.shift)
 
     def profile(
         self, u: np.ndarray, height: np.ndarray, width: np.ndarray, scatter: np.ndarray
@@ -59,16 +65,21 @@ class LowWall(NamedTuple):
         """
         image = np.maximum(width - height * self.shift, 0.0)
         x, tilt = np.maximum(u + height * self.shift, 0.0), np.arctan2(height, width)
-        away = np.maximum(x - width, 0.0)
-        more = scatter * (1.0 - np.cos(tilt))
-        low = 1.0 - _at(self.masked, x / (height * self.reach)) + more * _at(self.level, away / (away + height))
-        wall = _at(self.facet, tilt / (0.5 * np.pi)) + more * _at(self.wall, 1.0 - u / np.maximum(image, 1e-9))
+        facet, more = _at(self.facet, tilt / (0.5 * np.pi)), 1.0 - np.cos(tilt)
+        multiple = _to_wall(x, height) * facet + more * _at(self.level, x / (x + height))
+        low = 1.0 - _at(self.masked, x / (height * self.reach)) + scatter * multiple
+        wall = facet + scatter * more * _at(self.wall, 1.0 - u / np.maximum(image, 1e-9))
         is_wall = (u > 0.0) & (u < image)
         return np.where(u <= 0.0, 1.0, np.where(is_wall, wall, low)), is_wall
+
+
+def _to_wall(x: np.ndarray, height: np.ndarray | float) -> np.ndarray:
+    """Compute the probability that an atom goes from the lower level to a wall, x from its upper edge."""
+    return 0.5 * (1.0 - x / np.hypot(x, height))
 
 
 def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Interpolate a table of evenly spaced arguments from 0 to 1."""
     place = np.clip(t, 0.0, 1.0) * _NODES
-    i = place.astype(np.intp)
-    return table[i] + (place - i) * np.append(np.diff(table), 0.0)[i]
+    i = np.minimum(place.astype(np.intp), _NODES - 1)
+    return table[i] + (place - i) * np.diff(table)[i]

@@ -104,12 +104,10 @@ def _sides(
     step: Step, found: Steps, raster: Raster, region: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
     """Find the pixels above and below a step [y, x], the distance of all from its edge [y, x], and that of the band's
-    end [um]; None where too few pixels show a side."""
+    end [um], 0 of a step without one; None where too few pixels show a side."""
     bands = [b for b in found.bands if b.step == step.number and b.is_clear_mask]
-    if not bands:
-        return None
     side = math.sqrt(float(raster.dx) * float(raster.dy))
-    end = max(b.length_um * abs(math.cos(math.radians(b.runs_deg - step.falls_deg))) for b in bands)
+    end = max((b.length_um * abs(math.cos(math.radians(b.runs_deg - step.falls_deg))) for b in bands), default=0.0)
     distance, along, length = _beside(step, raster)
     beside = np.abs(along) <= 0.5 * length
     upper = beside & (distance > ABOVE[0] * side) & (distance < ABOVE[1] * side) & (found.patch == step.above)
