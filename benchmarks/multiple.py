@@ -121,7 +121,10 @@ def main() -> None:
         given.shapes, given.families, given.members = "pyramid", "smooth", 1
         given.rays, given.size, paths = 16, 17, 50_000
     wanted = [name for name in given.shapes.split(",") if name]
-    scenes = [(name, scene) for name, scene in shapes(given.size).items() if name in wanted]
+    known = shapes(given.size)
+    if unknown := set(wanted) - set(known):
+        parser.error(f"unknown shapes {', '.join(sorted(unknown))}: choose of {', '.join(known)}")
+    scenes = [(name, known[name]) for name in wanted]
     families = [name for name in given.families.split(",") if name]
     rows: list[Any] = []
     drawn = random_scenes(families, range(given.members), given.seed, given.size)

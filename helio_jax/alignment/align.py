@@ -17,7 +17,7 @@ from pydantic import Field
 from helio_jax.alignment.albedo_prior import AlbedoAlignment, align_with_albedo_prior
 from helio_jax.alignment.automatic import Aligner, Match
 from helio_jax.alignment.control_points import Picks, PointFit, fit_points, rms
-from helio_jax.alignment.resample import resample
+from helio_jax.alignment.resample import check_joinable, resample
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.alignment.views import View
 from helio_jax.arrays import as_json, pitch
@@ -124,7 +124,7 @@ def align_scans(
 
     Raises:
         GuardError: the scans do not determine the alignment, or oblique incidence, where heights move pixels.
-        InputFileError: too few scans, equal names, different instruments, or unusable control points.
+        InputFileError: too few scans, equal names, different instruments or calibrations, or unusable control points.
     """
     alignment = find_motions(scans, picks, settings, source)
     if alignment.problems:
@@ -159,6 +159,7 @@ def _check(scans: MicrographSet, is_auto: bool) -> None:
         raise InputFileError(f"alignment needs {wanted} or more scans, got {len(names)} ({', '.join(names)}): {hint}")
     if len(set(names)) < len(names):
         raise InputFileError(f"the scans' names must differ, got {', '.join(names)}: rename the files and import anew")
+    check_joinable(scans.stacks)
     for stack in scans.stacks:
         if stack.instrument.beam.incidence_deg:
             raise GuardError(

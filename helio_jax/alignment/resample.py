@@ -6,14 +6,15 @@ alignment is added to the variance.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.arrays import pitch
+from helio_jax.arrays import as_json, pitch
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Detector, Instrument
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
@@ -128,20 +129,42 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     return stacks[0].instrument.model_copy(update={"beam": beam, "detector": tuple(detectors)})
 
 
-def _calibration(stacks: tuple[MicrographStack, ...]) -> Calibration | None:
-    """Return the calibration of joined scans, that of the first with the warnings of all; None: they have none.
+def check_joinable(stacks: Sequence[MicrographStack]) -> None:
+    """Refuse scans whose counts have no common unit.
 
     Raises:
-        InputFileError: some are calibrated in another way than others.
+        InputFileError: some are calibrated in another way than others, or state another scattering law.
     """
-    found = [stack.calibration for stack in stacks]
-    kinds = {None if c is None else (c.method, c.without_multiple) for c in found}
+    kinds = {None if c is None else (c.method, c.without_multiple) for c in (s.calibration for s in stacks)}
     if len(kinds) > 1:
         names = ", ".join(f"{s.name}: {'none' if s.calibration is None else s.calibration.method}" for s in stacks)
-        raise InputFileError(f"scans that are joined must be calibrated alike, got {names}: calibrate all of them anew")
-    if found[0] is None:
+        raise InputFileError(
+            f"scans that are joined must be calibrated alike, got {names}: calibrate all imported files alike (helio "
+            "calibrate); simulated and measured scans cannot be joined"
+        )
+    first = stacks[0]
+    for stack in stacks:
+        if stack.instrument.law != first.instrument.law:
+            raise InputFileError(
+                f"scans that are joined must state one scattering law, {first.name!r} and {stack.name!r} differ: give "
+                "their instrument files the same table [law], or none"
+            )
+
+
+def _calibration(stacks: Sequence[MicrographStack]) -> Calibration | None:
+    """Return the calibration of joined scans, with the widest priors and the warnings of all; None: they have none."""
+    known = [stack.calibration for stack in stacks if stack.calibration is not None]
+    if not known:
         return None
-    return replace(found[0], warnings=tuple(dict.fromkeys(w for c in found if c for w in c.warnings)))
+    warnings = tuple(dict.fromkeys(w for c in known for w in c.warnings))
+    return replace(known[0], priors=_widest([c.priors for c in known]), warnings=warnings)
+
+
+def _widest(priors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the largest of what several calibrations state of each setting, number by number."""
+    names = dict.fromkeys(name for stated in priors for name in stated)
+    stated = {name: np.broadcast_arrays(*(p[name] for p in priors if name in p)) for name in names}
+    return {name: as_json(np.max(values, axis=0)) for name, values in stated.items()}
 
 
 def is_lit(height: np.ndarray, x: np.ndarray, y: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -201,7 +224,12 @@ def resample(
 
     Returns:
         One stack; a detector per scan and aperture. Points outside a scan or in its shadow are not observed there.
+
+    Raises:
+        GuardError: too many pixels.
+        InputFileError: `check_joinable`.
     """
+    check_joinable(scans.stacks)
     x, y = common_raster(scans.stacks, motions, field)
     points = np.stack(np.meshgrid(x, y), -1)
     area = pitch(x) * pitch(y)

@@ -35,7 +35,7 @@ def contraction_of(changes: Sequence[float]) -> float | None:
 def remaining_error(changes: Sequence[float], extrapolated: float) -> float:
     """Estimate the distance of the heights from the limit of further iterations, in units of the last change.
 
-    Slow convergence: the extrapolation, nine changes at most. Iterates that oscillate, or are limited by Monte Carlo
+    The distance to the extrapolation, nine changes at most. Iterates that oscillate, or are limited by Monte Carlo
     noise: one change, or the rest of the geometric series if changes fall at the slower of their last two rates; one
     small change after larger ones proves nothing. The change of a single iteration is taken to halve.
 
@@ -47,9 +47,9 @@ def remaining_error(changes: Sequence[float], extrapolated: float) -> float:
     if not known:
         return 1.0
     contraction, most = max(known), SLOWEST / (1.0 - SLOWEST)
-    slow = extrapolated - 1.0 if 0.0 < extrapolated < 1.0 + most else most
+    linear = abs(extrapolated - 1.0) if 0.0 < extrapolated < 1.0 + most else most
     oscillating = contraction / (1.0 - contraction) if contraction < 0.5 else 1.0
-    return max(slow, oscillating)
+    return max(linear, oscillating)
 
 
 def has_converged(changes: Sequence[float], tolerance: float) -> bool:

@@ -122,12 +122,15 @@ def _near_wide(mask: np.ndarray) -> np.ndarray:
     return np.asarray(binary_dilation(binary_opening(mask, np.ones((2, 2))), np.ones((3, 3)), 2), bool)
 
 
-def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.ndarray) -> Line | None:
+def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.ndarray) -> tuple[Line, ...]:
     """Find the line on which chance explains the dashes least, if it is below `FALSE_ALARMS`.
 
     The dashes of other places are how frequent chance makes them. On a line count dark dashes of the detectors that a
     step along it masks, in pixels where no other detector has any: a groove darkens both; and across an oblique beam
     bright dashes of any detector, which may be of a step that falls either way.
+
+    Returns:
+        The line; and its reverse, if most of its dashes are bright; none if chance explains the dashes.
 
     Args:
         dashes: isolated pixels.
@@ -137,7 +140,7 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     """
     is_any = dashes.is_dark.any(0) | dashes.is_bright.any(0)
     if is_any.sum() < MIN_DASHES:
-        return None
+        return ()
     at, counted = place[is_any], place[dashes.is_counted]
     dark, bright = dashes.is_dark[:, is_any], dashes.is_bright[:, is_any].any(0)
     angles = np.arange(0.0, 2.0 * np.pi, _TURN)
@@ -145,7 +148,7 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     bins, width = int(2.0 * reach / _SHIFT), round(2.0 * _STRIP / _SHIFT)
     oblique = float(np.hypot(*beam_shift))
     # every strip, and every start and end in it
-    best, found = np.log(FALSE_ALARMS / (len(angles) * bins * 2.0 * reach**2)), None
+    best, found, is_either_way = np.log(FALSE_ALARMS / (len(angles) * bins * 2.0 * reach**2)), None, False
 
     def in_strips(u: np.ndarray) -> np.ndarray:
         number = np.bincount(((u + reach) / _SHIFT).astype(int), minlength=bins)
@@ -154,9 +157,9 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     for angle in angles:
         line = Line(float(angle), 0.0, 0.0, 0.0)
         toward = v @ line.normal / np.maximum(np.hypot(v[:, 0], v[:, 1]), 1e-12)
-        use = dark[toward < -_FACES].any(0) & ~dark[toward > _FACES].any(0)
-        if oblique > _OBLIQUE and abs(beam_shift @ line.normal) > _FACES * oblique:
-            use |= bright
+        is_mask = dark[toward < -_FACES].any(0) & ~dark[toward > _FACES].any(0)
+        is_across = oblique > _OBLIQUE and abs(beam_shift @ line.normal) > _FACES * oblique
+        use = is_mask | (bright & is_across)
         if use.sum() < MIN_DASHES:
             continue
         u, w = at[use] @ line.normal, at[use] @ line.along
@@ -168,4 +171,7 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
         inside = np.abs(u - offset) <= _STRIP
         if cost < best and n[i] >= MIN_DASHES and np.ptp(w[inside]) >= MIN_SPAN:
             best, found = cost, Line(float(angle), offset, float(w[inside].min()), float(w[inside].max()))
-    return found
+            is_either_way = np.mean(is_mask[use][inside]) < 0.5
+    if found is None:
+        return ()
+    return (found, found.reversed) if is_either_way else (found,)

@@ -52,13 +52,13 @@ def find_low_steps(
     v = np.stack([o.mean for o in openings]) + beam_shift
     scan, found = Scan(place, signal, images.variance, openings, beam_shift, images.spot / images.side), []
     for _ in range(MAX_LINES):
-        line = find_line(dashes, place, v, beam_shift)
-        if line is None:
+        ways = find_line(dashes, place, v, beam_shift)
+        if not ways:
             break
-        low = fit_step((line, line.reversed), scan) if _share(line, place) >= MIN_SHARE else None
+        low = fit_step(ways, scan) if _share(ways[0], place) >= MIN_SHARE else None
         if low is not None and _is_through(low, place):
             found.append(_records(low, middle, images.side, names, v))
-        dashes = dashes.without(_beside(line if low is None else low.line, place))
+        dashes = dashes.without(_beside(ways[0] if low is None else low.line, place))
     return found
 
 

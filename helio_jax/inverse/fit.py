@@ -36,9 +36,9 @@ from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
-ALTERNATING, LEAST_RELAXATION = 2.0 / 3.0, 0.3
-"""Extrapolation below which the next iteration is relaxed: each change undoes more than half of the last; and the least
-share of a change that is kept."""
+ALTERNATING, LEAST_RELAXATION = 0.6, 0.3
+"""Extrapolation below which the next iteration is relaxed: each change undoes two thirds of the last (iterates that
+only Monte Carlo noise moves have 2/3: a half); and the least share of a change that is kept."""
 INFLATING = (
     (("distance", "tilt", "aim"), 1.0),
     (("discrepancy",), 1.3),
@@ -264,11 +264,14 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
     solved = state
     last_start, last_change, extrapolated = start.height, np.zeros(start.height.shape), 1.0
     is_interrupted, is_traceable = False, True
-    said = "start"
+    relaxed: float | None = None
+    said, before = "start", state
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
     for number in range(s.max_rounds):
-        before = state
         try:
+            if relaxed is not None:
+                state = with_residuals(problem, between(before, state, relaxed))
+            before, relaxed = state, None
             if report:
                 report(number, s.max_rounds, said)
             state = before = reached = _updated(problem, state, reached, predict)
@@ -297,7 +300,7 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         if changes[-1] < s.tolerance_um and number >= n_fixed:
             break
         if n_fixed < number < s.max_rounds - 1 and 0.0 < extrapolated < ALTERNATING:
-            state = with_residuals(problem, between(before, state, max(extrapolated, LEAST_RELAXATION)))
+            relaxed = max(extrapolated, LEAST_RELAXATION)
     undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result
     remaining = (remaining_error(changes, extrapolated) + undone) * last_change
     return Fit(

@@ -42,7 +42,8 @@ _LONGEST = 0.02, 4.0
 _WIDEST = 0.8
 """Greatest width of a wall [pixels]."""
 _SCATTER = 1.0, 0.25, 2.0
-"""Multiple scattering over the prediction: prior mean, standard deviation, and most."""
+"""Multiple scattering over the prediction: prior mean, standard deviation, and most. Nearly all helium leaves a surface
+again; what stands around, and a curved level, change it."""
 _WALKERS = 32
 _CHAINS = 3
 """Independent chains of samples."""

@@ -272,6 +272,8 @@ class FitProblem:
 
     def albedo_at(self, parameters: Parameters) -> np.ndarray:
         """Compute the albedo of every pixel [y, x], smooth and by patches, relative to the substrate's."""
+        if not parameters.albedo.size:
+            return self.patches_at(parameters).albedo
         with jax.enable_x64(True):
             modes = jnp.asarray(parameters.albedo)
             smooth = np.asarray(smooth_albedo(modes, self.signal.shape[1:], self.settings.albedo_std))

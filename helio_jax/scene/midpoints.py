@@ -8,6 +8,10 @@ import numpy as np
 
 from helio_jax.scene.wall_grid import Grid
 
+MOST = 1.0
+"""Largest distance of a point half-way from the straight line [pitches]: that of a tip between flanks of 63 deg. Noise
+of steep slopes would raise it more."""
+
 
 def with_midpoints(
     grid: Grid,
@@ -21,7 +25,8 @@ def with_midpoints(
     Between two points the surface is extrapolated from both, each with its slope and the change of slope behind it
     (beyond the border none). Of the two values half-way, taken from the straight line, the smaller one counts, and
     neither if their signs differ. That is exact on a parabola and on a crease anywhere between two planes; across a
-    depth jump it is the straight line. The middle of a cell is the mean of those of its diagonals.
+    depth jump it is the straight line. No point is farther than `MOST` off it. The middle of a cell is the mean of
+    those of its diagonals.
 
     Args:
         grid: points x, y, z of a surface [y, x], um: the raster, moved against the beam by z times its shift.
@@ -44,8 +49,9 @@ def with_midpoints(
     down = _half_way(height, rise_x + rise_y, (1, 1))
     up = _half_way(height[::-1], (rise_x - rise_y)[::-1], (1, 1))[::-1]
     found[1::2, 1::2] = 0.5 * (down + up)
-    above = found - z
-    return x - above * beam_shift[0], y - above * beam_shift[1], found
+    most = MOST * min(pitches)
+    above = np.clip(found - z, -most, most)
+    return x - above * beam_shift[0], y - above * beam_shift[1], z + above
 
 
 def first_of_halves(n: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from helio_jax.alignment.correction import correct_motions
-from helio_jax.alignment.resample import common_raster, resample
+from helio_jax.alignment.resample import check_joinable, common_raster, resample
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import fill_gaps, pitch
 from helio_jax.errors import InputFileError
@@ -204,6 +204,7 @@ def _comparable(scans: MicrographSet) -> MicrographSet:
 
 def _check(scans: MicrographSet) -> None:
     """Refuse scans that one surface below one plate cannot explain."""
+    check_joinable(scans.stacks)
     first = scans.stacks[0]
     for stack in scans.stacks:
         if stack.positions is not None:

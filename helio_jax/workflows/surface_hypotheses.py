@@ -193,8 +193,9 @@ class ScanRaster:
     ) -> SurfaceHypothesis:
         """Make the surface with its hidden side at a place, continued in one of `CONTINUATIONS`.
 
-        Where the beam sees all of it, the mesh has points between the pixels, too (`with_midpoints`). Walls are
-        half-way between the pixels, unless most of what is occluded lies behind round bodies.
+        Where no pixel of it is hidden from the beam and none stands on a wall, the mesh has points between the pixels,
+        too (`with_midpoints`), in either continuation. Walls are half-way between the pixels, unless most of what is
+        occluded lies behind round bodies.
         """
         shift, normal = self.view_shift, normals.reshape(-1, 3)
         seen = at = self.surface(self.x, self.y, height)
@@ -204,6 +205,8 @@ class ScanRaster:
             at, behind = self.with_foot(at), self.with_foot(behind)
         else:
             level, substrate = substrate_level(height), {}
+            if hidden.has_walls and not self.has_walls(at, behind):
+                hidden = hidden._replace(has_walls=False)  # of what is beyond the image no wall is known
             if way == "relief":
                 at, behind = self.continued(at, behind, level)
             at, behind = (extend_border(*points, level, self.reach) for points in (at, behind))
@@ -224,6 +227,10 @@ class ScanRaster:
         )
         hits = Hits.on_mesh(np.stack(seen, -1).reshape(-1, 3), normal)
         return SurfaceHypothesis(self, beam_x, beam_y, hits, body, pixel, Intersector(body), has_walls)
+
+    def has_walls(self, at: Grid, behind: Grid) -> bool:
+        """Return whether walls stand between the points of a grid [y, x]."""
+        return with_upright_walls(at, behind, self.view_shift)[0][0].size > at[0].size
 
     def slopes(self, normals: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Compute the slopes along the raster of unit normals [y, x, 3], NaN around the image in a larger grid."""
@@ -275,12 +282,14 @@ class ScanRaster:
         Noise makes facets see one another: on a flat that would add half a per cent of its signal. Where the mean
         height differs by more than `MAX_SMOOTHING_STEP`, neighbours are at another level, and the height stays.
         """
-        fields = np.concatenate([np.moveaxis(normals, -1, 0), height[None]])
+        substrate = self.tilt[0] * self.x + self.tilt[1] * self.y
+        fields = np.concatenate([np.moveaxis(normals, -1, 0), (height - substrate)[None]])
         mean = self.smoothed(fields, height, normals, width=surface_width(normals))
         smooth = np.moveaxis(mean[:3], 0, -1)
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
-        is_near = np.abs(mean[3] - height) < MAX_SMOOTHING_STEP * min(self.pitches)
-        return np.where(is_near, mean[3], height), smooth
+        mean_height = mean[3] + substrate
+        is_near = np.abs(mean_height - height) < MAX_SMOOTHING_STEP * min(self.pitches)
+        return np.where(is_near, mean_height, height), smooth
 
     def surface(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Grid:
         """Compute the surface points of heights [y, x] that are seen at positions x, y of the raster [um]."""

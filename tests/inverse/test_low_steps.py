@@ -77,6 +77,20 @@ def test_profile_of_a_ramp(instrument):
                 assert np.mean(np.abs(found - expected) < 0.03) > 0.98, (turn, height, width)
 
 
+def traced(turn, height, width=0.0, instrument=OBLIQUE) -> MicrographStack:
+    """Trace a straight ramp step [pixels] through the image that falls towards `turn` [deg]; SNR 60."""
+    slope = math.degrees(math.atan2(height, width))
+    step = {"sample.height_um": PITCH * height, "sample.slope_deg": slope, "sample.facing_deg": turn % 360.0}
+    scan = {"scan.nx": N, "scan.ny": N, "scan.pixel_size_um": PITCH, "scan.pitch": "sample"}
+    more = {"sample.position_um": 0.3 * PITCH, "beam.incidence_deg": instrument.beam.incidence_deg}
+    scene = load_scene("step", step | scan | more)
+    image = hx.simulate(scene, rays=8, branches=32, seed=1).only()
+    signal = image.counts / np.median(image.counts, axis=(1, 2), keepdims=True)
+    noise = 1.0 / 60.0
+    counts = signal + noise * np.random.default_rng(int(turn) % 360).standard_normal(signal.shape)
+    return stack_of(counts, noise, instrument)
+
+
 CASES = [
     (20.0, 0.45, 0.0, NORMAL),
     (203.0, 0.25, 0.25, NORMAL),
@@ -93,7 +107,7 @@ def test_a_step_that_only_dashes_show_is_measured(turn, height, width, instrumen
     Catches a line that turns the wrong way, ends at its last dash, or falls to the wrong side, and a vertical wall in
     place of a ramp.
     """
-    found = find_steps(drawn(turn, height, width, instrument, seed=int(turn)))
+    found = find_steps(traced(turn, height, width, instrument))
     (step,) = [s for s in found.steps if s.is_used]
     off = (step.falls_deg - turn + 180.0) % 360.0 - 180.0
     assert abs(off) < 1.0
@@ -102,22 +116,9 @@ def test_a_step_that_only_dashes_show_is_measured(turn, height, width, instrumen
     assert np.sum(np.bincount(regions(*(~cut for cut in walls_of(found, raster))).ravel()) > 100) == 2
 
 
-def traced(turn: float, height: float) -> MicrographStack:
-    """Trace a vertical step through the image that falls towards `turn` [deg]; height in pixels, SNR 60."""
-    step = {"sample.height_um": PITCH * height, "sample.facing_deg": turn, "sample.position_um": 0.3 * PITCH}
-    scene = load_scene(
-        "step", step | {"scan.nx": 61, "scan.ny": 61, "scan.pixel_size_um": PITCH, "scan.pitch": "sample"}
-    )
-    image = hx.simulate(scene, rays=8, branches=32, seed=1).only()
-    signal = image.counts / np.median(image.counts, axis=(1, 2), keepdims=True)
-    noise = 1.0 / 60.0
-    counts = signal + noise * np.random.default_rng(int(turn) % 360).standard_normal(signal.shape)
-    return stack_of(counts, noise, scene.instrument)
-
-
 @pytest.mark.parametrize(("turn", "height"), [(15.0, 0.25), (-28.0, 0.3), (2.5, 0.35)])
 def test_a_low_step_that_faces_away_is_measured(turn, height):
-    """The tracer's counts: no mask shows, but the foot is brighter. Height within 3 standard deviations of at most 35 %.
+    """Traced counts: no mask shows, but the foot is brighter. Height within 3 standard deviations of at most 35 %.
 
     Catches a search among dark pixels alone, which finds none of them, the wrong side, which explains the pixels worse,
     and a range of heights set by the masks, which these steps lack.
@@ -151,7 +152,7 @@ def test_noise_and_dirt_make_no_line():
         dashes = find_dashes(counts, np.full(counts.shape, 0.03**2), np.ones(3), np.zeros(counts.shape, bool))
         n_dark, n_bright = n_dark + int(dashes.is_dark.sum()), n_bright + int(dashes.is_bright.sum())
         for shift in (np.zeros(2), np.array(OBLIQUE.beam_shift)):
-            assert find_line(dashes, place, v + shift, shift) is None, seed
+            assert not find_line(dashes, place, v + shift, shift), seed
     assert n_dark > 1000 and n_bright > 1000
 
 

@@ -14,13 +14,14 @@ from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse import fit
+from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.convergence import extrapolation, remaining_error
 from helio_jax.inverse.fit import fit_heights, with_posterior, with_residuals, without_noise_bias
 from helio_jax.inverse.noise_bias import noise_bias
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, set_corrections, update_corrections
-from helio_jax.inverse.steps import expected
+from helio_jax.inverse.steps import expected, step
 from helio_jax.workflows import pipeline
 from tests.inverse.test_reconstruct import bump_stack
 
@@ -229,20 +230,64 @@ def test_predictions_that_overshoot_come_to_rest(bshem, monkeypatch, is_relaxed)
         assert found.changes[-1] > 4.0
 
 
-def test_interrupted_after_a_relaxed_iteration(bshem):
-    """What is shown is the last surface that a solve ended in, with its residuals, not the start between two."""
+def test_interrupted_after_a_relaxed_iteration(bshem, monkeypatch):
+    """What is shown is the last surface that a solve ended in, with its residuals, not the start between two.
+
+    An iteration begins with the residuals of its own start. Interrupted while the start between two is made, too.
+    """
     problem, start, predict = overshooting(bshem)
-    kept = {}
+    solved, begun, updated = [], [], fit._updated
+
+    def solve(problem, state, *args):
+        solved.append(step(problem, state, *args))
+        return solved[-1]
+
+    def update(problem, state, *args):
+        begun.append(state)
+        return updated(problem, state, *args)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
 
     def report(number, of, said):
-        kept[number] = said
-        if len(kept) == 4:
+        if number == 4:
             raise KeyboardInterrupt
 
-    found = fit_heights(problem, start, predict, report)
-    again = with_residuals(problem, found.state)
-    assert found.is_interrupted and len(found.changes) == 3
-    assert np.abs(again.residuals - found.residuals).max() < 0.01 * np.abs(again.residuals).max()
+    def check(found):
+        again = with_residuals(problem, found.state)
+        assert found.is_interrupted and len(found.changes) == 4
+        np.testing.assert_allclose(found.surface.height, solved[-1][0].surface.height, atol=1e-9)
+        assert np.abs(again.residuals - found.residuals).max() < 0.01 * np.abs(again.residuals).max()
+
+    monkeypatch.setattr(fit, "step", solve)
+    monkeypatch.setattr(fit, "_updated", update)
+    check(fit_heights(problem, start, predict, report))
+    fit_heights(problem, start, predict)
+    for state in begun[1:]:  # the first start has none
+        again = with_residuals(problem, state)
+        assert np.abs(again.residuals - state.residuals).max() < 0.01 * np.abs(again.residuals).max()
+    monkeypatch.setattr(fit, "between", interrupt)
+    check(fit_heights(problem, start, predict))
+
+
+def test_albedo_of_a_pixel_is_smooth_and_by_patches(bshem):
+    """The product of both, each in its own unit; rejects patches alone."""
+    surface, _ = bump()
+    signal = np.asarray(signal_of(bshem, surface))
+    settings = ReconstructSettings(refine=RefineSettings(albedo_std=0.05))
+    labels = np.zeros(SHAPE, int)
+    labels[:, : SHAPE[1] // 2] = 1
+    problem = FitProblem.of(signal, 0.01 * signal, bshem, Raster.regular(SHAPE, PITCH), surface, settings)
+    problem = replace(problem, patches=AlbedoPatches(labels, np.zeros(1)))
+    means = problem.prior_means()
+    modes = np.zeros(np.shape(means.albedo))
+    modes[0, 1] = 0.7
+    found = problem.albedo_at(means.replaced(albedo=modes, patch=np.array([-1.5])))
+    ratio = found / problem.albedo_at(means.replaced(albedo=0.0 * modes, patch=np.array([-1.5])))
+    patch = found / problem.albedo_at(means.replaced(albedo=modes, patch=np.array([0.0])))
+    assert np.ptp(ratio, axis=0).max() < 1e-9 and np.ptp(np.log(ratio)) > 0.01
+    expected_log = np.where(labels == 1, -1.5 * problem.settings.patch_albedo_std, 0.0)
+    np.testing.assert_allclose(np.log(patch), expected_log, atol=1e-9)
 
 
 def nothing_more(height, normals, *instrument, **albedo):

@@ -269,16 +269,17 @@ def test_priors_of_a_calibration_reach_the_heights(crystal):
 def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     """The calibration brings a level substrate to the cosine law's signal, a fit by the stated law to that law's.
 
-    Catches joined scans that are fitted at the cosine law's level, for no calibration goes with them. Scans of
-    which one is not calibrated are refused.
+    Catches joined scans that are fitted at the cosine law's level, for no calibration goes with them, and the first
+    scan's priors for all. Scans of which one is not calibrated, or states another law, are refused.
     """
     scans, _ = crystal
     stated = CampaignLaw(exponent=0.2, std=0.01)
     instruments = [s.instrument.model_copy(update={"law": stated}) for s in scans.stacks]
-    calibration = Calibration("border", {}, warnings=("dark",))
+    calibration = Calibration("border", {"offset_std": 0.01, "gain_std": 0.1}, warnings=("dark",))
     stacks = [s.replace(calibration=calibration, instrument=i) for s, i in zip(scans.stacks, instruments, strict=True)]
+    stacks[1] = stacks[1].replace(calibration=Calibration("border", {"offset_std": 0.3}, warnings=("dark",)))
     joined = several_scans.join_scans(MicrographSet(tuple(stacks))).stack
-    assert joined.calibration == calibration
+    assert joined.calibration == Calibration("border", {"offset_std": 0.3, "gain_std": 0.1}, warnings=("dark",))
     scaled = with_level_of_law(joined, RefineSettings())
     ratio = level_ratio(PowerLaw(0.2), Optics.of(joined.instrument))
     np.testing.assert_allclose(scaled.counts, joined.counts * ratio[:, None, None])
@@ -286,6 +287,8 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     assert np.abs(ratio - 1.0).max() > 0.01
     with pytest.raises(InputFileError, match="must be calibrated alike"):
         several_scans.join_scans(MicrographSet((stacks[0].replace(calibration=None), *stacks[1:])))
+    with pytest.raises(InputFileError, match="must state one scattering law"):
+        several_scans.join_scans(MicrographSet((scans.stacks[0].replace(calibration=calibration), *stacks[1:])))
 
 
 def test_command_joins_the_scans_of_several_files(crystal, tmp_path):
