@@ -262,6 +262,7 @@ def test_interrupted_after_a_relaxed_iteration(bshem, monkeypatch):
     monkeypatch.setattr(fit, "step", solve)
     monkeypatch.setattr(fit, "_updated", update)
     check(fit_heights(problem, start, predict, report))
+    begun.clear()
     fit_heights(problem, start, predict)
     for state in begun[1:]:  # the first start has none
         again = with_residuals(problem, state)
