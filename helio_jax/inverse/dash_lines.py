@@ -157,7 +157,7 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     for angle in angles:
         line = Line(float(angle), 0.0, 0.0, 0.0)
         toward = v @ line.normal / np.maximum(np.hypot(v[:, 0], v[:, 1]), 1e-12)
-        is_mask = dark[toward < -_FACES].any(0) & ~dark[toward > _FACES].any(0)
+        is_mask = np.asarray(dark[toward < -_FACES].any(0) & ~dark[toward > _FACES].any(0))
         is_across = oblique > _OBLIQUE and abs(beam_shift @ line.normal) > _FACES * oblique
         use = is_mask | (bright & is_across)
         if use.sum() < MIN_DASHES:
@@ -171,7 +171,7 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
         inside = np.abs(u - offset) <= _STRIP
         if cost < best and n[i] >= MIN_DASHES and np.ptp(w[inside]) >= MIN_SPAN:
             best, found = cost, Line(float(angle), offset, float(w[inside].min()), float(w[inside].max()))
-            is_either_way = np.mean(is_mask[use][inside]) < 0.5
+            is_either_way = bool(np.mean(is_mask[use][inside]) < 0.5)
     if found is None:
         return ()
     return (found, found.reversed) if is_either_way else (found,)

@@ -19,13 +19,15 @@ MIN_SHARE = 0.5
 """Least share of its way through the image along which a line shows dashes."""
 MAX_BAND = 1.5
 """Longest band of a low step: longer ones are those of `band_fit` [pixels]."""
+LEAST_MASK = 0.2
+"""Shortest mask band that counts [heights of the step]."""
+MAX_BY_GLOW = 1.2
+"""Highest step that is known by the glow of its foot alone, plus two standard deviations [pixels]: that of a higher one
+reaches the pixels that show the signal of the lower side (`shadow_steps` finds it)."""
 _BORDER = 3.0
 """Distance from the border within which a line ends there [pixels]."""
 _BESIDE = 2.0
 """Dashes so near to a line are its own [pixels]."""
-
-_LEAST_MASK = 0.2
-"""Shortest mask band that is listed [heights of the step]."""
 
 
 def find_low_steps(
@@ -78,7 +80,9 @@ def _is_through(low: LowStep, place: np.ndarray) -> bool:
     """Return whether a low step goes through the image, and is one."""
     first, last = _way(low.line, place)
     ends_there = low.line.start < first + _BORDER and low.line.end > last - _BORDER
-    return ends_there and low.height * low.longest <= MAX_BAND
+    longest = max(s.length for s in low.signals)
+    is_low = low.height * longest <= MAX_BAND if longest > LEAST_MASK else low.height + 2.0 * low.std <= MAX_BY_GLOW
+    return ends_there and is_low
 
 
 def _beside(line: Line, place: np.ndarray) -> np.ndarray:
@@ -95,7 +99,7 @@ def _records(
     std = math.hypot(side * low.std, SHAPE_STD * height)
     dark = tuple(k for k, s in enumerate(low.signals) if kind_of(s) == "dark")
     lengths = [s.length for s in low.signals]
-    if not dark and max(lengths) > _LEAST_MASK:
+    if not dark and max(lengths) > LEAST_MASK:
         dark = (int(np.argmax(lengths)),)
     start, end = (middle + side * (line.offset * line.normal + at * line.along) for at in (line.start, line.end))
     edge = Edge(start, end, dark)

@@ -84,13 +84,8 @@ class LowStep:
     gain: float
     signals: tuple[WallSignal, ...]
 
-    @property
-    def longest(self) -> float:
-        """Longest image of the step per height: of mask band, wall or shadow."""
-        return longest_image(self.signals)
 
-
-def longest_image(signals: Sequence[WallSignal]) -> float:
+def _longest_image(signals: Sequence[WallSignal]) -> float:
     """Return the longest mask band, wall or shadow of a vertical wall [heights], of the signals of all detectors."""
     return max(max(s.length, abs(s.shift)) for s in signals)
 
@@ -204,7 +199,7 @@ def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
     Args:
         walkers: shift of the line [pixels], turn [rad], logarithm of the height, width of the wall [pixels], scattering
             over the prediction, and bend [pixels] [walker, 6].
-        longest: `longest_image`.
+        longest: `_longest_image`.
     """
     _, _, log_height, width, scatter, bend = walkers.T
     image = np.exp(log_height) * longest
@@ -335,7 +330,7 @@ def _one_chain(line: Line, scan: Scan, seed: int, least_gain: float) -> LowStep 
     for tries, moves, *spread in _ROUNDS:
         shift = float(scan.beam_shift[0]), float(scan.beam_shift[1])
         signals = tuple(wall_signal(o, shift, line.normal) for o in scan.openings)
-        strip, longest = _Strip.of(line, scan, signals), longest_image(signals)
+        strip, longest = _Strip.of(line, scan, signals), _longest_image(signals)
         if strip is None or longest <= 0.0:
             return None
         points, costs = _sampled(

@@ -77,6 +77,28 @@ def test_profile_of_a_ramp(instrument):
                 assert np.mean(np.abs(found - expected) < 0.03) > 0.98, (turn, height, width)
 
 
+@pytest.mark.parametrize(("slope", "limit"), [(90.0, 0.05), (45.0, 0.1)])
+def test_glow_below_a_wall(slope, limit):
+    """Multiple scattering on the level beside a wall that faces away, as traced: noise 1 %.
+
+    Beside a slope of 45 deg it rejects that of a vertical wall times 1 - cos from its foot on: 0.2 to 0.4 too low.
+    """
+    height, run = 20.0, 20.0 / math.tan(math.radians(slope))
+    step = {"sample.height_um": height, "sample.position_um": 0.0, "sample.slope_deg": slope}
+    scene = load_scene("step", step | {"scan.nx": 161, "scan.ny": 1, "scan.pixel_size_um": 1.0, "scan.pitch": "sample"})
+    image = hx.simulate(scene, rays=512, branches=16, seed=1).only()
+    shift = np.array(OBLIQUE.beam_shift)
+    u = image.x - height * shift[0]
+    beside = (u > max(run - height * shift[0], 0.0) + 0.25 * height) & (u < 2.5 * height)
+    level = np.median(image.counts[:, 0, :60], axis=1)
+    for k, aperture in enumerate(scene.instrument.apertures()):
+        opening = opening_of(aperture, scene.instrument, 0.0)
+        wall = LowWall.of(wall_signal(opening, tuple(shift), unit(0.0)), opening, unit(0.0))
+        model = [wall.profile(u[None], *(np.array([[a]]) for a in (height, run, m)))[0][0] for m in (1.0, 0.0)]
+        found = (image.by_order[1:, k, 0].sum(0) / level[k])[beside]
+        assert (model[0] - model[1])[beside].mean() == pytest.approx(found.mean(), rel=limit)
+
+
 def traced(turn, height, width=0.0, instrument=OBLIQUE) -> MicrographStack:
     """Trace a straight ramp step [pixels] through the image that falls towards `turn` [deg]; SNR 60."""
     slope = math.degrees(math.atan2(height, width))
@@ -134,6 +156,11 @@ def test_a_low_step_that_faces_away_is_measured(turn, height):
     numbers, anchors = anchors_of_steps(found, flat, raster, region)
     ((height_um, _),) = anchors.known_steps(np.where(found.patch == step.above, 1, 0)).values()
     assert numbers == (step.number,) and abs(height_um) == pytest.approx(step.height_um)
+
+
+def test_a_high_step_that_faces_away_is_not_measured_by_its_glow():
+    """2 pixels high: its glow is wider than a low step's, by which it would be 1.6 +- 0.2 pixels high."""
+    assert not [s for s in find_steps(traced(-33.0, 2.0)).steps if s.is_used]
 
 
 def test_noise_and_dirt_make_no_line():
