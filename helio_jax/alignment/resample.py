@@ -15,12 +15,15 @@ from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import as_json, pitch
+from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Detector, Instrument
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
+LAWS_DIFFER = 3.0
+"""Difference of two scattering laws from which on they are not of one sample [standard deviations]."""
 _MARCH = 0.5
 """Step of the search for what shadows a point [pixels]."""
 
@@ -100,7 +103,7 @@ def common_raster(
 
 
 def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid, ...]) -> Instrument:
-    """Combine the apertures of all scans in one instrument, each rotated back by its sample's rotation.
+    """Combine the apertures and laws of all scans in one instrument, each rotated back by its sample's rotation.
 
     Where a scan's beam is oblique, each detector keeps the beam of its scan, and the raster sees the sample straight
     down (`Instrument.has_several_beams`).
@@ -126,14 +129,15 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
                 )
             )
     beam = beams[0].changed(incidence_deg=0.0, azimuth_deg=0.0) if is_oblique else beams[0]
-    return stacks[0].instrument.model_copy(update={"beam": beam, "detector": tuple(detectors)})
+    update = {"beam": beam, "detector": tuple(detectors), "law": _joined_law(stacks)}
+    return stacks[0].instrument.model_copy(update=update)
 
 
 def check_joinable(stacks: Sequence[MicrographStack]) -> None:
     """Refuse scans whose counts have no common unit.
 
     Raises:
-        InputFileError: some are calibrated in another way than others, or state another scattering law.
+        InputFileError: some are calibrated in another way than others, or state scattering laws that disagree.
     """
     kinds = {None if c is None else (c.method, c.without_multiple) for c in (s.calibration for s in stacks)}
     if len(kinds) > 1:
@@ -142,13 +146,30 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
             f"scans that are joined must be calibrated alike, got {names}: calibrate all imported files alike (helio "
             "calibrate); simulated and measured scans cannot be joined"
         )
-    first = stacks[0]
-    for stack in stacks:
-        if stack.instrument.law != first.instrument.law:
-            raise InputFileError(
-                f"scans that are joined must state one scattering law, {first.name!r} and {stack.name!r} differ: give "
-                "their instrument files the same table [law], or none"
-            )
+    _joined_law(stacks)
+
+
+def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
+    """Return the scattering law of a sample by the scans that state one, as a weighted mean; None: none does.
+
+    Its standard deviation is the weighted mean of theirs: what samples differ by is common to all scans of one.
+
+    Raises:
+        InputFileError: two differ by more than `LAWS_DIFFER` standard deviations.
+    """
+    stated = [(s.name, s.instrument.law) for s in stacks if s.instrument.law is not None]
+    if not stated:
+        return None
+    (low, least), (high, most) = (of(stated, key=lambda pair: pair[1].exponent) for of in (min, max))
+    if most.exponent - least.exponent > LAWS_DIFFER * math.hypot(least.std, most.std):
+        raise InputFileError(
+            f"scans that are joined must agree on the scattering law, got m = {least.exponent:g} +- {least.std:g} of "
+            f"{low!r} and {most.exponent:g} +- {most.std:g} of {high!r}: correct or remove the tables [law] of their "
+            f"instrument files (limit {LAWS_DIFFER:g} standard deviations)"
+        )
+    exponent, std = np.array([(law.exponent, law.std) for _, law in stated]).T
+    mean, own = (float(np.average(values, weights=std**-2.0)) for values in (exponent, std))
+    return CampaignLaw(exponent=mean, std=own)
 
 
 def _calibration(stacks: Sequence[MicrographStack]) -> Calibration | None:

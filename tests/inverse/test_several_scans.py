@@ -270,7 +270,7 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     """The calibration brings a level substrate to the cosine law's signal, a fit by the stated law to that law's.
 
     Catches joined scans that are fitted at the cosine law's level, for no calibration goes with them, and the first
-    scan's priors for all. Scans of which one is not calibrated, or states another law, are refused.
+    scan's priors for all. Scans of which one is not calibrated, or states a law that disagrees, are refused.
     """
     scans, _ = crystal
     stated = CampaignLaw(exponent=0.2, std=0.01)
@@ -287,8 +287,14 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     assert np.abs(ratio - 1.0).max() > 0.01
     with pytest.raises(InputFileError, match="must be calibrated alike"):
         several_scans.join_scans(MicrographSet((stacks[0].replace(calibration=None), *stacks[1:])))
-    with pytest.raises(InputFileError, match="must state one scattering law"):
-        several_scans.join_scans(MicrographSet((scans.stacks[0].replace(calibration=calibration), *stacks[1:])))
+    other = stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=0.23, std=0.02)})
+    of_both = several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:]))).stack
+    n = len(stacks) - 1
+    assert of_both.instrument.law.exponent == pytest.approx((0.23 + 4 * n * 0.2) / (1 + 4 * n))
+    assert of_both.instrument.law.std == pytest.approx((0.02 + 4 * n * 0.01) / (1 + 4 * n))
+    other = other.model_copy(update={"law": CampaignLaw(exponent=0.3, std=0.02)})
+    with pytest.raises(InputFileError, match="must agree on the scattering law"):
+        several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:])))
 
 
 def test_command_joins_the_scans_of_several_files(crystal, tmp_path):
