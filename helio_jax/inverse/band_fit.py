@@ -22,6 +22,8 @@ _BLUR = 0.15
 """Least standard deviation of the smoothing of sharp ends, which makes the model differentiable [pixels]."""
 _SHARP = 0.08
 """The same where the place of an edge is compared [pixels]."""
+LEAST_MASK = 0.2
+"""Shortest mask band that tells a height [heights of the step]."""
 _SLANT = 0.35
 """Least cosine of the angle between an edge's normal and the direction of its band."""
 _SCATTER_STD = {"dark": 0.6, "lit": 0.6}
@@ -93,7 +95,7 @@ class Band:
 
 def kind_of(signal: WallSignal) -> str:
     """Return how a detector shows a wall: "dark", "lit", or "" where its signal does not determine the height."""
-    if signal.dark_share >= 0.995 and signal.length >= 0.2 and signal.slant[0] >= _SLANT:
+    if signal.dark_share >= 0.995 and signal.length >= LEAST_MASK and signal.slant[0] >= _SLANT:
         return "dark"
     if signal.shift < -0.1 and signal.q[-1] < 0.0 and signal.slant[1] >= _SLANT:
         return "lit"

@@ -35,9 +35,10 @@ def contraction_of(changes: Sequence[float]) -> float | None:
 def remaining_error(changes: Sequence[float], extrapolated: float) -> float:
     """Estimate the distance of the heights from the limit of further iterations, in units of the last change.
 
-    The distance to the extrapolation, nine changes at most. Iterates that oscillate, or are limited by Monte Carlo
-    noise: one change, or the rest of the geometric series if changes fall at the slower of their last two rates; one
-    small change after larger ones proves nothing. The change of a single iteration is taken to halve.
+    The larger of two: the distance to the extrapolation, nine changes at most; and, for iterates that oscillate or are
+    limited by Monte Carlo noise, one change, or the rest of the geometric series if changes fall at the slower of their
+    last two rates: one small change after larger ones proves nothing. The change of a single iteration is taken to
+    halve.
 
     Args:
         changes: root mean square of the height changes of every iteration.

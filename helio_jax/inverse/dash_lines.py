@@ -129,14 +129,14 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     step along it masks, in pixels where no other detector has any: a groove darkens both; and across an oblique beam
     bright dashes of any detector, which may be of a step that falls either way.
 
-    Returns:
-        The line; and its reverse, if most of its dashes are bright; none if chance explains the dashes.
-
     Args:
         dashes: isolated pixels.
         place: of the pixels, about the middle of the image [y, x, 2], pixels.
         v: direction of each detector plus beam shift [detector, 2].
         beam_shift: `Instrument.beam_shift` [2].
+
+    Returns:
+        The line; and its reverse, if most of its dashes are bright; none if chance explains the dashes.
     """
     is_any = dashes.is_dark.any(0) | dashes.is_bright.any(0)
     if is_any.sum() < MIN_DASHES:
@@ -148,7 +148,8 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
     bins, width = int(2.0 * reach / _SHIFT), round(2.0 * _STRIP / _SHIFT)
     oblique = float(np.hypot(*beam_shift))
     # every strip, and every start and end in it
-    best, found, is_either_way = np.log(FALSE_ALARMS / (len(angles) * bins * 2.0 * reach**2)), None, False
+    best = np.log(FALSE_ALARMS / (len(angles) * bins * 2.0 * reach**2))
+    found: tuple[Line, ...] = ()
 
     def in_strips(u: np.ndarray) -> np.ndarray:
         number = np.bincount(((u + reach) / _SHIFT).astype(int), minlength=bins)
@@ -170,8 +171,6 @@ def find_line(dashes: Dashes, place: np.ndarray, v: np.ndarray, beam_shift: np.n
         offset = (i + 0.5 * width) * _SHIFT - reach
         inside = np.abs(u - offset) <= _STRIP
         if cost < best and n[i] >= MIN_DASHES and np.ptp(w[inside]) >= MIN_SPAN:
-            best, found = cost, Line(float(angle), offset, float(w[inside].min()), float(w[inside].max()))
-            is_either_way = bool(np.mean(is_mask[use][inside]) < 0.5)
-    if found is None:
-        return ()
-    return (found, found.reversed) if is_either_way else (found,)
+            best, line = cost, Line(float(angle), offset, float(w[inside].min()), float(w[inside].max()))
+            found = (line, line.reversed) if np.mean(is_mask[use][inside]) < 0.5 else (line,)
+    return found

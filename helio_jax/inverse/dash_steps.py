@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from helio_jax.inverse.band_fit import kind_of
+from helio_jax.inverse.band_fit import LEAST_MASK, kind_of
 from helio_jax.inverse.dash_lines import Line, find_dashes, find_line
 from helio_jax.inverse.edge_place import Images
 from helio_jax.inverse.low_steps import SHAPE_STD, LowStep, Scan, fit_step
@@ -19,8 +19,6 @@ MIN_SHARE = 0.5
 """Least share of its way through the image along which a line shows dashes."""
 MAX_BAND = 1.5
 """Longest band of a low step: longer ones are those of `band_fit` [pixels]."""
-LEAST_MASK = 0.2
-"""Shortest mask band that counts [heights of the step]."""
 MAX_BY_GLOW = 1.2
 """Highest step that is known by the glow of its foot alone, plus two standard deviations [pixels]: that of a higher one
 reaches the pixels that show the signal of the lower side (`shadow_steps` finds it)."""
@@ -33,7 +31,7 @@ _BESIDE = 2.0
 def find_low_steps(
     images: Images, openings: Sequence[Opening], beam_shift: np.ndarray, names: Sequence[str], is_explained: np.ndarray
 ) -> list[tuple[Edge, Step, tuple[BandRow, ...]]]:
-    """Find the steps through the image whose mask bands are shorter than a pixel, and measure them.
+    """Find the steps through the image whose mask bands are shorter than a pixel, or hidden, and measure them.
 
     Around the ends of a shorter one the surface joins both sides, and tells their heights; where it ends dashes do not.
 

@@ -9,7 +9,7 @@ Source: sampler: Goodman and Weare, Comm. Appl. Math. Comp. Sci. 5 (2010) 65.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +44,8 @@ _WIDEST = 0.8
 _SCATTER = 1.0, 0.25, 2.0
 """Multiple scattering over the prediction: prior mean, standard deviation, and most. Nearly all helium leaves a surface
 again; what stands around, and a curved level, change it."""
+_LINE_WIDTHS, _LEAST_ON_LINE = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.2), 3
+"""Widths of a line without a step that are tried [pixels], and the fewest pixels on it."""
 _WALKERS = 32
 _CHAINS = 3
 """Independent chains of samples."""
@@ -63,6 +65,9 @@ in every round."""
 SHAPE_STD = 0.05
 """Standard deviation of heights by the shape of the wall, as a fraction: staircases of facets a quarter of a pixel wide
 come out 10 % too low."""
+
+_Modelled = tuple[int, np.ndarray, np.ndarray]
+"""A detector's number, and its signal and error of the model."""
 
 
 @dataclass(frozen=True)
@@ -157,11 +162,21 @@ class _Strip:
         shift, turn, log_height, width, scatter, bend = (walkers[:, i, None] for i in range(6))
         height, width = np.exp(log_height), np.maximum(width, 1e-3)
         u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
+        return self._over_edges(
+            u, lambda at: ((k, *self._signal(k, at, height, width, scatter)) for k in range(len(self.walls)))
+        )
+
+    def _over_edges(self, u: np.ndarray, signals: Callable[[np.ndarray], Iterable[_Modelled]]) -> np.ndarray:
+        """Compute minus the logarithm of the likelihood, averaged over where the edge is in a pixel [..., pixel].
+
+        Args:
+            u: distance from the edge's line [..., pixel].
+            signals: each detector's number, signal and error of the model [..., pixel] at distances from the edge.
+        """
         places = []
         for place, share in ((-_FUZZ, 0.25), (0.0, 0.5), (_FUZZ, 0.25)):
             total = np.full(u.shape, -math.log(share))
-            for k in range(len(self.walls)):
-                model, error = self._signal(k, u + place, height, width, scatter)
+            for k, model, error in signals(u + place):
                 std = np.sqrt(self.std[k] ** 2 + error**2)
                 rest = (self.data[k] - model) / std
                 total += 0.5 * _OUTLIER**2 * np.log1p((rest / _OUTLIER) ** 2) + np.log(std / self.lower[k])
@@ -186,6 +201,27 @@ class _Strip:
             signal += side * model
             error += side * np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
         return signal, error
+
+    def gain_of_line(self) -> float:
+        """Compute by how much a line of other signals, without a step, explains the pixels better than none.
+
+        Dirt and narrow ridges are such lines: each detector's signal in it is free.
+        """
+        side = 0.5 * (self.upper + self.lower)
+        share, least = self.data / side, np.inf
+        for start in np.arange(-1.0, 1.0, 0.05):
+            for width in _LINE_WIDTHS:
+                inside = (self.u > start) & (self.u < start + width)
+                if inside.sum() < _LEAST_ON_LINE:
+                    continue
+                level = np.median(share[:, inside], axis=1)
+
+                def signals(at: np.ndarray, level=level, ends=(start, start + width)) -> Iterable[_Modelled]:
+                    is_line = (at > ends[0]) & (at < ends[1])
+                    return ((k, s * np.where(is_line, level[k], 1.0), _MODEL_ERROR * s) for k, s in enumerate(side))
+
+                least = min(least, float(self._over_edges(self.u, signals).sum()))
+        return float(self.without().sum()) - least
 
     def without(self) -> np.ndarray:
         """Compute the same of a surface without a step [pixel]."""
@@ -304,7 +340,8 @@ def fit_step(ways: Sequence[Line], scan: Scan) -> LowStep | None:
     explain the pixels about as well are part of the standard deviation.
 
     Args:
-        ways: lines near the upper edge, such as one and its reverse; the one that explains the pixels best is taken.
+        ways: a line near the upper edge; or one that shows as bright pixels, and its reverse: the way that explains the
+            pixels best is taken, if it explains them better than a line of other signals.
         scan: data.
 
     Returns:
@@ -317,6 +354,10 @@ def fit_step(ways: Sequence[Line], scan: Scan) -> LowStep | None:
             first, chosen = low, way
     if first is None:
         return None
+    if len(ways) > 1:
+        strip = _Strip.of(first.line, scan, first.signals)
+        if strip is None or strip.gain_of_line() > first.gain:
+            return None
     further = (_one_chain(chosen, scan, seed, _GAIN) for seed in range(1, _CHAINS))
     chains = [first, *(low for low in further if low is not None)]
     best = max(chains, key=lambda low: low.gain)

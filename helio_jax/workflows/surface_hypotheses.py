@@ -21,7 +21,7 @@ from helio_jax.scene.hidden_side import is_foot, occluded_vertices, undercut_ver
 from helio_jax.scene.midpoints import first_of_halves, with_midpoints
 from helio_jax.scene.scattering import COSINE_LAW, Term
 from helio_jax.scene.surfaces import surface_body
-from helio_jax.scene.wall_grid import Grid, has_level_rims, with_upright_walls
+from helio_jax.scene.wall_grid import Grid, has_level_rims, wall_links, with_upright_walls
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import SMOOTH_NORMALS, smooth_along_surface, surface_width
 from helio_jax.trace.intersect import Hits, Intersector
@@ -205,7 +205,7 @@ class ScanRaster:
             at, behind = self.with_foot(at), self.with_foot(behind)
         else:
             level, substrate = substrate_level(height), {}
-            if hidden.has_walls and not self.has_walls(at, behind):
+            if not any(parts.any() for parts in wall_links(self.x, self.y, height)):
                 hidden = hidden._replace(has_walls=False)  # of what is beyond the image no wall is known
             if way == "relief":
                 at, behind = self.continued(at, behind, level)
@@ -227,10 +227,6 @@ class ScanRaster:
         )
         hits = Hits.on_mesh(np.stack(seen, -1).reshape(-1, 3), normal)
         return SurfaceHypothesis(self, beam_x, beam_y, hits, body, pixel, Intersector(body), has_walls)
-
-    def has_walls(self, at: Grid, behind: Grid) -> bool:
-        """Return whether walls stand between the points of a grid [y, x]."""
-        return with_upright_walls(at, behind, self.view_shift)[0][0].size > at[0].size
 
     def slopes(self, normals: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Compute the slopes along the raster of unit normals [y, x, 3], NaN around the image in a larger grid."""
