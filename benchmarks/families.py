@@ -159,18 +159,26 @@ def inner(mask: np.ndarray) -> np.ndarray:
     return mask
 
 
+def around(rec: Reconstruction, place: tuple[float, float]) -> np.ndarray:
+    """Return the pixel nearest to a place and its eight neighbours, as a mask [y, x]."""
+    x, y = (np.argmin(np.abs(axis - at)) for axis, at in zip((rec.raster_x, rec.raster_y), place, strict=True))
+    where = np.zeros(rec.height.shape, bool)
+    where[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2] = True
+    return where
+
+
 def steps(member: Member, truth: np.ndarray, rec: Reconstruction) -> list[Case]:
-    """Return the heights of a member's levels, or of its apex, above the substrate z = 0: relative errors."""
+    """Return the heights of a member's levels or apexes above the substrate z = 0: relative errors."""
     near = 1e-3 * float(np.ptp(truth)) + 0.1
     base = inner(np.abs(truth) < near)
     if member.border == "free" and not member.levels:
         return []
     tops = [(level, inner(np.abs(truth - level) < near)) for level in member.levels if level]
     if not tops:
-        apex = np.unravel_index(np.argmax(np.abs(truth)), truth.shape)
-        where = np.zeros(truth.shape, bool)
-        where[tuple(slice(max(0, i - 1), i + 2) for i in apex)] = True
-        tops = [(float(np.mean(truth[where])), where)]
+        y, x = np.unravel_index(np.argmax(np.abs(truth)), truth.shape)
+        for place in member.apexes or ((rec.raster_x[x], rec.raster_y[y]),):
+            where = around(rec, place)
+            tops.append((float(np.mean(truth[where])), where))
     out = []
     for level, where in tops:
         if not where.any() or not base.any():
