@@ -5,6 +5,7 @@ the pixels' areas: the information of a region is that of its readings. The chan
 alignment is added to the variance.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -152,7 +153,8 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     """Return the scattering law of a sample by the scans that state one, as a weighted mean; None: none does.
 
-    Its standard deviation is the weighted mean of theirs: what samples differ by is common to all scans of one.
+    Its standard deviation is the weighted mean of theirs, for what samples differ by is common to all scans of one; or,
+    where the laws differ by more, times the Birge ratio: the root of chi-square over the degrees of freedom.
 
     Raises:
         InputFileError: two differ by more than `LAWS_DIFFER` standard deviations.
@@ -160,16 +162,17 @@ def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     stated = [(s.name, s.instrument.law) for s in stacks if s.instrument.law is not None]
     if not stated:
         return None
-    (low, least), (high, most) = (of(stated, key=lambda pair: pair[1].exponent) for of in (min, max))
-    if most.exponent - least.exponent > LAWS_DIFFER * math.hypot(least.std, most.std):
-        raise InputFileError(
-            f"scans that are joined must agree on the scattering law, got m = {least.exponent:g} +- {least.std:g} of "
-            f"{low!r} and {most.exponent:g} +- {most.std:g} of {high!r}: correct or remove the tables [law] of their "
-            f"instrument files (limit {LAWS_DIFFER:g} standard deviations)"
-        )
+    for (one, a), (other, b) in itertools.combinations(stated, 2):
+        if abs(a.exponent - b.exponent) > LAWS_DIFFER * math.hypot(a.std, b.std):
+            raise InputFileError(
+                f"scans that are joined must agree on the scattering law, got m = {a.exponent:g} +- {a.std:g} of "
+                f"{one!r} and {b.exponent:g} +- {b.std:g} of {other!r}: correct or remove the tables [law] of their "
+                f"instrument files (limit {LAWS_DIFFER:g} standard deviations)"
+            )
     exponent, std = np.array([(law.exponent, law.std) for _, law in stated]).T
     mean, own = (float(np.average(values, weights=std**-2.0)) for values in (exponent, std))
-    return CampaignLaw(exponent=mean, std=own)
+    birge = math.sqrt(float(np.sum(((exponent - mean) / std) ** 2)) / max(len(stated) - 1, 1))
+    return CampaignLaw(exponent=mean, std=own * max(1.0, birge))
 
 
 def _calibration(stacks: Sequence[MicrographStack]) -> Calibration | None:

@@ -25,8 +25,8 @@ _SIDES = 1.2, 5.0, 3.0
 their weight along it [pixels]."""
 _MODEL_ERROR = 0.03
 """Error of the modelled signal, in that of the level."""
-_WALL_ERROR = 0.25
-"""Relative error on the wall: how it is inclined and what it sees is modelled roughly."""
+_WALL_ERROR = 0.06
+"""Relative error on the wall: it need not be a plane, nor what it sees level."""
 _FUZZ = 0.1
 """How straight an edge is: in a pixel it may be so far before its line, at it, or as far behind it [pixels]."""
 _NODE, _LEAST_SPOT = math.sqrt(2.0), 0.05
@@ -46,6 +46,8 @@ _SCATTER = 1.0, 0.25, 2.0
 again; what stands around, and a curved level, change it."""
 _LINE_WIDTHS, _LEAST_ON_LINE = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.2), 3
 """Widths of a line without a step that are tried [pixels], and the fewest pixels on it."""
+_CREASES = np.append(np.arange(-1.0, 1.01, 0.25), (-np.inf, np.inf))
+"""Places of a crease between the sides that are tried where no step is [pixels]; at infinity: one side only."""
 _WALKERS = 32
 _CHAINS = 3
 """Independent chains of samples."""
@@ -78,6 +80,7 @@ class LowStep:
         line: the upper edge.
         height, std: of the step.
         width: horizontal width of the wall.
+        bend: of the edge, as in `_Strip.distance`.
         gain: by how much a step explains the pixels better than none [minus log likelihood].
         signals: of a vertical wall along the line [detector].
     """
@@ -86,6 +89,7 @@ class LowStep:
     height: float
     std: float
     width: float
+    bend: float
     gain: float
     signals: tuple[WallSignal, ...]
 
@@ -125,7 +129,7 @@ class _Strip:
         upper, lower: signal of the two sides there [detector, pixel].
         half: half the length of the line.
         walls: signal across a wall along the line [detector].
-        spot: standard deviation of the beam's spot.
+        spot: standard deviation of the beam's spot across the line; the raster stretches it along the beam's azimuth.
     """
 
     u: np.ndarray
@@ -155,15 +159,21 @@ class _Strip:
             sides.append(values[:, beside] @ weight.T / weight.sum(1))
         walls = tuple(LowWall.of(s, o, line.normal) for s, o in zip(signals, scan.openings, strict=True))
         std = np.sqrt(np.maximum(noise[:, inside], 0.0))
-        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, scan.spot)
+        spot = scan.spot * math.hypot(1.0, float(scan.beam_shift @ line.normal))
+        return cls(u[inside], w[inside], values[:, inside], std, sides[0], sides[1], half, walls, spot)
+
+    def distance(self, shift: float | np.ndarray, turn: float | np.ndarray, bend: float | np.ndarray) -> np.ndarray:
+        """Compute the distance from the line, shifted, turned and curved [..., pixel]."""
+        return self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
 
     def costs(self, walkers: np.ndarray) -> np.ndarray:
         """Compute minus the logarithm of the likelihood of every pixel [walker, pixel]; walkers as in `_prior`."""
         shift, turn, log_height, width, scatter, bend = (walkers[:, i, None] for i in range(6))
         height, width = np.exp(log_height), np.maximum(width, 1e-3)
-        u = self.u - shift - turn * self.w - bend * ((self.w / self.half) ** 2 - 1.0 / 3.0)
+        walls = range(len(self.walls))
         return self._over_edges(
-            u, lambda at: ((k, *self._signal(k, at, height, width, scatter)) for k in range(len(self.walls)))
+            self.distance(shift, turn, bend),
+            lambda at: ((k, *self._signal(k, at, height, width, scatter)) for k in walls),
         )
 
     def _over_edges(self, u: np.ndarray, signals: Callable[[np.ndarray], Iterable[_Modelled]]) -> np.ndarray:
@@ -199,34 +209,48 @@ class _Strip:
             model, is_wall = self.walls[k].profile(at, *wall)
             side = weight * np.where(at < 0.0, self.upper[k], self.lower[k])
             signal += side * model
-            error += side * np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
+            error += side * _model_error(model, is_wall)
         return signal, error
 
-    def gain_of_line(self) -> float:
+    def gain_of_line(self, bend: float) -> float:
         """Compute by how much a line of other signals, without a step, explains the pixels better than none.
 
-        Dirt and narrow ridges are such lines: each detector's signal in it is free.
+        Dirt and narrow ridges are such lines: each detector's signal in it is free, and as uncertain as on a wall.
         """
-        side = 0.5 * (self.upper + self.lower)
-        share, least = self.data / side, np.inf
+        u, least = self.distance(0.0, 0.0, bend), np.inf
         for start in np.arange(-1.0, 1.0, 0.05):
             for width in _LINE_WIDTHS:
-                inside = (self.u > start) & (self.u < start + width)
+                inside, end = (u > start) & (u < start + width), start + width
                 if inside.sum() < _LEAST_ON_LINE:
                     continue
-                level = np.median(share[:, inside], axis=1)
+                level = np.median(self.data[:, inside] / self._sides(u - start - 0.5 * width)[:, inside], axis=1)
 
-                def signals(at: np.ndarray, level=level, ends=(start, start + width)) -> Iterable[_Modelled]:
-                    is_line = (at > ends[0]) & (at < ends[1])
-                    return ((k, s * np.where(is_line, level[k], 1.0), _MODEL_ERROR * s) for k, s in enumerate(side))
+                def signals(at: np.ndarray, level=level, start=start, end=end) -> Iterable[_Modelled]:
+                    is_line = (at > start) & (at < end)
+                    for k, side in enumerate(self._sides(at - 0.5 * (start + end))):
+                        model = np.where(is_line, level[k], 1.0)
+                        yield k, side * model, side * _model_error(model, is_line)
 
-                least = min(least, float(self._over_edges(self.u, signals).sum()))
+                least = min(least, float(self._over_edges(u, signals).sum()))
         return float(self.without().sum()) - least
 
     def without(self) -> np.ndarray:
-        """Compute the same of a surface without a step [pixel]."""
-        far = np.array([[2.0 * (_FUZZ + self.spot + _NEAR), 0.0, 0.0, 0.1, 1.0, 0.0]])
-        return np.minimum(self.costs(far)[0], replace(self, upper=self.lower).costs(far)[0])
+        """Compute the same of a surface without a step: one side, or the two with a crease between them [pixel]."""
+
+        def costs(place: float) -> np.ndarray:
+            sides = self._sides(self.u - place)
+            return self._over_edges(self.u, lambda _: ((k, s, _MODEL_ERROR * s) for k, s in enumerate(sides)))
+
+        return min((costs(float(place)) for place in _CREASES), key=np.sum)
+
+    def _sides(self, u: np.ndarray) -> np.ndarray:
+        """Return the signal of the upper side where u < 0, and of the lower elsewhere [detector, pixel]."""
+        return np.where(u < 0.0, self.upper, self.lower)
+
+
+def _model_error(model: np.ndarray, is_wall: np.ndarray) -> np.ndarray:
+    """Return the error of a modelled signal; both in that of the level [..., pixel]."""
+    return np.where(is_wall, _WALL_ERROR * np.maximum(model, 0.3), _MODEL_ERROR)
 
 
 def _prior(walkers: np.ndarray, longest: float) -> np.ndarray:
@@ -356,13 +380,14 @@ def fit_step(ways: Sequence[Line], scan: Scan) -> LowStep | None:
         return None
     if len(ways) > 1:
         strip = _Strip.of(first.line, scan, first.signals)
-        if strip is None or strip.gain_of_line() > first.gain:
+        if strip is None or strip.gain_of_line(first.bend) > first.gain:
             return None
     further = (_one_chain(chosen, scan, seed, _GAIN) for seed in range(1, _CHAINS))
     chains = [first, *(low for low in further if low is not None)]
     best = max(chains, key=lambda low: low.gain)
     height, std = np.array([(low.height, low.std) for low in chains if low.gain > best.gain - _LOST]).T
-    return replace(best, height=float(height.mean()), std=float(np.sqrt(np.mean(std**2) + height.var())))
+    spread = height.var(ddof=1) if height.size > 1 else 0.0
+    return replace(best, height=float(height.mean()), std=float(np.sqrt(np.mean(std**2) + spread)))
 
 
 def _one_chain(line: Line, scan: Scan, seed: int, least_gain: float) -> LowStep | None:
@@ -387,6 +412,6 @@ def _one_chain(line: Line, scan: Scan, seed: int, least_gain: float) -> LowStep 
         drawn = points[costs < costs.min() + _LOST]
         height, width = np.exp(drawn[:, 2]), float(drawn[:, 3].mean())
         line = _moved(line, float(best[0]), float(best[1]))
-        found = LowStep(line, float(height.mean()), float(height.std()), width, gain, signals)
+        found = LowStep(line, float(height.mean()), float(height.std()), width, float(best[5]), gain, signals)
         line = _extended(line, scan, signals, np.array([0.0, 0.0, *best[2:]]))
     return found

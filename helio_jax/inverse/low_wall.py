@@ -9,6 +9,10 @@ elevation of the upper edge, tan e = h / x, and leaves it as one that the beam b
 between wall and level once more: they are those of a vertical wall in proportion to 1 - cos of the inclination, twice
 the probability that an atom goes from the wall to the level.
 
+An atom that leaves the wall goes to the level further away than where its depression is d with the probability
+(cos(i - d) - cos i) / 2, i: inclination of the wall; the level sends it to the points of the aperture that are not
+masked there. Further paths are those of a vertical wall in proportion to (1 - cos i)^2: they pass twice more.
+
 Source: own derivation; tests/inverse/test_low_steps.py.
 """
 
@@ -20,6 +24,8 @@ from helio_jax.inverse.wall_signal import Opening, WallSignal
 
 _NODES = 256
 """Intervals of the tables."""
+_WALL_NODES = 32
+"""Intervals of the table of multiple scattering on a wall, by inclination and by height."""
 
 
 class LowWall(NamedTuple):
@@ -30,7 +36,7 @@ class LowWall(NamedTuple):
         reach: distance from which on nothing is masked [heights]; unit of the arguments of `masked`.
         level: multiple scattering at the distance d from the foot of a vertical wall, less that of the paths that only
             the wall scatters, by d / (1 + d) [heights].
-        wall: multiple scattering on a vertical wall, by height above the foot over that of the wall.
+        wall: multiple scattering on a wall, by its inclination over 90 deg, and by height above the foot over its own.
         facet: direct signal of a wall, in that of the level, by its inclination over 90 deg.
         shift: t . n.
     """
@@ -51,7 +57,7 @@ class LowWall(NamedTuple):
         facet = np.maximum(np.cos(tilt) + np.sin(tilt) * (opening.tau @ normal), 0.0) @ opening.weight
         distance = t / np.maximum(1.0 - t, 1e-3)
         further = signal.on_level(distance) - _to_wall(distance, 1.0) * facet[-1]
-        return cls(signal.masked(reach * t), reach, further, signal.on_wall(t), facet, signal.shift)
+        return cls(signal.masked(reach * t), reach, further, _on_wall(signal), facet, signal.shift)
 
     def profile(
         self, u: np.ndarray, height: np.ndarray, width: np.ndarray, scatter: np.ndarray
@@ -68,7 +74,8 @@ class LowWall(NamedTuple):
         facet, more = _at(self.facet, tilt / (0.5 * np.pi)), 1.0 - np.cos(tilt)
         multiple = _to_wall(x, height) * facet + more * _at(self.level, x / (x + height))
         low = 1.0 - _at(self.masked, x / (height * self.reach)) + scatter * multiple
-        wall = facet + scatter * more * _at(self.wall, 1.0 - u / np.maximum(image, 1e-9))
+        above = 1.0 - u / np.maximum(image, 1e-9)
+        wall = facet + scatter * _at_both(self.wall, tilt / (0.5 * np.pi), above)
         is_wall = (u > 0.0) & (u < image)
         return np.where(u <= 0.0, 1.0, np.where(is_wall, wall, low)), is_wall
 
@@ -76,6 +83,28 @@ class LowWall(NamedTuple):
 def _to_wall(x: np.ndarray, height: np.ndarray | float) -> np.ndarray:
     """Compute the probability that an atom goes from the lower level to a wall, x from its upper edge."""
     return 0.5 * (1.0 - x / np.hypot(x, height))
+
+
+def _on_wall(signal: WallSignal) -> np.ndarray:
+    """Tabulate multiple scattering on a wall, as `LowWall.wall` [inclination, height]."""
+    t = np.linspace(0.0, 1.0, _WALL_NODES + 1)
+    tilt, z = 0.5 * np.pi * t[:, None, None], np.maximum(t, 1e-6)[None, :, None]
+    width = np.cos(tilt) / np.maximum(np.sin(tilt), 1e-6)
+    beyond = np.maximum(np.maximum(signal.q - width, 0.0) + width * z, 0.0)
+    depression = np.minimum(np.arctan2(z, beyond), tilt)
+    share = np.diff(signal.below, prepend=0.0)
+    first = 0.5 * (np.cos(tilt - depression) - np.cos(tilt)) @ share
+    further = (1.0 - np.cos(tilt[..., 0])) ** 2 * (signal.on_wall(t) - first[-1])
+    return first + further
+
+
+def _at_both(table: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Interpolate a table of two evenly spaced arguments from 0 to 1; s and t are broadcast."""
+    places = [np.clip(a, 0.0, 1.0) * (n - 1) for a, n in zip((s, t), table.shape, strict=True)]
+    (i, j) = (np.minimum(a.astype(np.intp), n - 2) for a, n in zip(places, table.shape, strict=True))
+    a, b = places[0] - i, places[1] - j
+    before, after = ((1.0 - b) * table[k, j] + b * table[k, j + 1] for k in (i, i + 1))
+    return (1.0 - a) * before + a * after
 
 
 def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -290,8 +290,20 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     other = stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=0.23, std=0.02)})
     of_both = several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:]))).stack
     n = len(stacks) - 1
-    assert of_both.instrument.law.exponent == pytest.approx((0.23 + 4 * n * 0.2) / (1 + 4 * n))
+    mean = (0.23 + 4 * n * 0.2) / (1 + 4 * n)
+    assert of_both.instrument.law.exponent == pytest.approx(mean)
     assert of_both.instrument.law.std == pytest.approx((0.02 + 4 * n * 0.01) / (1 + 4 * n))
+
+    def joined_law(*laws):
+        models = [stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=m, std=std)}) for m, std in laws]
+        stated_apart = [s.replace(instrument=model) for s, model in zip(stacks, models, strict=True)]
+        return several_scans.join_scans(MicrographSet(tuple(stated_apart))).stack.instrument.law
+
+    # chi-square 8 of 4 degrees of freedom: times the Birge ratio; two that disagree, neither the smallest nor largest
+    law = joined_law((0.2, 0.02), (0.28, 0.02), (0.24, 0.02), (0.24, 0.02), (0.24, 0.02))
+    assert law.std == pytest.approx(0.02 * 2.0**0.5)
+    with pytest.raises(InputFileError, match="must agree on the scattering law"):
+        joined_law((0.0, 0.2), (0.3, 0.2), (0.1, 0.001), (0.15, 0.001), (0.1, 0.2))
     other = other.model_copy(update={"law": CampaignLaw(exponent=0.3, std=0.02)})
     with pytest.raises(InputFileError, match="must agree on the scattering law"):
         several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:])))
