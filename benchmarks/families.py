@@ -159,7 +159,7 @@ def inner(mask: np.ndarray) -> np.ndarray:
     return mask
 
 
-def around(rec: Reconstruction, place: tuple[float, float]) -> np.ndarray:
+def apex_pixels(rec: Reconstruction, place: tuple[float, float]) -> np.ndarray:
     """Return the pixel nearest to a place and its eight neighbours, as a mask [y, x]."""
     x, y = (np.argmin(np.abs(axis - at)) for axis, at in zip((rec.raster_x, rec.raster_y), place, strict=True))
     where = np.zeros(rec.height.shape, bool)
@@ -177,7 +177,7 @@ def steps(member: Member, truth: np.ndarray, rec: Reconstruction) -> list[Case]:
     if not tops:
         y, x = np.unravel_index(np.argmax(np.abs(truth)), truth.shape)
         for place in member.apexes or ((rec.raster_x[x], rec.raster_y[y]),):
-            where = around(rec, place)
+            where = apex_pixels(rec, place)
             tops.append((float(np.mean(truth[where])), where))
     out = []
     for level, where in tops:

@@ -153,8 +153,9 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     """Return the scattering law of a sample by the scans that state one, as a weighted mean; None: none does.
 
-    Its standard deviation is the weighted mean of theirs, for what samples differ by is common to all scans of one; or,
-    where the laws differ by more, times the Birge ratio: the root of chi-square over the degrees of freedom.
+    Its standard deviation is the weighted mean of theirs, for what samples differ by is common to all scans of one.
+    Where the laws scatter by more, it is multiplied by the Birge ratio: the root of chi-square over the degrees of
+    freedom.
 
     Raises:
         InputFileError: two differ by more than `LAWS_DIFFER` standard deviations.

@@ -300,7 +300,7 @@ def _robust(residuals: np.ndarray) -> float:
 def _abrupt_end(pixels: _Pixels, height: float, side: float, spot: float) -> float:
     """Compute how much worse an abrupt far end fits than a penumbra: what ends abruptly, something else ends."""
     s = pixels.signal
-    mean = float(np.diff(s.below, prepend=0.0) @ s.q)
+    mean = float(s.weight @ s.q)
     sharp = replace(pixels, signal=replace(s, q=mean + 1e-3 * (s.q - mean)))
     factors = np.linspace(0.85, 1.15, 16)
     soft, hard = (min(_robust(_residuals(p, height * f, side, spot)[0]) for f in factors) for p in (pixels, sharp))

@@ -207,7 +207,7 @@ class _Strip:
         for node, weight in nodes:
             at = u + self.spot * node
             model, is_wall = self.walls[k].profile(at, *wall)
-            side = weight * np.where(at < 0.0, self.upper[k], self.lower[k])
+            side = weight * self._side(k, at)
             signal += side * model
             error += side * _model_error(model, is_wall)
         return signal, error
@@ -220,15 +220,16 @@ class _Strip:
         u, least = self.distance(0.0, 0.0, bend), np.inf
         for start in np.arange(-1.0, 1.0, 0.05):
             for width in _LINE_WIDTHS:
-                inside, end = (u > start) & (u < start + width), start + width
+                middle = start + 0.5 * width
+                inside = np.abs(u - middle) < 0.5 * width
                 if inside.sum() < _LEAST_ON_LINE:
                     continue
-                level = np.median(self.data[:, inside] / self._sides(u - start - 0.5 * width)[:, inside], axis=1)
+                share = [(data / self._side(k, u - middle))[inside] for k, data in enumerate(self.data)]
 
-                def signals(at: np.ndarray, level=level, start=start, end=end) -> Iterable[_Modelled]:
-                    is_line = (at > start) & (at < end)
-                    for k, side in enumerate(self._sides(at - 0.5 * (start + end))):
-                        model = np.where(is_line, level[k], 1.0)
+                def signals(at: np.ndarray, level=np.median(share, 1), middle=middle, half=0.5 * width):
+                    is_line = np.abs(at - middle) < half
+                    for k, brightness in enumerate(level):
+                        model, side = np.where(is_line, brightness, 1.0), self._side(k, at - middle)
                         yield k, side * model, side * _model_error(model, is_line)
 
                 least = min(least, float(self._over_edges(u, signals).sum()))
@@ -238,14 +239,14 @@ class _Strip:
         """Compute the same of a surface without a step: one side, or the two with a crease between them [pixel]."""
 
         def costs(place: float) -> np.ndarray:
-            sides = self._sides(self.u - place)
+            sides = [self._side(k, self.u - place) for k in range(len(self.walls))]
             return self._over_edges(self.u, lambda _: ((k, s, _MODEL_ERROR * s) for k, s in enumerate(sides)))
 
         return min((costs(float(place)) for place in _CREASES), key=np.sum)
 
-    def _sides(self, u: np.ndarray) -> np.ndarray:
-        """Return the signal of the upper side where u < 0, and of the lower elsewhere [detector, pixel]."""
-        return np.where(u < 0.0, self.upper, self.lower)
+    def _side(self, k: int, u: np.ndarray) -> np.ndarray:
+        """Return detector k's signal of the upper side where u < 0, and of the lower elsewhere [..., pixel]."""
+        return np.where(u < 0.0, self.upper[k], self.lower[k])
 
 
 def _model_error(model: np.ndarray, is_wall: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ Source: own derivation; tests/inverse/test_low_steps.py.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from helio_jax.inverse.wall_signal import Opening, WallSignal
 
@@ -71,11 +72,12 @@ class LowWall(NamedTuple):
         """
         image = np.maximum(width - height * self.shift, 0.0)
         x, tilt = np.maximum(u + height * self.shift, 0.0), np.arctan2(height, width)
-        facet, more = _at(self.facet, tilt / (0.5 * np.pi)), 1.0 - np.cos(tilt)
+        inclination = tilt / (0.5 * np.pi)
+        facet, more = _at(self.facet, inclination), 1.0 - np.cos(tilt)
         multiple = _to_wall(x, height) * facet + more * _at(self.level, x / (x + height))
         low = 1.0 - _at(self.masked, x / (height * self.reach)) + scatter * multiple
         above = 1.0 - u / np.maximum(image, 1e-9)
-        wall = facet + scatter * _at_both(self.wall, tilt / (0.5 * np.pi), above)
+        wall = facet + scatter * _at_both(self.wall, inclination, above)
         is_wall = (u > 0.0) & (u < image)
         return np.where(u <= 0.0, 1.0, np.where(is_wall, wall, low)), is_wall
 
@@ -90,21 +92,17 @@ def _on_wall(signal: WallSignal) -> np.ndarray:
     t = np.linspace(0.0, 1.0, _WALL_NODES + 1)
     tilt, z = 0.5 * np.pi * t[:, None, None], np.maximum(t, 1e-6)[None, :, None]
     width = np.cos(tilt) / np.maximum(np.sin(tilt), 1e-6)
-    beyond = np.maximum(np.maximum(signal.q - width, 0.0) + width * z, 0.0)
+    beyond = np.maximum(signal.q - width, 0.0) + width * z
     depression = np.minimum(np.arctan2(z, beyond), tilt)
-    share = np.diff(signal.below, prepend=0.0)
-    first = 0.5 * (np.cos(tilt - depression) - np.cos(tilt)) @ share
+    first = 0.5 * (np.cos(tilt - depression) - np.cos(tilt)) @ signal.weight
     further = (1.0 - np.cos(tilt[..., 0])) ** 2 * (signal.on_wall(t) - first[-1])
     return first + further
 
 
 def _at_both(table: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Interpolate a table of two evenly spaced arguments from 0 to 1; s and t are broadcast."""
-    places = [np.clip(a, 0.0, 1.0) * (n - 1) for a, n in zip((s, t), table.shape, strict=True)]
-    (i, j) = (np.minimum(a.astype(np.intp), n - 2) for a, n in zip(places, table.shape, strict=True))
-    a, b = places[0] - i, places[1] - j
-    before, after = ((1.0 - b) * table[k, j] + b * table[k, j + 1] for k in (i, i + 1))
-    return (1.0 - a) * before + a * after
+    places = [a * (n - 1) for a, n in zip(np.broadcast_arrays(s, t), table.shape, strict=True)]
+    return map_coordinates(table, places, order=1, mode="nearest")
 
 
 def _at(table: np.ndarray, t: np.ndarray) -> np.ndarray:

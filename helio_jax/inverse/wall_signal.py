@@ -101,6 +101,11 @@ class WallSignal:
     slant: tuple[float, float]
 
     @property
+    def weight(self) -> np.ndarray:
+        """Fraction of the level's direct signal that goes to each point of `q`."""
+        return np.diff(self.below, prepend=0.0)
+
+    @property
     def strip(self) -> float:
         """Width of the wall's image along n; 0 where the beam does not see it."""
         return max(-self.shift, 0.0)
@@ -113,8 +118,7 @@ class WallSignal:
     @property
     def length(self) -> float:
         """Mean length of the dark band along n, the wall's image included."""
-        weight = np.diff(self.below, prepend=0.0)
-        return self.strip + float(weight @ np.maximum(self.q - max(self.shift, 0.0), 0.0))
+        return self.strip + float(self.weight @ np.maximum(self.q - max(self.shift, 0.0), 0.0))
 
     def masked(self, d: np.ndarray) -> np.ndarray:
         """Return the masked fraction of the aperture at distances from the foot."""

@@ -93,8 +93,8 @@ def test_glow_below_a_wall(slope, limit):
 def test_multiple_scattering_on_a_wall_that_faces_the_beam(slope):
     """As traced, within 3 % of the level's signal everywhere on the wall; noise 1 %.
 
-    It rejects that of a vertical wall times 1 - cos: up to 0.06 too dark above the foot in the detector that the wall
-    faces away from, for a mask that a slope does not cast, and up to 0.06 too bright in the others.
+    It rejects that of a vertical wall times 1 - cos: 0.05 to 0.15 too dark above the foot in the detector that the wall
+    faces away from, for a mask that a slope does not cast, and too bright in the others.
     """
     height, run = 20.0, 20.0 / math.tan(math.radians(slope))
     step = {"sample.height_um": height, "sample.position_um": 0.0, "sample.slope_deg": slope}

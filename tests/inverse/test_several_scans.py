@@ -290,8 +290,7 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     other = stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=0.23, std=0.02)})
     of_both = several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:]))).stack
     n = len(stacks) - 1
-    mean = (0.23 + 4 * n * 0.2) / (1 + 4 * n)
-    assert of_both.instrument.law.exponent == pytest.approx(mean)
+    assert of_both.instrument.law.exponent == pytest.approx((0.23 + 4 * n * 0.2) / (1 + 4 * n))
     assert of_both.instrument.law.std == pytest.approx((0.02 + 4 * n * 0.01) / (1 + 4 * n))
 
     def joined_law(*laws):
