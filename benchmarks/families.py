@@ -13,7 +13,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -159,12 +159,15 @@ def inner(mask: np.ndarray) -> np.ndarray:
     return mask
 
 
-def apex_pixels(rec: Reconstruction, place: tuple[float, float]) -> np.ndarray:
-    """Return the pixel nearest to a place and its eight neighbours, as a mask [y, x]."""
-    x, y = (np.argmin(np.abs(axis - at)) for axis, at in zip((rec.raster_x, rec.raster_y), place, strict=True))
-    where = np.zeros(rec.height.shape, bool)
-    where[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2] = True
-    return where
+def apex_pixels(member: Member, truth: np.ndarray, rec: Reconstruction) -> Iterator[np.ndarray]:
+    """Return the pixel that sees each apex of a member, or the highest point, and its neighbours, as masks [y, x]."""
+    beams = [np.array(place) + height * np.array(rec.instrument.beam_shift) for *place, height in member.apexes]
+    axes = rec.raster_y, rec.raster_x
+    pixels = [tuple(int(np.argmin(np.abs(axis - b))) for axis, b in zip(axes, at[::-1], strict=True)) for at in beams]
+    for y, x in pixels or [np.unravel_index(np.argmax(np.abs(truth)), truth.shape)]:
+        where = np.zeros(truth.shape, bool)
+        where[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2] = True
+        yield where
 
 
 def steps(member: Member, truth: np.ndarray, rec: Reconstruction) -> list[Case]:
@@ -175,10 +178,7 @@ def steps(member: Member, truth: np.ndarray, rec: Reconstruction) -> list[Case]:
         return []
     tops = [(level, inner(np.abs(truth - level) < near)) for level in member.levels if level]
     if not tops:
-        y, x = np.unravel_index(np.argmax(np.abs(truth)), truth.shape)
-        for place in member.apexes or ((rec.raster_x[x], rec.raster_y[y]),):
-            where = apex_pixels(rec, place)
-            tops.append((float(np.mean(truth[where])), where))
+        tops = [(float(np.median(truth[where])), where) for where in apex_pixels(member, truth, rec)]
     out = []
     for level, where in tops:
         if not where.any() or not base.any():

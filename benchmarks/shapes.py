@@ -41,7 +41,8 @@ class Member:
         mesh: the sample's solid, or None.
         map: x [x], y [y], height [y, x] of a height map, or None, um.
         levels: heights of the level patches that are scored, the substrate's apart [um].
-        apexes: places [um] of the objects that are scored where there are no such levels; none: the highest point.
+        apexes: places x, y, z [um] of the tops of the objects that are scored where there are no such levels; none: the
+            highest point.
         border: what reconstruction may assume.
         about: the numbers drawn, for tables.
         world: name of a disturbance of the micrographs (`benchmarks/families.py`), or "".
@@ -52,7 +53,7 @@ class Member:
     mesh: manifold3d.Manifold | None = None
     map: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     levels: tuple[float, ...] = ()
-    apexes: tuple[tuple[float, float], ...] = ()
+    apexes: tuple[tuple[float, float, float], ...] = ()
     border: str = "flat"
     about: Tables = field(default_factory=dict)
     world: str = ""
@@ -386,7 +387,7 @@ def albedo(rng: Rng, scan: Scan) -> Member:
     top = max(s["cap_height_um"] for s in spheres)
     ratios = [round(m["albedo"] / SUBSTRATE_ALBEDO, 2) for m in list(materials.values())[1:]]
     about = {"top_um": top, "height_um": top, "kind": f"albedo {ratios}", "atoms_factor": 1.0 / SUBSTRATE_ALBEDO}
-    apexes = tuple((s["center_um"][0], s["center_um"][1]) for s in spheres)
+    apexes = tuple((s["center_um"][0], s["center_um"][1], s["cap_height_um"]) for s in spheres)
     return Member("", {"sample": sample, "material": materials}, apexes=apexes, about=about)
 
 

@@ -65,10 +65,14 @@ class CampaignReadout(Settings):
         return self
 
 
+MAX_LAW_STD = 1.0
+"""Largest standard deviation of the exponent of a law that is stated."""
+
+
 class CampaignLaw(Settings):
     """Scattering law of the samples of a measuring campaign, cos^(1 + m): table `[law]` of an instrument file."""
 
     exponent: float = Field(gt=-1.0, le=50.0)
     """m; 0 is the cosine law."""
-    std: float = Field(gt=0.0, le=1.0)
+    std: float = Field(gt=0.0, le=MAX_LAW_STD)
     """Standard deviation of m, that between samples included."""

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import as_json, pitch
-from helio_jax.campaign import CampaignLaw
+from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.instrument import Detector, Instrument
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
@@ -153,14 +153,15 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     """Return the scattering law of a sample by the scans that state one, as a weighted mean; None: none does.
 
-    Its standard deviation is the weighted mean of theirs, for what samples differ by is common to all scans of one.
-    Where the laws scatter by more, it is multiplied by the Birge ratio: the root of chi-square over the degrees of
-    freedom.
+    Scans that state the same law share its measurement, which counts once. The standard deviation is the weighted mean
+    of theirs, for what samples differ by is common to all scans of one. Where the laws scatter by more, it is
+    multiplied by the Birge ratio: the root of chi-square over the degrees of freedom.
 
     Raises:
-        InputFileError: two differ by more than `LAWS_DIFFER` standard deviations.
+        InputFileError: two differ by more than `LAWS_DIFFER` standard deviations, or all tell next to nothing.
     """
-    stated = [(s.name, s.instrument.law) for s in stacks if s.instrument.law is not None]
+    known = {s.instrument.law: s.name for s in reversed(stacks) if s.instrument.law is not None}
+    stated = [(name, law) for law, name in reversed(known.items())]
     if not stated:
         return None
     for (one, a), (other, b) in itertools.combinations(stated, 2):
@@ -170,10 +171,17 @@ def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
                 f"{one!r} and {b.exponent:g} +- {b.std:g} of {other!r}: correct or remove the tables [law] of their "
                 f"instrument files (limit {LAWS_DIFFER:g} standard deviations)"
             )
-    exponent, std = np.array([(law.exponent, law.std) for _, law in stated]).T
-    mean, own = (float(np.average(values, weights=std**-2.0)) for values in (exponent, std))
-    birge = math.sqrt(float(np.sum(((exponent - mean) / std) ** 2)) / max(len(stated) - 1, 1))
-    return CampaignLaw(exponent=mean, std=own * max(1.0, birge))
+    exponent, stds = np.array([(law.exponent, law.std) for _, law in stated]).T
+    mean, own = (float(np.average(values, weights=stds**-2.0)) for values in (exponent, stds))
+    birge = math.sqrt(float(np.sum(((exponent - mean) / stds) ** 2)) / max(len(stated) - 1, 1))
+    std = own * max(1.0, birge)
+    if std > MAX_LAW_STD:
+        names = ", ".join(repr(name) for name, _ in stated)
+        raise InputFileError(
+            f"scans that are joined: their scattering laws together know m to {std:.2g} only (limit {MAX_LAW_STD:g}): "
+            f"correct or remove the tables [law] of the instrument files of {names}"
+        )
+    return CampaignLaw(exponent=mean, std=std)
 
 
 def _calibration(stacks: Sequence[MicrographStack]) -> Calibration | None:

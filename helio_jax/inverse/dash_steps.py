@@ -8,7 +8,7 @@ import numpy as np
 from helio_jax.inverse.band_fit import LEAST_MASK, kind_of
 from helio_jax.inverse.dash_lines import Line, find_dashes, find_line
 from helio_jax.inverse.edge_place import Images
-from helio_jax.inverse.low_steps import SHAPE_STD, LowStep, Scan, fit_step
+from helio_jax.inverse.low_steps import LowStep, Scan, fit_step
 from helio_jax.inverse.mask_edges import Edge
 from helio_jax.inverse.step_records import BandRow, Step
 from helio_jax.inverse.wall_signal import Opening
@@ -94,7 +94,7 @@ def _records(
 ) -> tuple[Edge, Step, tuple[BandRow, ...]]:
     """Turn a low step into records; lengths in um."""
     line, height = low.line, side * low.height
-    std = math.hypot(side * low.std, SHAPE_STD * height)
+    std = math.hypot(side * low.std, low.shape_std * height)
     dark = tuple(k for k, s in enumerate(low.signals) if kind_of(s) == "dark")
     lengths = [s.length for s in low.signals]
     if not dark and max(lengths) > LEAST_MASK:

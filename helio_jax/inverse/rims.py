@@ -1,9 +1,11 @@
 """Rims: where a dome meets a level surface, steeper at its rim than further up.
 
-Half balls, ellipsoids and caps rise in the edge that holds their rim by more than the trapezoid rule says: the slope at
-a distance t from the rim is c / sqrt(t + r), r = 0 where the tangent at the rim is vertical, r = infinity where the
-slope is constant (a cone, a wall). Where in its edge a rim lies, and how steep the rim itself is, follows to some
-extent from the slopes of the first two pixels within; what they do not tell of r is common to a whole outline.
+Half balls, ellipsoids and caps rise in the edge that holds their rim by more than the trapezoid rule says. A row or
+column cuts them in an ellipse: the slope at a distance t from the rim is c (1 - t / L) / sqrt(t (1 - t / 2 L) + r), L
+the distance of the crest from the rim, r = 0 where the tangent at the rim is vertical, r = infinity on a parabola. Of a
+cone or a wall the slope is constant (L and r infinite). Where in its edge a rim lies, and how steep the rim itself is,
+follows to some extent from the slopes of the first pixels within; what they do not tell of r is common to a whole
+outline.
 
 The first pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
 """
@@ -15,26 +17,39 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 from scipy.special import logsumexp, softmax
 
-from helio_jax.forward.surface import Surface
+from helio_jax.forward.surface import Surface, along
 
-OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 3.0, 5.0, 100.0]) ** 2
-"""Values of r that are compared, in pixels; the rise in an edge goes with the root of r, and the last stands for a
-constant slope."""
+OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 3.0, 5.0, 100.0, 100.0]) ** 2
+"""Values of r that are compared, in pixels; the rise in an edge goes with the root of r. The last two have no rim: a
+parabola and, with the crest at infinity, a constant slope."""
+N_WITHIN = 4
+"""So many pixels within a rim are compared."""
+LEAST_CREST = 1.5
+"""Least distance of the crest from the first pixel, in pixels: rows that cut less of an outline hold no profile."""
+NEAR_CREST = 0.8
+"""Distance over that of the crest from which on slopes are not compared: ellipses fit domes at their rims."""
+FIRST_ERROR = 0.25
+"""Standard deviation of the first slope within over 1 + slope^2: the steepest, and masks and multiple scattering follow
+from where the rim lies."""
 N_DISTANCES = 24
 """Distances of the first pixel from the rim, equally likely, over which is averaged."""
 LEVEL = 0.25, 0.8
 """Largest slopes of the second and of the first pixel outside, over that of the first within."""
-LEVEL_STD = 2.5
-"""Largest median slope of the second pixels outside an outline, in standard deviations: rough surfaces have no rims."""
+LEVEL_STD, LEVEL_SHARE = 2.5, 0.06
+"""Largest median slope of the second pixels outside an outline: in standard deviations, added in square to a share of
+the first within, by which steep rims disturb them. Rough surfaces have no rims."""
 LEAST_SLOPE = 4.0
 """Least slope of the first pixel within, in standard deviations."""
 WALL = 0.25
 """Least slope of the second pixel within, over that of the first: below it the first is on a wall."""
 RISING = 2.0
 """Where the slope rises from the first pixel to the second by more standard deviations, the rim is further within."""
+CROSSING = 0.5
+"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of its
+rim."""
 LEAST_EDGES = 8
 """Shorter outlines have no rim."""
-N_INDEPENDENT = 2.0
+N_INDEPENDENT = 8.0
 """So many edges of an outline count as independent: errors of the fitted slopes agree along it."""
 DECISIVE = 0.75
 """Least logarithm of the evidence for a rim against a constant slope."""
@@ -86,6 +101,37 @@ class AxisRims:
         self.common[place] = sign * between
         self.outline[place] = number
 
+    def loosen(
+        self,
+        region: np.ndarray,
+        inside: np.ndarray,
+        number: int,
+        slopes: tuple[np.ndarray, np.ndarray],
+        steepness: float,
+        axis: int,
+    ) -> None:
+        """Give the other edges in the region of an outline the standard deviation of a kink, or rim, anywhere in them.
+
+        Where an outline runs along the raster, rows or columns that touch it hold no profile. The slope along such an
+        edge says little of its rise, which follows from where the rim cuts it. So a kink goes by the whole change of
+        slope, and an edge that crosses the outline by the slope of its rim: a few of them with small errors would hold
+        the level of all that the outline surrounds.
+
+        Args:
+            region: of the outline [y, x].
+            inside: pixels within it, near the rim [y, x].
+            number: of the outline.
+            slopes: along x and y [y, x].
+            steepness: slope of the rim.
+            axis: of the edges.
+        """
+        before, after = along(region, axis)
+        place = (before | after) & ~self.is_rim
+        kink = np.hypot(*(np.diff(s, axis=axis) for s in slopes)) / np.sqrt(12.0)
+        crosses = np.logical_xor(*along(inside, axis))
+        self.sigma[place] = np.hypot(kink, np.where(crosses, CROSSING * steepness, 0.0))[place]
+        self.outline[place] = number
+
 
 @dataclass(frozen=True)
 class RimEdges:
@@ -104,34 +150,64 @@ class RimEdges:
     evidence: np.ndarray
 
 
-def rises(first: np.ndarray, second: np.ndarray, first_std: np.ndarray, second_std: np.ndarray) -> RimEdges:
-    """Compute the rises beside rims from the slopes of the first and the second pixel within [edge].
+def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float) -> RimEdges:
+    """Compute the rises beside rims from the slopes of the pixels within.
 
-    The distance d of the first pixel from the rim is uniform in (0, 1) pixels, c has a scale-free prior.
+    The distance d of the first pixel from the rim is uniform in (0, 1) pixels, c has a scale-free prior. Sections of
+    one ellipsoid share the product of r and L.
 
     Args:
-        first, second: slopes away from the rim [edge].
-        first_std, second_std: their standard deviations [edge].
+        slope: slopes away from the rim, of the first and the following pixels [edge, pixel].
+        std: their standard deviations; infinite: not known [edge, pixel].
+        crest: distance of the crest from the first pixel, in pixels [edge].
+        typical: distance L of an edge whose r is one of `OFFSETS`, in pixels.
 
     Source: own derivation, tests/inverse/test_rims.py.
     """
-    d = (np.arange(N_DISTANCES) + 0.5) / N_DISTANCES
+    d = ((np.arange(N_DISTANCES) + 0.5) / N_DISTANCES)[:, None]
+    ahead = np.arange(slope.shape[1])
     per_offset = []
-    s1, s2, i1, i2 = (a[:, None] for a in (first, second, first_std**-2, second_std**-2))
-    for r in OFFSETS:
-        at_rim, at_first, at_second = np.sqrt(r), np.sqrt(d + r), np.sqrt(1.0 + d + r)
-        information = i1 / at_first**2 + i2 / at_second**2
-        c = (i1 * s1 / at_first + i2 * s2 / at_second) / information
-        chi_square = i1 * (s1 - c / at_first) ** 2 + i2 * (s2 - c / at_second) ** 2
+    for number, r in enumerate(OFFSETS):
+        length = crest[:, None, None] + d
+        offset = r * typical / length
+        profile = _Profile(offset, np.full_like(length, 1e6) if number == len(OFFSETS) - 1 else length)
+        at = profile.slope(d + ahead)
+        inverse = np.where((ahead < 2) | (ahead < NEAR_CREST * crest[:, None]), 1.0 / std, 0.0)[:, None]
+        information = np.sum((inverse * at) ** 2, 2)
+        c = np.sum(inverse**2 * at * slope[:, None], 2) / information
+        chi_square = np.sum((inverse * (slope[:, None] - c[..., None] * at)) ** 2, 2)
         log_weight = -0.5 * (chi_square + np.log(information)) - np.log(np.abs(c) + 1e-12)
         weight = softmax(log_weight, axis=1)
+        to_rim, to_first, to_second = (profile.rise(t)[..., 0] for t in (0.0 * d, d, 1.0 + d))
         moments = []
-        for length in (2.0 * (at_first - at_rim), 2.0 * (at_second - at_first)):
-            mean = np.sum(weight * c * length, axis=1)
-            variance = np.sum(weight * ((c * length - mean[:, None]) ** 2 + length**2 / information), axis=1)
+        for rise in (to_first - to_rim, to_second - to_first):
+            mean = np.sum(weight * c * rise, axis=1)
+            variance = np.sum(weight * ((c * rise - mean[:, None]) ** 2 + rise**2 / information), axis=1)
             moments += [mean, variance]
         per_offset.append((*moments, logsumexp(log_weight, axis=1) - np.log(N_DISTANCES)))
     return RimEdges(*(np.array(part) for part in zip(*per_offset, strict=True)))
+
+
+class _Profile(NamedTuple):
+    """Section of a dome, by the distance t from its rim, for c = 1.
+
+    Attributes:
+        r: offset.
+        crest: distance L of the crest from the rim.
+    """
+
+    r: np.ndarray
+    crest: np.ndarray
+
+    def slope(self, t: np.ndarray) -> np.ndarray:
+        """Compute slopes at distances up to that of the crest."""
+        t = np.minimum(t, self.crest)
+        return (1.0 - t / self.crest) / np.sqrt(t * (1.0 - 0.5 * t / self.crest) + self.r)
+
+    def rise(self, t: np.ndarray) -> np.ndarray:
+        """Compute heights at distances up to that of the crest, above one that does not depend on them."""
+        t = np.minimum(t, self.crest)
+        return 2.0 * np.sqrt(t * (1.0 - 0.5 * t / self.crest) + self.r)
 
 
 class _Candidates(NamedTuple):
@@ -139,18 +215,18 @@ class _Candidates(NamedTuple):
 
     Attributes:
         y, x: rows and columns.
-        first, second: slopes of the first and the second pixel within.
-        first_std, second_std: their standard deviations.
+        slope: slopes of the first pixels within [candidate, pixel].
+        std: their standard deviations; infinite: beyond the crest or the border [candidate, pixel].
+        crest: distance of the crest from the first, in pixels.
         outer: slope of the first pixel outside.
-        beyond: size of the slope of the second pixel outside, in standard deviations.
+        beyond: size of the slope of the second pixel outside, over the largest of level pixels.
     """
 
     y: np.ndarray
     x: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    first_std: np.ndarray
-    second_std: np.ndarray
+    slope: np.ndarray
+    std: np.ndarray
+    crest: np.ndarray
     outer: np.ndarray
     beyond: np.ndarray
 
@@ -180,27 +256,42 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
     for number in range(1, n_outlines + 1):
         mine = {way: c.only(outlines[c.y, c.x] == number) for way, c in found.items()}
         beyond = np.concatenate([c.beyond for c in mine.values()])
-        if len(beyond) < LEAST_EDGES or np.median(beyond) > LEVEL_STD:
+        if len(beyond) < LEAST_EDGES or np.median(beyond) > 1.0:
             continue
-        beside = {way: rises(c.first, c.second, c.first_std, c.second_std) for way, c in mine.items()}
+        typical = 0.5 + float(np.median(np.concatenate([c.crest for c in mine.values()])))
+        beside = {way: rises(c.slope, c.std, c.crest, typical) for way, c in mine.items()}
         evidence = np.sum([b.evidence.sum(1) for b in beside.values()], axis=0)
         evidence = evidence * min(1.0, N_INDEPENDENT / len(beyond))
-        if np.max(evidence) - evidence[-1] < DECISIVE:
+        if np.max(evidence[:-2]) - np.max(evidence[-2:]) < DECISIVE:
             continue
         probability = softmax(evidence)
         for (axis, sign), c in mine.items():
+            first, second = c.slope[:, 0], c.slope[:, 1]
             b, level = beside[axis, sign], np.zeros((len(OFFSETS), len(c.y)))
             parts = (
                 (-1, c.outer, level, level + c.outer**2 / 12.0),
-                (0, c.outer + c.first, b.rise, b.variance),
-                (1, c.first + c.second, b.next_rise, b.next_variance),
+                (0, c.outer + first, b.rise, b.variance),
+                (1, first + second, b.next_rise, b.next_variance),
             )
             for step, sum_of_ends, rise, variance in parts:
                 # edges are numbered by their first pixel along the axis
                 move = step - 1 if sign > 0 else -step
                 place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
                 out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
+        steepness = float(np.median(np.abs(np.concatenate([c.slope[:, 0] for c in mine.values()]))))
+        for axis, rims in out.items():
+            rims.loosen(outlines == number, _inside(mine, steep.shape), number, slopes, steepness, axis)
     return out[1], out[0]
+
+
+def _inside(found: dict[tuple[int, int], _Candidates], shape: tuple[int, ...]) -> np.ndarray:
+    """Mark the pixels near the rim that are within an outline, by its candidates of each (axis, sign) [y, x]."""
+    out = np.zeros(shape, bool)
+    for (axis, sign), c in found.items():
+        edge, ahead = np.nonzero(np.isfinite(c.std))
+        move = sign * ahead
+        out[c.y[edge] + move * (axis == 0), c.x[edge] + move * (axis == 1)] = True
+    return out
 
 
 def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> _Candidates:
@@ -214,7 +305,21 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     further = np.sign(s[:, first]) * s[:, second]
     is_rim &= (further > WALL * size) & (further < size + RISING * np.hypot(e[:, first], e[:, second]))
     row, column = np.nonzero(is_rim)
-    at, after = (row, column + 2), (row, column + 3)
-    along = column + 2 if sign > 0 else s.shape[1] - 1 - (column + 2)
+    first = column + 2
+    distance = np.arange(s.shape[1]) - first[:, None]
+    rise = np.sign(s[row, first])[:, None] * s[row]  # along the whole row, upwards from its rim
+    crest = np.where((distance > 0) & (rise <= 0.0), distance, s.shape[1] - first[:, None]).min(axis=1)
+    before = crest - 1 + first
+    falls = first + crest < s.shape[1]
+    last, after = (rise[np.arange(len(row)), np.minimum(k, s.shape[1] - 1)] for k in (before, before + 1))
+    crest = crest - np.where(falls, -after / np.maximum(last - after, 1e-12), 0.0)
+    ahead = first[:, None] + np.arange(N_WITHIN)
+    is_known = (ahead < s.shape[1]) & (np.arange(N_WITHIN) < np.maximum(crest[:, None], 2.0))
+    ahead = np.minimum(ahead, s.shape[1] - 1)
+    std = np.where(is_known, e[row[:, None], ahead], np.inf)
+    std[:, 0] = np.hypot(std[:, 0], FIRST_ERROR * (1.0 + t[row, first] ** 2))
+    along = first if sign > 0 else s.shape[1] - 1 - first
     place = (row, along) if axis == 1 else (along, row)
-    return _Candidates(*place, s[at], s[after], e[at], e[after], s[row, column + 1], (t / e)[row, column])
+    level = np.hypot(LEVEL_STD * e[row, column], LEVEL_SHARE * s[row, first])
+    found = _Candidates(*place, s[row[:, None], ahead], std, crest, s[row, column + 1], t[row, column] / level)
+    return found.only(crest > LEAST_CREST)

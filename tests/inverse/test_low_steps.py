@@ -2,8 +2,10 @@
 
 import math
 
+import manifold3d
 import numpy as np
 import pytest
+import trimesh
 
 import helio_jax as hx
 from helio_jax.forward.optics import Raster
@@ -20,6 +22,7 @@ from helio_jax.workflows.scene_file import load_scene
 from tests.inverse.test_mask_bands import NORMAL, OBLIQUE, unit
 
 PITCH, N = 10.0, 61
+SCAN = {"scan.nx": N, "scan.ny": N, "scan.pixel_size_um": PITCH, "scan.pitch": "sample"}
 
 
 def ramp_share(aperture, instrument, normal, u, height, width):
@@ -123,9 +126,12 @@ def traced(turn, height, width=0.0, instrument=OBLIQUE) -> MicrographStack:
     """Trace a straight ramp step [pixels] through the image that falls towards `turn` [deg]; SNR 60."""
     slope = math.degrees(math.atan2(height, width))
     step = {"sample.height_um": PITCH * height, "sample.slope_deg": slope, "sample.facing_deg": turn % 360.0}
-    scan = {"scan.nx": N, "scan.ny": N, "scan.pixel_size_um": PITCH, "scan.pitch": "sample"}
     more = {"sample.position_um": 0.3 * PITCH, "beam.incidence_deg": instrument.beam.incidence_deg}
-    scene = load_scene("step", step | scan | more)
+    return counts_of(load_scene("step", SCAN | step | more), turn, instrument)
+
+
+def counts_of(scene, turn, instrument) -> MicrographStack:
+    """Trace a scene; SNR 60, its noise by the direction of the step [deg]."""
     image = hx.simulate(scene, rays=8, branches=32, seed=1).only()
     signal = image.counts / np.median(image.counts, axis=(1, 2), keepdims=True)
     noise = 1.0 / 60.0
@@ -180,6 +186,24 @@ def test_a_low_step_that_faces_away_is_measured(turn, height):
     numbers, anchors = anchors_of_steps(found, flat, raster, region)
     ((height_um, _),) = anchors.known_steps(np.where(found.patch == step.above, 1, 0)).values()
     assert numbers == (step.number,) and abs(height_um) == pytest.approx(step.height_um)
+
+
+def test_a_wall_of_two_facets_that_faces_away_has_wide_error_bars(tmp_path):
+    """Traced counts: the beam sees the upper facet at a glancing angle. Within 3 standard deviations of at most 40 %.
+
+    Catches error bars for plane walls alone: 0.178 +- 0.029 pixels, truly 0.3.
+    """
+    turn, height, width = 20.0, 0.3, 0.4
+    profile = [(-70.0, 0.0), (0.0, 0.0), (0.3 * width, -0.65 * height), (width, -height), (70.0, -height)]
+    outline = PITCH * np.array([(70.0, -10.0), *profile[::-1], (-70.0, -10.0)])
+    prism = manifold3d.Manifold.extrude(manifold3d.CrossSection([outline]), 140.0 * PITCH)
+    solid = prism.translate([0.0, 0.0, -70.0 * PITCH]).rotate([90.0, 0.0, 0.0]).rotate([0.0, 0.0, turn]).to_mesh64()
+    mesh = trimesh.Trimesh(np.asarray(solid.vert_properties)[:, :3], np.asarray(solid.tri_verts))
+    mesh.export(tmp_path / "facets.ply")
+    sample = {"kind": "mesh", "file": str(tmp_path / "facets.ply"), "unit": "um"}
+    found = find_steps(counts_of(load_scene("step", SCAN | {"sample": sample}), turn, OBLIQUE))
+    (step,) = [s for s in found.steps if s.is_used]
+    assert abs(step.height_um - PITCH * height) < 3.0 * step.height_std_um < 3.0 * 0.4 * PITCH * height
 
 
 def test_a_high_step_that_faces_away_is_not_measured_by_its_glow():

@@ -59,16 +59,44 @@ def excess(surface: Surface, axis: int) -> np.ndarray:
 
 
 def test_rises_in_closed_form():
-    """A slope of c / sqrt(t) rises by 2 c sqrt(d) to the first pixel; a constant slope s by s / 2 +- s / sqrt(12)."""
-    d, c = np.array([0.1, 0.4, 0.9]), 0.6
-    std = np.full(3, 1e-3)
-    steepest = rises(c / np.sqrt(d), c / np.sqrt(1.0 + d), std, std)
-    np.testing.assert_allclose(steepest.rise[0], 2.0 * c * np.sqrt(d), rtol=0.05)
-    np.testing.assert_allclose(steepest.next_rise[0], 2.0 * c * (np.sqrt(1.0 + d) - np.sqrt(d)), rtol=0.05)
-    even = rises(np.full(1, 0.5), np.full(1, 0.5), std[:1], std[:1])
+    """Sections of half balls rise by their height at d and 1 + d; a constant slope s rises by s / 2 +- s / sqrt(12).
+
+    The crests differ from section to section; without what they have in common, r L, no r fits all of them.
+    """
+    d, crest = np.array([0.1, 0.4, 0.9, 0.6]), np.array([12.0, 9.0, 5.0, 3.0])
+    at = d[:, None] + np.arange(4)
+    std = np.full((4, 4), 1e-3)
+    for number, cut in ((0, 0.0), (5, OFFSETS[5] * 9.0)):  # r L
+        length = crest + d
+
+        def height(t, length=length, cut=cut):
+            return np.sqrt(2.0 * length * t - t**2 + 2.0 * cut)
+
+        slope = (length[:, None] - at) / height(at, length[:, None])
+        found = rises(slope, std, crest, 9.0)
+        assert np.argmax(found.evidence.sum(1)) == number
+        np.testing.assert_allclose(found.rise[number], height(d) - height(0.0 * d), rtol=0.06)
+        np.testing.assert_allclose(found.next_rise[number], height(1.0 + d) - height(d), rtol=0.03)
+    even = rises(np.full((1, 4), 0.5), std[:1], np.full(1, 12.0), 12.0)
     assert np.argmax(even.evidence[:, 0]) == len(OFFSETS) - 1
     np.testing.assert_allclose(even.rise[-1], 0.25, rtol=1e-2)
     np.testing.assert_allclose(np.sqrt(even.variance[-1]), 0.5 / np.sqrt(12.0), rtol=1e-2)
+
+
+def test_no_edge_holds_the_level_within_an_outline():
+    """Every edge across the outline is uncertain, also where the outline runs along the raster.
+
+    There the slope along an edge is small, and with it the error by a kink: single edges held the level of a dome to
+    a hundredth of a pixel, and rises in all others counted for nothing.
+    """
+    surface = dome(18.4, 15.0)
+    inside = np.hypot(X, Y) < 18.4
+    for rims, axis in zip(find_rims(noisy(surface, 1), NOISE), (1, 0), strict=True):
+        across = np.diff(inside, axis=axis)
+        assert np.all(rims.outline[across] > 0)
+        assert rims.sigma[across].min() > 0.15
+        information = rims.sigma[across] ** -2.0
+        assert information.max() < 0.2 * information.sum()
 
 
 @pytest.mark.parametrize("sign", (1.0, -1.0))
@@ -77,7 +105,7 @@ def test_rim_of_a_dome_rises_by_more_than_the_trapezoid_rule(sign):
     surface = dome(18.4, 5.0 * sign)
     found = find_rims(noisy(surface, 1), NOISE)
     for rims, axis in zip(found, (1, 0), strict=True):
-        at = rims.outline > 0
+        at = rims.common != 0.0
         assert 100 < at.sum() < 300
         towards = np.sign(np.where(at, np.diff(surface.height, axis=axis), 0.0))
         true, expected, common = (np.sum(towards * f) for f in (excess(surface, axis), rims.gap, rims.common))
@@ -97,12 +125,13 @@ def test_no_rims_where_slopes_are_even(seed):
 
 
 @pytest.mark.slow
-def test_height_of_a_traced_low_dome(tmp_path: Path):
-    """A half ellipsoid of a sixth of its foot's radius: within 2.5 stated standard deviations and 5 % of its height.
+@pytest.mark.parametrize(("rise", "limit"), ((34.0, 0.05), (140.0, 0.06)))
+def test_height_of_a_traced_dome(rise: float, limit: float, tmp_path: Path):
+    """Half ellipsoids, low and steep: within 2.5 stated standard deviations and a share of their height.
 
-    With the trapezoid rule alone it came out 5.5 % too low, stated 1.0 %; now 0.1 % too high, stated 8 %.
+    With the trapezoid rule alone the low one came out 5.5 % too low, stated 1.0 %.
     """
-    foot, rise = 170.0, 34.0
+    foot = 170.0
     at = np.linspace(-350.0, 350.0, 351)
     u = np.hypot(*np.meshgrid(at, at)) / foot
     np.savez(tmp_path / "dome.npz", x=at, y=at, height=rise * np.sqrt(np.maximum(1.0 - u**2, 0.0)))
@@ -113,5 +142,6 @@ def test_height_of_a_traced_low_dome(tmp_path: Path):
     top = truth > 0.9 * rise
     height, std = rec.spread(lambda z: float(np.mean(z[top])))
     error = height - truth[top].mean()
-    assert abs(error) < min(2.5 * std, 0.05 * rise), (error, std)
+    print("RES", error / rise, std / rise)
+    assert abs(error) < min(2.5 * std, limit * rise), (error, std)
     assert std < 0.1 * rise

@@ -289,18 +289,22 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
         several_scans.join_scans(MicrographSet((stacks[0].replace(calibration=None), *stacks[1:])))
     other = stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=0.23, std=0.02)})
     of_both = several_scans.join_scans(MicrographSet((stacks[0].replace(instrument=other), *stacks[1:]))).stack
-    n = len(stacks) - 1
-    assert of_both.instrument.law.exponent == pytest.approx((0.23 + 4 * n * 0.2) / (1 + 4 * n))
-    assert of_both.instrument.law.std == pytest.approx((0.02 + 4 * n * 0.01) / (1 + 4 * n))
+    # the other scans share one measurement of the law
+    assert of_both.instrument.law.exponent == pytest.approx((0.23 + 4 * 0.2) / 5)
+    assert of_both.instrument.law.std == pytest.approx((0.02 + 4 * 0.01) / 5 * max(1.0, 0.03 / np.hypot(0.02, 0.01)))
 
     def joined_law(*laws):
         models = [stacks[0].instrument.model_copy(update={"law": CampaignLaw(exponent=m, std=std)}) for m, std in laws]
         stated_apart = [s.replace(instrument=model) for s, model in zip(stacks, models, strict=True)]
         return several_scans.join_scans(MicrographSet(tuple(stated_apart))).stack.instrument.law
 
-    # chi-square 8 of 4 degrees of freedom: times the Birge ratio; two that disagree, neither the smallest nor largest
+    # chi-square 8 of 2 degrees of freedom: times the Birge ratio, copies of a statement count once; two that disagree,
+    # neither the smallest nor largest; and laws so vague that together they tell nothing
     law = joined_law((0.2, 0.02), (0.28, 0.02), (0.24, 0.02), (0.24, 0.02), (0.24, 0.02))
-    assert law.std == pytest.approx(0.02 * 2.0**0.5)
+    assert law.exponent == pytest.approx(0.24)
+    assert law.std == pytest.approx(0.02 * 2.0)
+    with pytest.raises(InputFileError, match=r"know m to 1\.1 only"):
+        joined_law((0.0, 0.4), (1.6, 0.4), (0.0, 0.4), (0.0, 0.4), (0.0, 0.4))
     with pytest.raises(InputFileError, match="must agree on the scattering law"):
         joined_law((0.0, 0.2), (0.3, 0.2), (0.1, 0.001), (0.15, 0.001), (0.1, 0.2))
     other = other.model_copy(update={"law": CampaignLaw(exponent=0.3, std=0.02)})
