@@ -140,7 +140,7 @@ class RimEdges:
     Attributes:
         rise, variance: in the edge of the rim.
         next_rise, next_variance: in the next.
-        evidence: logarithm of the probability of the two slopes.
+        evidence: logarithm of the probability of the slopes within.
     """
 
     rise: np.ndarray
