@@ -45,14 +45,13 @@ WALL = 0.25
 RISING = 2.0
 """Where the slope rises from the first pixel to the second by more standard deviations, the rim is further within."""
 CROSSING = 0.5
-"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of its
-rim."""
+"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of the rim."""
 LEAST_EDGES = 8
 """Shorter outlines have no rim."""
 N_INDEPENDENT = 8.0
 """So many edges of an outline count as independent: errors of the fitted slopes agree along it."""
 DECISIVE = 0.75
-"""Least logarithm of the evidence for a rim against a constant slope."""
+"""Least logarithm of the evidence for a rim against a parabola and a constant slope."""
 
 
 @dataclass(frozen=True)
@@ -306,20 +305,29 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     is_rim &= (further > WALL * size) & (further < size + RISING * np.hypot(e[:, first], e[:, second]))
     row, column = np.nonzero(is_rim)
     first = column + 2
-    distance = np.arange(s.shape[1]) - first[:, None]
-    rise = np.sign(s[row, first])[:, None] * s[row]  # along the whole row, upwards from its rim
-    crest = np.where((distance > 0) & (rise <= 0.0), distance, s.shape[1] - first[:, None]).min(axis=1)
-    before = crest - 1 + first
-    falls = first + crest < s.shape[1]
-    last, after = (rise[np.arange(len(row)), np.minimum(k, s.shape[1] - 1)] for k in (before, before + 1))
-    crest = crest - np.where(falls, -after / np.maximum(last - after, 1e-12), 0.0)
+    crest = _crest(np.sign(s[row, first])[:, None] * s[row], first)
     ahead = first[:, None] + np.arange(N_WITHIN)
     is_known = (ahead < s.shape[1]) & (np.arange(N_WITHIN) < np.maximum(crest[:, None], 2.0))
     ahead = np.minimum(ahead, s.shape[1] - 1)
     std = np.where(is_known, e[row[:, None], ahead], np.inf)
     std[:, 0] = np.hypot(std[:, 0], FIRST_ERROR * (1.0 + t[row, first] ** 2))
-    along = first if sign > 0 else s.shape[1] - 1 - first
-    place = (row, along) if axis == 1 else (along, row)
+    position = first if sign > 0 else s.shape[1] - 1 - first
+    place = (row, position) if axis == 1 else (position, row)
     level = np.hypot(LEVEL_STD * e[row, column], LEVEL_SHARE * s[row, first])
     found = _Candidates(*place, s[row[:, None], ahead], std, crest, s[row, column + 1], t[row, column] / level)
     return found.only(crest > LEAST_CREST)
+
+
+def _crest(slope: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Compute the distance from the first pixels to where the slope changes sign, or to the border [candidate].
+
+    Args:
+        slope: of whole rows, positive in the first pixel within [candidate, pixel].
+        first: number of that pixel [candidate].
+    """
+    n = slope.shape[1]
+    is_beyond = (np.arange(n) > first[:, None]) & (slope <= 0.0)
+    after = np.where(is_beyond.any(axis=1), is_beyond.argmax(axis=1), n)
+    rising, falling = (slope[np.arange(len(first)), np.minimum(k, n - 1)] for k in (after - 1, after))
+    back = np.where(after < n, -falling / np.maximum(rising - falling, 1e-12), 0.0)
+    return after - first - back
