@@ -44,8 +44,9 @@ WALL = 0.25
 """Least slope of the second pixel within, over that of the first: below it the first is on a wall."""
 RISING = 2.0
 """Where the slope rises from the first pixel to the second by more standard deviations, the rim is further within."""
-CROSSING = 0.5
-"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of the rim."""
+CROSSING = 1.0 / np.sqrt(12.0)
+"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of the rim: that
+lies anywhere in the edge."""
 LEAST_EDGES = 8
 """Shorter outlines have no rim."""
 N_INDEPENDENT = 8.0
