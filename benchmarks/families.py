@@ -160,7 +160,7 @@ def inner(mask: np.ndarray) -> np.ndarray:
 
 
 def apex_pixels(member: Member, truth: np.ndarray, rec: Reconstruction) -> Iterator[np.ndarray]:
-    """Return the pixel that sees each apex of a member, or the highest point, and its neighbours, as masks [y, x]."""
+    """Yield the pixel that sees each apex of a member, or the highest point, and its neighbours, as masks [y, x]."""
     beams = [np.array(place) + height * np.array(rec.instrument.beam_shift) for *place, height in member.apexes]
     axes = rec.raster_y, rec.raster_x
     pixels = [tuple(int(np.argmin(np.abs(axis - b))) for axis, b in zip(axes, at[::-1], strict=True)) for at in beams]

@@ -160,8 +160,11 @@ def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     Raises:
         InputFileError: two differ by more than `LAWS_DIFFER` standard deviations, or all tell next to nothing.
     """
-    known = {s.instrument.law: s.name for s in reversed(stacks) if s.instrument.law is not None}
-    stated = [(name, law) for law, name in reversed(known.items())]
+    first_scan: dict[CampaignLaw, str] = {}
+    for stack in stacks:
+        if stack.instrument.law is not None:
+            first_scan.setdefault(stack.instrument.law, stack.name)
+    stated = [(name, law) for law, name in first_scan.items()]
     if not stated:
         return None
     for (one, a), (other, b) in itertools.combinations(stated, 2):

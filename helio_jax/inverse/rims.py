@@ -17,11 +17,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 from scipy.special import logsumexp, softmax
 
-from helio_jax.forward.surface import Surface, along
+from helio_jax.forward.surface import Surface
 
 OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 3.0, 5.0, 100.0, 100.0]) ** 2
 """Values of r that are compared, in pixels; the rise in an edge goes with the root of r. The last two have no rim: a
 parabola and, with the crest at infinity, a constant slope."""
+FAR = 1e6
+"""Distance of a crest at infinity, in pixels."""
 N_WITHIN = 4
 """So many pixels within a rim are compared."""
 LEAST_CREST = 1.5
@@ -44,9 +46,6 @@ WALL = 0.25
 """Least slope of the second pixel within, over that of the first: below it the first is on a wall."""
 RISING = 2.0
 """Where the slope rises from the first pixel to the second by more standard deviations, the rim is further within."""
-CROSSING = 1.0 / np.sqrt(12.0)
-"""Standard deviation of the rise in an edge that crosses an outline without a profile, over the slope of the rim: that
-lies anywhere in the edge."""
 LEAST_EDGES = 8
 """Shorter outlines have no rim."""
 N_INDEPENDENT = 8.0
@@ -101,37 +100,6 @@ class AxisRims:
         self.common[place] = sign * between
         self.outline[place] = number
 
-    def loosen(
-        self,
-        region: np.ndarray,
-        inside: np.ndarray,
-        number: int,
-        slopes: tuple[np.ndarray, np.ndarray],
-        steepness: float,
-        axis: int,
-    ) -> None:
-        """Give the other edges in the region of an outline the standard deviation of a kink, or rim, anywhere in them.
-
-        Where an outline runs along the raster, rows or columns that touch it hold no profile. The slope along such an
-        edge says little of its rise, which follows from where the rim cuts it. So a kink goes by the whole change of
-        slope, and an edge that crosses the outline by the slope of its rim: a few of them with small errors would hold
-        the level of all that the outline surrounds.
-
-        Args:
-            region: of the outline [y, x].
-            inside: pixels within it, near the rim [y, x].
-            number: of the outline.
-            slopes: along x and y [y, x].
-            steepness: slope of the rim.
-            axis: of the edges.
-        """
-        before, after = along(region, axis)
-        place = (before | after) & ~self.is_rim
-        kink = np.hypot(*(np.diff(s, axis=axis) for s in slopes)) / np.sqrt(12.0)
-        crosses = np.logical_xor(*along(inside, axis))
-        self.sigma[place] = np.hypot(kink, np.where(crosses, CROSSING * steepness, 0.0))[place]
-        self.outline[place] = number
-
 
 @dataclass(frozen=True)
 class RimEdges:
@@ -170,7 +138,7 @@ def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float)
     for number, r in enumerate(OFFSETS):
         length = crest[:, None, None] + d
         offset = r * typical / length
-        profile = _Profile(offset, np.full_like(length, 1e6) if number == len(OFFSETS) - 1 else length)
+        profile = _Profile(offset, np.full_like(length, FAR) if number == len(OFFSETS) - 1 else length)
         at = profile.slope(d + ahead)
         inverse = np.where((ahead < 2) | (ahead < NEAR_CREST * crest[:, None]), 1.0 / std, 0.0)[:, None]
         information = np.sum((inverse * at) ** 2, 2)
@@ -278,20 +246,7 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
                 move = step - 1 if sign > 0 else -step
                 place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
                 out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
-        steepness = float(np.median(np.abs(np.concatenate([c.slope[:, 0] for c in mine.values()]))))
-        for axis, rims in out.items():
-            rims.loosen(outlines == number, _inside(mine, steep.shape), number, slopes, steepness, axis)
     return out[1], out[0]
-
-
-def _inside(found: dict[tuple[int, int], _Candidates], shape: tuple[int, ...]) -> np.ndarray:
-    """Mark the pixels near the rim that are within an outline, by its candidates of each (axis, sign) [y, x]."""
-    out = np.zeros(shape, bool)
-    for (axis, sign), c in found.items():
-        edge, ahead = np.nonzero(np.isfinite(c.std))
-        move = sign * ahead
-        out[c.y[edge] + move * (axis == 0), c.x[edge] + move * (axis == 1)] = True
-    return out
 
 
 def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> _Candidates:

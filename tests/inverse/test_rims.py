@@ -83,29 +83,13 @@ def test_rises_in_closed_form():
     np.testing.assert_allclose(np.sqrt(even.variance[-1]), 0.5 / np.sqrt(12.0), rtol=1e-2)
 
 
-def test_no_edge_holds_the_level_within_an_outline():
-    """Every edge across the outline is uncertain, also where the outline runs along the raster.
-
-    There the slope along an edge is small, and with it the error by a kink: single edges held the level of a dome to
-    a hundredth of a pixel, and rises in all others counted for nothing.
-    """
-    surface = dome(18.4, 15.0)
-    inside = np.hypot(X, Y) < 18.4
-    for rims, axis in zip(find_rims(noisy(surface, 1), NOISE), (1, 0), strict=True):
-        across = np.diff(inside, axis=axis)
-        assert np.all(rims.outline[across] > 0)
-        assert rims.sigma[across].min() > 0.15
-        information = rims.sigma[across] ** -2.0
-        assert information.max() < 0.2 * information.sum()
-
-
 @pytest.mark.parametrize("sign", (1.0, -1.0))
 def test_rim_of_a_dome_rises_by_more_than_the_trapezoid_rule(sign):
     """Low domes and bowls: the excess of all edges, within 3 standard deviations of what each outline has in common."""
     surface = dome(18.4, 5.0 * sign)
     found = find_rims(noisy(surface, 1), NOISE)
     for rims, axis in zip(found, (1, 0), strict=True):
-        at = rims.common != 0.0
+        at = rims.outline > 0
         assert 100 < at.sum() < 300
         towards = np.sign(np.where(at, np.diff(surface.height, axis=axis), 0.0))
         true, expected, common = (np.sum(towards * f) for f in (excess(surface, axis), rims.gap, rims.common))
@@ -142,6 +126,5 @@ def test_height_of_a_traced_dome(rise: float, limit: float, tmp_path: Path):
     top = truth > 0.9 * rise
     height, std = rec.spread(lambda z: float(np.mean(z[top])))
     error = height - truth[top].mean()
-    print("RES", error / rise, std / rise)
     assert abs(error) < min(2.5 * std, limit * rise), (error, std)
     assert std < 0.1 * rise
