@@ -5,7 +5,9 @@ plate, beam and apertures belong together (table [covariance]): a plate that is 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -86,6 +88,37 @@ class GeometryPrior:
         distance, *aim = self.factor() @ np.append(rng.standard_normal(), aim)
         incidence = self.incidence_std * float(rng.standard_normal()) if self.incidence_std else 0.0
         return float(distance), np.array(aim[::2]), np.array(aim[1::2]), incidence
+
+
+def errors_in_common(instrument: Instrument, names: Sequence[str]) -> Covariance | None:
+    """State the errors of one instrument for several scans by it, between which the sample was turned.
+
+    Distance, polar angles and azimuths are off by the same in all scans, for each sees its own plate.
+
+    Args:
+        instrument: of every scan.
+        names: of the joined scans' detectors, scan by scan, each in the instrument's order.
+
+    Returns:
+        [covariance] of the joined scans; None where nothing is uncertain.
+    """
+    prior = GeometryPrior.of(instrument).covariance
+    of_detector = 1 + 2 * (np.arange(len(names)) % len(instrument.detector))
+    own = np.concatenate([[0], np.stack([of_detector, of_detector + 1], 1).ravel()])
+    joint = prior[np.ix_(own, own)]
+    parameters = ("sample distance", *(f"{kind} of {name}" for name in names for kind in ("polar", "azimuth")))
+    is_known = np.diag(joint) <= 0.0
+    if is_known.all():
+        return None
+    degrees: tuple[Literal["deg"], ...] = ("deg",) * (len(parameters) - 1)
+    std = np.sqrt(np.diag(joint))
+    correlation = joint / np.outer(*2 * [np.where(is_known, 1.0, std)]) + np.diag(1.0 * is_known)
+    return Covariance(
+        parameters=parameters,
+        units=("um", *degrees),
+        std=(float(std[0]), *np.degrees(std[1:]).tolist()),
+        correlation=tuple(map(tuple, correlation.tolist())),
+    )
 
 
 def geometry_covariance(instrument: Instrument, stated: Covariance) -> np.ndarray:

@@ -18,6 +18,7 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import as_json, pitch
 from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
 from helio_jax.errors import GuardError, InputFileError
+from helio_jax.geometry_prior import errors_in_common
 from helio_jax.instrument import Detector, Instrument
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
@@ -107,7 +108,8 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     """Combine the apertures and laws of all scans in one instrument, each rotated back by its sample's rotation.
 
     Where a scan's beam is oblique, each detector keeps the beam of its scan, and the raster sees the sample straight
-    down (`Instrument.has_several_beams`).
+    down (`Instrument.has_several_beams`). How far the geometry may be off is that of the first scan's file, the same in
+    all scans (`errors_in_common`).
     """
     detectors = []
     beams = [s.instrument.beam for s in stacks]
@@ -130,7 +132,8 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
                 )
             )
     beam = beams[0].changed(incidence_deg=0.0, azimuth_deg=0.0) if is_oblique else beams[0]
-    update = {"beam": beam, "detector": tuple(detectors), "law": _joined_law(stacks)}
+    covariance = errors_in_common(stacks[0].instrument, [d.name for d in detectors])
+    update = {"beam": beam, "detector": tuple(detectors), "law": _joined_law(stacks), "covariance": covariance}
     return stacks[0].instrument.model_copy(update=update)
 
 
@@ -138,7 +141,8 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
     """Refuse scans whose counts have no common unit.
 
     Raises:
-        InputFileError: some are calibrated in another way than others, or state scattering laws that disagree.
+        InputFileError: some are calibrated in another way than others, or state scattering laws that disagree or that
+            determine the exponent too badly.
     """
     kinds = {None if c is None else (c.method, c.without_multiple) for c in (s.calibration for s in stacks)}
     if len(kinds) > 1:
@@ -153,18 +157,19 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     """Return the scattering law of a sample by the scans that state one, as a weighted mean; None: none does.
 
-    Scans that state the same law share its measurement, which counts once. The standard deviation is the weighted mean
-    of theirs, for what samples differ by is common to all scans of one. Where the laws scatter by more, it is
-    multiplied by the Birge ratio: the root of chi-square over the degrees of freedom.
+    Scans that state the same law (to four digits) share its measurement, which counts once. The standard deviation is
+    the weighted mean of theirs, for what samples differ by is common to all scans of one. Where the laws scatter by
+    more, it is multiplied by the Birge ratio: the root of chi-square over the degrees of freedom.
 
     Raises:
-        InputFileError: two differ by more than `LAWS_DIFFER` standard deviations, or all tell next to nothing.
+        InputFileError: two differ by more than `LAWS_DIFFER` standard deviations, or m is known to no better than
+            `MAX_LAW_STD` by all of them.
     """
-    first_scan: dict[CampaignLaw, str] = {}
+    first_scan: dict[str, tuple[str, CampaignLaw]] = {}
     for stack in stacks:
-        if stack.instrument.law is not None:
-            first_scan.setdefault(stack.instrument.law, stack.name)
-    stated = [(name, law) for law, name in first_scan.items()]
+        if (law := stack.instrument.law) is not None:
+            first_scan.setdefault(f"{law.exponent:.4g} {law.std:.4g}", (stack.name, law))
+    stated = list(first_scan.values())
     if not stated:
         return None
     for (one, a), (other, b) in itertools.combinations(stated, 2):
@@ -181,8 +186,8 @@ def _joined_law(stacks: Sequence[MicrographStack]) -> CampaignLaw | None:
     if std > MAX_LAW_STD:
         names = ", ".join(repr(name) for name, _ in stated)
         raise InputFileError(
-            f"scans that are joined: their scattering laws together know m to {std:.2g} only (limit {MAX_LAW_STD:g}): "
-            f"correct or remove the tables [law] of the instrument files of {names}"
+            f"scans that are joined: the laws that they state determine m to +- {std:.2g} only (limit "
+            f"{MAX_LAW_STD:g}): correct or remove the tables [law] of the instrument files of {names}"
         )
     return CampaignLaw(exponent=mean, std=std)
 

@@ -5,9 +5,10 @@ column cuts them in an ellipse: the slope at a distance t from the rim is c (1 -
 the distance of the crest from the rim, r = 0 where the tangent at the rim is vertical, r = infinity on a parabola. Of a
 cone or a wall the slope is constant (L and r infinite). Where in its edge a rim lies, and how steep the rim itself is,
 follows to some extent from the slopes of the first pixels within; what they do not tell of r is common to a whole
-outline.
+outline. An oblique beam shears the sections along its azimuth: the two sides of a dome then have an r each.
 
 The first pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
+Rows that leave the image before they reach a crest tell nothing.
 """
 
 from dataclasses import dataclass
@@ -19,27 +20,29 @@ from scipy.special import logsumexp, softmax
 
 from helio_jax.forward.surface import Surface
 
-OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 3.0, 5.0, 100.0, 100.0]) ** 2
-"""Values of r that are compared, in pixels; the rise in an edge goes with the root of r. The last two have no rim: a
-parabola and, with the crest at infinity, a constant slope."""
+OFFSETS = np.r_[np.arange(0.0, 1.5, 0.05), np.arange(1.5, 3.0, 0.1), 3.0, 3.5, 4.0, 5.0, 100.0, 100.0] ** 2
+"""Values of r that are compared, in pixels; the rise in an edge goes with the root of r, whose steps are finer than its
+errors. The last two have no rim: a parabola and, with the crest at infinity, a constant slope."""
 FAR = 1e6
 """Distance of a crest at infinity, in pixels."""
 N_WITHIN = 4
 """So many pixels within a rim are compared."""
 LEAST_CREST = 1.5
-"""Least distance of the crest from the first pixel, in pixels: rows that cut less of an outline hold no profile."""
+"""Least distance of the crest from the first pixel, in pixels: rows nearer to the edge of a dome are not used."""
 NEAR_CREST = 0.8
 """Distance over that of the crest from which on slopes are not compared: ellipses fit domes at their rims."""
 FIRST_ERROR = 0.25
-"""Standard deviation of the first slope within over 1 + slope^2: the steepest, and masks and multiple scattering follow
-from where the rim lies."""
+"""Standard deviation of the first slope within, over 1 + slope^2, besides noise: masks and multiple scattering depend
+most on the place of the rim there."""
+SHAPE_ERROR = 0.05
+"""Standard deviation of the other slopes, over the slope, besides noise: domes are not quite elliptic."""
 N_DISTANCES = 24
 """Distances of the first pixel from the rim, equally likely, over which is averaged."""
 LEVEL = 0.25, 0.8
 """Largest slopes of the second and of the first pixel outside, over that of the first within."""
 LEVEL_STD, LEVEL_SHARE = 2.5, 0.06
-"""Largest median slope of the second pixels outside an outline: in standard deviations, added in square to a share of
-the first within, by which steep rims disturb them. Rough surfaces have no rims."""
+"""Outside an outline the median slope of the second pixels is at most hypot(LEVEL_STD standard deviations, LEVEL_SHARE
+of the first slope within): steep rims disturb the pixels beside them. Rough surfaces have no rims."""
 LEAST_SLOPE = 4.0
 """Least slope of the first pixel within, in standard deviations."""
 WALL = 0.25
@@ -50,6 +53,11 @@ LEAST_EDGES = 8
 """Shorter outlines have no rim."""
 N_INDEPENDENT = 8.0
 """So many edges of an outline count as independent: errors of the fitted slopes agree along it."""
+VERTICAL = 5.0
+"""A tangent that is vertical at the rim (r = 0), as that of half a ball, is so many times as likely as each other r."""
+HIDING = 0.2, 0.1
+"""Where a side falls along an oblique beam and the root of r is below the first number, with a probability above the
+second, its foot may be hidden behind the limb: edges there may be depth jumps and count as no rims."""
 DECISIVE = 0.75
 """Least logarithm of the evidence for a rim against a parabola and a constant slope."""
 
@@ -62,7 +70,7 @@ class AxisRims:
         gap: by how much (height change / pitch) should exceed the mean of the two slopes [edge].
         sigma: standard deviation of it; 0: no rim [edge].
         common: change of it by one standard deviation of what is common to its outline [edge].
-        outline: number of the outline; 0: no rim [edge].
+        outline: number of the outline, or of a side of it that has an r of its own; 0: no rim [edge].
     """
 
     gap: np.ndarray
@@ -85,6 +93,8 @@ class AxisRims:
     ) -> None:
         """Set the edges of an outline at a place, seen along the axis in the direction `sign`.
 
+        Of two outlines that share an edge the less certain one counts.
+
         Args:
             place: index of the edges.
             number: of the outline.
@@ -95,9 +105,12 @@ class AxisRims:
         """
         mean = probability @ rise
         between = np.sqrt(probability @ (rise - mean) ** 2)
-        self.gap[place] = sign * (mean - trapezoid)
-        self.sigma[place] = np.sqrt(probability @ variance + between**2)
-        self.common[place] = sign * between
+        sigma = np.sqrt(probability @ variance + between**2)
+        is_new = sigma > self.sigma[place]
+        place = tuple(index[is_new] for index in place)
+        self.gap[place] = (sign * (mean - trapezoid))[is_new]
+        self.sigma[place] = sigma[is_new]
+        self.common[place] = (sign * between)[is_new]
         self.outline[place] = number
 
 
@@ -121,14 +134,14 @@ class RimEdges:
 def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float) -> RimEdges:
     """Compute the rises beside rims from the slopes of the pixels within.
 
-    The distance d of the first pixel from the rim is uniform in (0, 1) pixels, c has a scale-free prior. Sections of
-    one ellipsoid share the product of r and L.
+    The distance d of the first pixel from the rim is uniform in (0, 1) pixels, c has a scale-free prior. Parallel
+    sections of an ellipsoid share the product of r and L.
 
     Args:
         slope: slopes away from the rim, of the first and the following pixels [edge, pixel].
         std: their standard deviations; infinite: not known [edge, pixel].
         crest: distance of the crest from the first pixel, in pixels [edge].
-        typical: distance L of an edge whose r is one of `OFFSETS`, in pixels.
+        typical: r of an edge is one of `OFFSETS` times `typical` / L, in pixels.
 
     Source: own derivation, tests/inverse/test_rims.py.
     """
@@ -184,7 +197,7 @@ class _Candidates(NamedTuple):
     Attributes:
         y, x: rows and columns.
         slope: slopes of the first pixels within [candidate, pixel].
-        std: their standard deviations; infinite: beyond the crest or the border [candidate, pixel].
+        std: their standard deviations [candidate, pixel].
         crest: distance of the crest from the first, in pixels.
         outer: slope of the first pixel outside.
         beyond: size of the slope of the second pixel outside, over the largest of level pixels.
@@ -203,12 +216,15 @@ class _Candidates(NamedTuple):
         return _Candidates(*(values[which] for values in self))
 
 
-def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, AxisRims]:
+def find_rims(
+    surface: Surface, noise: float | np.ndarray, shift: tuple[float, float] | np.ndarray = (0.0, 0.0)
+) -> tuple[AxisRims, AxisRims]:
     """Find the rims of a surface in its edges along x and along y.
 
     Args:
         surface: heights and slopes.
-        noise: slope noise of a level pixel, or of every pixel [y, x].
+        noise: slope noise of a level pixel, or of every pixel [y, x]; infinite: not observed.
+        shift: how far the beam moves sideways per unit of height, along x and y; sections along it are sheared.
     """
     slopes = np.asarray(surface.slope_x), np.asarray(surface.slope_y)
     steep = np.hypot(*slopes)
@@ -216,26 +232,98 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
     ways = [(axis, sign) for axis in (1, 0) for sign in (1, -1)]
     found = {way: _candidates(slopes[1 - way[0]], steep, std, *way) for way in ways}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
-    within = np.zeros(steep.shape, bool)
-    for c in found.values():
-        within[c.y, c.x] = True
-    eight = np.ones((3, 3))
-    outlines, n_outlines = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
-    for number in range(1, n_outlines + 1):
-        mine = {way: c.only(outlines[c.y, c.x] == number) for way, c in found.items()}
+    numbers = _outlines(found, steep.shape)
+    is_sheared = {1: shift[0] != 0.0, 0: shift[1] != 0.0}
+    n_sides = 0
+    for number in np.unique(np.concatenate(list(numbers.values()))):
+        mine = {way: c.only(numbers[way] == number) for way, c in found.items()}
         beyond = np.concatenate([c.beyond for c in mine.values()])
         if len(beyond) < LEAST_EDGES or np.median(beyond) > 1.0:
             continue
-        typical = 0.5 + float(np.median(np.concatenate([c.crest for c in mine.values()])))
-        beside = {way: rises(c.slope, c.std, c.crest, typical) for way, c in mine.items()}
-        evidence = np.sum([b.evidence.sum(1) for b in beside.values()], axis=0)
-        evidence = evidence * min(1.0, N_INDEPENDENT / len(beyond))
-        if np.max(evidence[:-2]) - np.max(evidence[-2:]) < DECISIVE:
+        alike = {way: c for way, c in mine.items() if not is_sheared[way[0]]}
+        sides = [alike, *({way: c} for way, c in mine.items() if is_sheared[way[0]])]
+        sides = [_Side.of(side) for side in sides if any(len(c.y) for c in side.values())]
+        if sum(side.gain for side in sides) < DECISIVE:
             continue
-        probability = softmax(evidence)
-        for (axis, sign), c in mine.items():
-            first, second = c.slope[:, 0], c.slope[:, 1]
-            b, level = beside[axis, sign], np.zeros((len(OFFSETS), len(c.y)))
+        for side in sides:
+            if not side.may_hide_below(shift):
+                n_sides += 1
+                side.set_edges(out, n_sides)
+    return out[1], out[0]
+
+
+def _outlines(found: dict[tuple[int, int], _Candidates], shape: tuple[int, ...]) -> dict[tuple[int, int], np.ndarray]:
+    """Number the outline of every candidate [candidate], those of neighbouring domes and of a ring's two sides apart.
+
+    Args:
+        found: candidates along each axis in each direction.
+        shape: of the image.
+    """
+    within, body, eight = np.zeros(shape, bool), np.zeros(shape, bool), np.ones((3, 3))
+    for (axis, sign), c in found.items():
+        within[c.y, c.x] = True
+        up = sign * np.arange(0.5 + np.max(c.crest, initial=0.0), dtype=int)
+        at = (c.y[:, None], c.x[:, None] + up) if axis == 1 else (c.y[:, None] + up, c.x[:, None])
+        at = tuple(np.broadcast_arrays(*at))
+        is_raised = np.abs(up) <= 0.5 + c.crest[:, None]
+        body[tuple(index[is_raised] for index in at)] = True
+    rim, _ = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
+    raised, n_raised = label(body)  # type: ignore[misc]
+    return {way: rim[c.y, c.x] * (n_raised + 1) + raised[c.y, c.x] for way, c in found.items()}
+
+
+class _Side(NamedTuple):
+    """Candidates that share an r, by axis and direction.
+
+    Attributes:
+        mine: them.
+        beside: their rises.
+        evidence: of each of `OFFSETS`, logarithm [offset].
+    """
+
+    mine: dict[tuple[int, int], _Candidates]
+    beside: dict[tuple[int, int], RimEdges]
+    evidence: np.ndarray
+
+    @classmethod
+    def of(cls, mine: dict[tuple[int, int], _Candidates]) -> "_Side":
+        """Compute rises and evidence.
+
+        Between the sections of an ellipsoid along its axes the product of r and L goes with the square of L, of which
+        the crests of rows and columns tell.
+        """
+        crests = {
+            axis: np.concatenate([np.zeros(0), *(c.crest for way, c in mine.items() if way[0] == axis)])
+            for axis in (1, 0)
+        }
+        typical = 0.5 + float(np.median(np.concatenate(list(crests.values()))))
+        of_axis = {axis: (0.5 + float(np.median(c))) ** 2 / typical for axis, c in crests.items() if len(c)}
+        beside = {way: rises(c.slope, c.std, c.crest, of_axis[way[0]]) for way, c in mine.items() if way[0] in of_axis}
+        evidence = np.sum([b.evidence.sum(1) for b in beside.values()], axis=0)
+        n = sum(len(c) for c in crests.values())
+        evidence *= min(1.0, N_INDEPENDENT / n)
+        evidence[0] += np.log(VERTICAL)
+        return cls(mine, beside, evidence)
+
+    def may_hide_below(self, shift: tuple[float, float] | np.ndarray) -> bool:
+        """Whether the side falls along the beam (`find_rims`), and perhaps so steeply that its foot is not seen."""
+        along = {1: shift[0], 0: shift[1]}
+        falls = (sign * along[axis] * c.slope[:, :1] < 0.0 for (axis, sign), c in self.mine.items())
+        root, probability = HIDING
+        is_steep = softmax(self.evidence)[np.sqrt(OFFSETS) < root].sum() > probability
+        return bool(is_steep and np.mean(np.concatenate(list(falls))) > 0.5)
+
+    @property
+    def gain(self) -> float:
+        """Logarithm of the evidence for a rim against a parabola and a constant slope."""
+        return float(np.max(self.evidence[:-2]) - np.max(self.evidence[-2:]))
+
+    def set_edges(self, out: dict[int, AxisRims], number: int) -> None:
+        """Set the edges at and beside the rim along each axis; `number`: of this side."""
+        probability = softmax(self.evidence)
+        for (axis, sign), b in self.beside.items():
+            c = self.mine[axis, sign]
+            first, second, level = c.slope[:, 0], c.slope[:, 1], np.zeros((len(OFFSETS), len(c.y)))
             parts = (
                 (-1, c.outer, level, level + c.outer**2 / 12.0),
                 (0, c.outer + first, b.rise, b.variance),
@@ -246,7 +334,6 @@ def find_rims(surface: Surface, noise: float | np.ndarray) -> tuple[AxisRims, Ax
                 move = step - 1 if sign > 0 else -step
                 place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
                 out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
-    return out[1], out[0]
 
 
 def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> _Candidates:
@@ -262,20 +349,20 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     row, column = np.nonzero(is_rim)
     first = column + 2
     crest = _crest(np.sign(s[row, first])[:, None] * s[row], first)
-    ahead = first[:, None] + np.arange(N_WITHIN)
-    is_known = (ahead < s.shape[1]) & (np.arange(N_WITHIN) < np.maximum(crest[:, None], 2.0))
-    ahead = np.minimum(ahead, s.shape[1] - 1)
-    std = np.where(is_known, e[row[:, None], ahead], np.inf)
-    std[:, 0] = np.hypot(std[:, 0], FIRST_ERROR * (1.0 + t[row, first] ** 2))
+    ahead = np.minimum(first[:, None] + np.arange(N_WITHIN), s.shape[1] - 1)  # beyond the border is beyond the crest
+    at = row[:, None], ahead
+    error = SHAPE_ERROR * np.abs(s[at])
+    error[:, 0] = FIRST_ERROR * (1.0 + t[row, first] ** 2)
+    std = np.hypot(e[at], error)
     position = first if sign > 0 else s.shape[1] - 1 - first
     place = (row, position) if axis == 1 else (position, row)
     level = np.hypot(LEVEL_STD * e[row, column], LEVEL_SHARE * s[row, first])
-    found = _Candidates(*place, s[row[:, None], ahead], std, crest, s[row, column + 1], t[row, column] / level)
+    found = _Candidates(*place, s[at], std, crest, s[row, column + 1], t[row, column] / level)
     return found.only(crest > LEAST_CREST)
 
 
 def _crest(slope: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Compute the distance from the first pixels to where the slope changes sign, or to the border [candidate].
+    """Compute the distance from the first pixels to where the slope changes sign [candidate]; 0: beyond the border.
 
     Args:
         slope: of whole rows, positive in the first pixel within [candidate, pixel].
@@ -285,5 +372,4 @@ def _crest(slope: np.ndarray, first: np.ndarray) -> np.ndarray:
     is_beyond = (np.arange(n) > first[:, None]) & (slope <= 0.0)
     after = np.where(is_beyond.any(axis=1), is_beyond.argmax(axis=1), n)
     rising, falling = (slope[np.arange(len(first)), np.minimum(k, n - 1)] for k in (after - 1, after))
-    back = np.where(after < n, -falling / np.maximum(rising - falling, 1e-12), 0.0)
-    return after - first - back
+    return np.where(after < n, after - first + falling / np.maximum(rising - falling, 1e-12), 0.0)

@@ -97,7 +97,8 @@ def edges_of(
     problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[AxisEdges, AxisEdges]:
     """Find the edges of a surface along x and along y; those at walls or `occluded` count as depth jumps."""
-    rims_x, rims_y = find_rims(surface, problem.pixel_noise)
+    noise = np.where(problem.has_enough_images, problem.pixel_noise, np.inf)
+    rims_x, rims_y = find_rims(surface, noise, problem.shift)
     found = (
         find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut, rims_x),
         find_edges(surface.height, surface.slope_y, problem.raster.dy, 0, problem.pixel_noise, cut, rims_y),

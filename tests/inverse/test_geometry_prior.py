@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
+from helio_jax.alignment.resample import joined_instrument
+from helio_jax.alignment.rigid import Rigid
 from helio_jax.errors import SceneError
 from helio_jax.forward.render import Corrections
 from helio_jax.geometry_prior import GeometryPrior
@@ -19,6 +21,7 @@ from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, set_corrections, with_responses
 from helio_jax.inverse.steps import freeze
+from helio_jax.micrograph import MicrographStack
 
 SHIFT = 30.0
 NAMES = ("plate shift x", "plate shift y", "sample distance")
@@ -75,6 +78,42 @@ def test_uncertainty_widens_a_covariance(bshem):
     assert np.sqrt(np.diag(wider.covariance)[1::2].max()) == pytest.approx(math.radians(5.0), rel=1e-3)
     assert less.covariance == pytest.approx(calibrated.covariance)
     assert not GeometryPrior.of(bshem.model_copy(update={"uncertainty": Uncertainty()})).covariance.any()
+
+
+def test_turned_scans_share_the_errors_of_their_plate(bshem):
+    """Joined scans: each scan's apertures move as the plate does in its own frame, the same in all scans.
+
+    Against the directions of joined instruments that are joined anew from moved ones. Rejects independent errors of
+    every scan, and a plate that is shifted in the sample's frame, by which scans turned by 120 deg differ in sign.
+    """
+    one = with_plate_error(bshem, polar_deg=0.5, azimuth_deg=2.0)
+    blank = MicrographStack(np.ones((3, 4, 4)), 10.0 * np.arange(4), 10.0 * np.arange(4), one, n_rays=1.0)
+    scans = tuple(blank.replace(name=f"scan {k}", sample_rotation=t) for k, t in enumerate((0.0, 2.0)))
+    motions = tuple(Rigid(s.sample_rotation, (0.0, 0.0)) for s in scans)
+    joined = joined_instrument(scans, motions)
+    found, own = GeometryPrior.of(joined).covariance, GeometryPrior.of(one).covariance
+    floor = 3e-6 * np.diag(own).max()
+    for rows in (slice(1, 7), slice(7, 13)):
+        for columns in (slice(1, 7), slice(7, 13)):
+            assert found[rows, columns] == pytest.approx(own[1:, 1:], rel=1e-5, abs=floor)
+        assert found[0, rows] == pytest.approx(own[0, 1:], rel=1e-5, abs=1e-9)
+    assert found[0, 0] == pytest.approx(own[0, 0], rel=1e-5)
+
+    def directions(shift: float) -> np.ndarray:
+        moved = one.moved(np.zeros((3, 2)), 0.0, plate_shift=(shift, 0.0))
+        at = joined_instrument(tuple(s.replace(instrument=moved) for s in scans), motions)
+        return np.array([d.aim(at.working_distance) for d in at.detector]).ravel()
+
+    by_shift = (directions(1.0) - directions(-1.0)) / 2.0
+    alone = joined_instrument(
+        tuple(s.replace(instrument=with_plate_error(bshem, std=(SHIFT, 0.0, 0.0))) for s in scans), motions
+    )
+    expected = SHIFT**2 * np.outer(by_shift, by_shift)
+    assert GeometryPrior.of(alone).covariance[1:, 1:] == pytest.approx(expected, rel=5e-3, abs=1e-5 * expected.max())
+    known = joined_instrument(
+        tuple(s.replace(instrument=bshem.model_copy(update={"uncertainty": Uncertainty()})) for s in scans), motions
+    )
+    assert known.covariance is None
 
 
 def test_covariance_of_another_instrument_is_refused(bshem):

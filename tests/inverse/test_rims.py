@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
 import helio_jax as hx
-from helio_jax.forward.surface import Surface
-from helio_jax.inverse.rims import DECISIVE, OFFSETS, find_rims, rises
+from helio_jax.forward.surface import Surface, along
+from helio_jax.inverse.rims import OFFSETS, find_rims, rises
 from helio_jax.workflows.pipeline import record
 from helio_jax.workflows.truth import true_height
 
@@ -45,17 +47,126 @@ def cone(foot: float, rise: float) -> Surface:
     return Surface(rise * np.maximum(1.0 - r / foot, 0.0), slope * X, slope * Y)
 
 
-def noisy(surface: Surface, seed: int) -> Surface:
+def noisy(surface: Surface, seed: int, noise: float = NOISE) -> Surface:
     steep = 1.0 + surface.slope_x**2 + surface.slope_y**2
-    x, y = NOISE * steep * np.random.default_rng(seed).standard_normal((2, *steep.shape))
+    x, y = noise * steep * np.random.default_rng(seed).standard_normal((2, *steep.shape))
     return Surface(surface.height, surface.slope_x + x, surface.slope_y + y)
 
 
-def excess(surface: Surface, axis: int) -> np.ndarray:
-    """Compute what the height changes along every edge exceed the trapezoid rule by, in pixels."""
-    slope = surface.slope_x if axis == 1 else surface.slope_y
-    ends = (slope[:, :-1], slope[:, 1:]) if axis == 1 else (slope[:-1], slope[1:])
-    return np.diff(surface.height, axis=axis) - 0.5 * sum(ends)
+def ellipsoid(
+    foot: tuple[float, float],
+    rise: float,
+    *,
+    share: float = 0.5,
+    at: tuple[float, float] = (0.0, 0.0),
+    dx: float = 1.0,
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> Surface:
+    """Make the cap of an ellipsoid as an oblique beam sees it, by the root of its quadratic equation.
+
+    Args:
+        foot: half-axes of its foot.
+        rise: height of its top.
+        share: `rise` over the ellipsoid's vertical half-axis, up to 1.
+        at: middle of the foot.
+        dx: pitch along x; that along y is 1.
+        shift: of the beam per unit of height.
+    """
+    vertical = rise / share
+    depth = vertical - rise
+    wide, deep = (f / np.sqrt(1.0 - (depth / vertical) ** 2) for f in foot)
+    u, v = (dx * X - at[0]) / wide, (Y - at[1]) / deep
+    by_u, by_v = shift[0] / wide, shift[1] / deep
+    a = by_u**2 + by_v**2 + vertical**-2
+    b = -2.0 * (u * by_u + v * by_v) + 2.0 * depth / vertical**2
+    c = u**2 + v**2 + (depth / vertical) ** 2 - 1.0
+    root = np.sqrt(np.maximum(b**2 - 4.0 * a * c, 0.0))
+    height = np.where(root > 0.0, (root - b) / (2.0 * a), 0.0)
+    within = height > 0.0
+    u, v = u - height * by_u, v - height * by_v
+    down = np.where(within, 2.0 * (height + depth) / vertical**2 - 2.0 * (u * by_u + v * by_v), 1.0)
+    return Surface(*(np.where(within, f, 0.0) for f in (height, -2.0 * u / wide / down, -2.0 * v / deep / down)))
+
+
+def rises_over_rims(
+    surface: Surface, seed: int, noise: float, dx: float = 1.0, shift=(0.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the errors of the rise over each side of all rims, the same by the trapezoid rule, and what is stated.
+
+    Rises are sums over the edges of a path from the level surface into the dome, weighted by their variances; what is
+    common to a side adds up.
+    """
+    seen, found = noisy(surface, seed, noise), []
+    for rims, axis, pitch in zip(find_rims(seen, noise, shift), (1, 0), (dx, 1.0), strict=True):
+        slope = seen.slope_x if axis == 1 else seen.slope_y
+        change = np.diff(surface.height, axis=axis) / pitch
+        excess = change - 0.5 * sum(along(slope, axis))
+        paths, n_paths = label(rims.is_rim, [[0, 0, 0], [1, 1, 1], [0, 0, 0]] if axis == 1 else [[0, 1, 0]] * 3)
+        sides: dict[tuple, list] = {}
+        for number in range(1, n_paths + 1):
+            on = paths == number
+            up = np.sign(change[on].sum())
+            terms = (
+                up * excess[on].sum(),
+                up * rims.gap[on].sum(),
+                np.sum(rims.sigma[on] ** 2),
+                up * rims.common[on].sum(),
+            )
+            sides.setdefault((up, rims.outline[on].max()), []).append(terms)
+        for terms in sides.values():
+            by_trapezoid, gap, variance, common = np.array(terms).T
+            weight = 1.0 / variance / np.sum(1.0 / variance)
+            stated = np.hypot(weight @ common, np.sqrt(weight**2 @ variance))
+            found.append((weight @ (by_trapezoid - gap), weight @ by_trapezoid, stated))
+    error, by_trapezoid, stated = np.reshape(found, (-1, 3)).T
+    return error, by_trapezoid, stated
+
+
+def level_pulls(*args, **kwargs) -> np.ndarray:
+    """Compute by how many standard deviations the rise over each side is off; arguments as above."""
+    error, _, stated = rises_over_rims(*args, **kwargs)
+    return error / stated
+
+
+OBLIQUE = np.tan(np.radians(30.0))
+DOMES = {
+    "low": {"foot": (12.0, 12.0), "rise": 4.0, "share": 0.2},
+    "steep": {"foot": (9.0, 9.0), "rise": 8.0, "share": 0.88},
+    "oblique": {"foot": (12.0, 12.0), "rise": 6.0, "share": 0.4, "shift": (OBLIQUE, 0.0)},
+    "hidden foot": {"foot": (12.0, 12.0), "rise": 8.4, "share": 0.66, "shift": (OBLIQUE, 0.0)},
+    "oblong pixels": {"foot": (24.0, 24.0), "rise": 16.8, "share": 0.66, "dx": 2.0},
+    "elongated": {"foot": (16.0, 6.0), "rise": 4.0, "share": 0.5},
+    "cut by the border": {"foot": (14.0, 14.0), "rise": 9.0, "share": 0.6, "at": (-32.0, 0.0)},
+}
+"""Noise of 0.005 to 0.02 are signals of 200 to 50 times the noise. With one r for all sides, the product of r and L the
+same along x and y, coarse values of r, or crests put at the border, pulls are 2.5 to 150."""
+
+
+@pytest.mark.parametrize("noise", (0.005, 0.02))
+@pytest.mark.parametrize("name", DOMES)
+def test_domes_rise_as_stated(name: str, noise: float):
+    """Caps of ellipsoids: rms of the pulls of all sides and seeds below 1.8; about ten of them are independent."""
+    about = DOMES[name]
+    how = {key: about[key] for key in ("dx", "shift") if key in about}
+    at = np.array(about.get("at", (0.0, 0.0)))
+    places = np.random.default_rng(5).uniform(-0.5, 0.5, (4, 2))
+    pulls = [
+        level_pulls(ellipsoid(**(about | {"at": tuple(at + p)})), seed, noise, **how) for seed, p in enumerate(places)
+    ]
+    pulls = np.concatenate(pulls)
+    assert len(pulls) >= 6
+    assert np.sqrt(np.mean(pulls**2)) < 1.8, pulls
+
+
+@pytest.mark.parametrize("noise", (0.005, 0.02))
+def test_neighbouring_domes_have_rims_of_their_own(noise: float):
+    """A steep and a low cap, 1.5 pixels apart: as one outline they are off by up to 30 standard deviations."""
+    steep = ellipsoid((9.0, 9.0), 7.9, share=0.85, at=(-10.0, 0.3))
+    low = ellipsoid((9.0, 9.0), 3.7, share=0.3, at=(9.5, 0.3))
+    both = jax.tree.map(np.add, steep, low)
+    pulls = np.concatenate([level_pulls(both, seed, noise) for seed in range(4)])
+    assert len(pulls) >= 24
+    assert np.sqrt(np.mean(pulls**2)) < 1.8, pulls
 
 
 def test_rises_in_closed_form():
@@ -66,7 +177,7 @@ def test_rises_in_closed_form():
     d, crest = np.array([0.1, 0.4, 0.9, 0.6]), np.array([12.0, 9.0, 5.0, 3.0])
     at = d[:, None] + np.arange(4)
     std = np.full((4, 4), 1e-3)
-    for number, cut in ((0, 0.0), (5, OFFSETS[5] * 9.0)):  # r L
+    for number, cut in ((0, 0.0), (20, OFFSETS[20] * 9.0)):  # r L
         length = crest + d
 
         def height(t, length=length, cut=cut):
@@ -85,23 +196,29 @@ def test_rises_in_closed_form():
 
 @pytest.mark.parametrize("sign", (1.0, -1.0))
 def test_rim_of_a_dome_rises_by_more_than_the_trapezoid_rule(sign):
-    """Low domes and bowls: the excess of all edges, within 3 standard deviations of what each outline has in common."""
-    surface = dome(18.4, 5.0 * sign)
-    found = find_rims(noisy(surface, 1), NOISE)
-    for rims, axis in zip(found, (1, 0), strict=True):
-        at = rims.outline > 0
-        assert 100 < at.sum() < 300
-        towards = np.sign(np.where(at, np.diff(surface.height, axis=axis), 0.0))
-        true, expected, common = (np.sum(towards * f) for f in (excess(surface, axis), rims.gap, rims.common))
-        own = np.sqrt(np.sum(rims.sigma[at] ** 2))
-        assert abs(true - expected) < 3.0 * (own + abs(common)), (true, expected, own, common)
-        assert np.sum((excess(surface, axis) - rims.gap)[at] ** 2) < np.sum(excess(surface, axis)[at] ** 2)
+    """Half ellipsoids and bowls: off by less than by that rule, of 9 % of their height, and as stated."""
+    error, by_trapezoid, stated = rises_over_rims(dome(18.4, 5.0 * sign), 1, 0.25 * NOISE)
+    assert len(error) == 4
+    assert np.all(by_trapezoid > 0.3)
+    assert np.mean(error) < 0.9 * np.mean(by_trapezoid), (error, by_trapezoid)
+    assert np.all(np.abs(error) < 1.8 * stated), (error, stated)
+
+
+def test_pixels_that_no_image_shows_tell_nothing():
+    surface = noisy(dome(18.4, 5.0), 1)
+    noise = np.full(X.shape, NOISE)
+    noise[:, X[0] > 5.0] = np.inf
+    wild = Surface(surface.height, *(np.where(np.isinf(noise), 7.0, s) for s in (surface.slope_x, surface.slope_y)))
+    known, other = find_rims(surface, noise), find_rims(wild, noise)
+    for rims, others in zip(known, other, strict=True):
+        assert rims.is_rim.any()
+        np.testing.assert_array_equal(rims.outline, others.outline)
+        np.testing.assert_array_equal(rims.sigma, others.sigma)
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_no_rims_where_slopes_are_even(seed):
     """Cones and hills have none. False alarms: of 8 noise seeds none (the limit is a Bayes factor of exp(0.75))."""
-    assert DECISIVE > 0.5
     hill = 4.0 * np.exp(-0.5 * (X**2 + Y**2) / 8.0**2)
     hills = Surface(hill, -hill * X / 64.0, -hill * Y / 64.0)
     for surface in (cone(18.4, 8.0), hills):

@@ -303,7 +303,7 @@ def test_joined_scans_have_the_level_that_their_law_gives_them(crystal):
     law = joined_law((0.2, 0.02), (0.28, 0.02), (0.24, 0.02), (0.24, 0.02), (0.24, 0.02))
     assert law.exponent == pytest.approx(0.24)
     assert law.std == pytest.approx(0.02 * 2.0)
-    with pytest.raises(InputFileError, match=r"know m to 1\.1 only"):
+    with pytest.raises(InputFileError, match=r"determine m to \+- 1\.1 only"):
         joined_law((0.0, 0.4), (1.6, 0.4), (0.0, 0.4), (0.0, 0.4), (0.0, 0.4))
     with pytest.raises(InputFileError, match="must agree on the scattering law"):
         joined_law((0.0, 0.2), (0.3, 0.2), (0.1, 0.001), (0.15, 0.001), (0.1, 0.2))
