@@ -253,23 +253,27 @@ def find_rims(
 
 
 def _outlines(found: dict[tuple[int, int], _Candidates], shape: tuple[int, ...]) -> dict[tuple[int, int], np.ndarray]:
-    """Number the outline of every candidate [candidate], those of neighbouring domes and of a ring's two sides apart.
+    """Number the outline of every candidate [candidate].
+
+    Those of neighbouring domes, of domes and bowls, and of the two sides of a ring differ.
 
     Args:
         found: candidates along each axis in each direction.
         shape: of the image.
     """
-    within, body, eight = np.zeros(shape, bool), np.zeros(shape, bool), np.ones((3, 3))
+    within, body = np.zeros(shape, bool), np.zeros((2, *shape), bool)  # of bowls, of domes
+    kinds = {way: (c.slope[:, 0] > 0.0).astype(int) for way, c in found.items()}
     for (axis, sign), c in found.items():
         within[c.y, c.x] = True
         up = sign * np.arange(0.5 + np.max(c.crest, initial=0.0), dtype=int)
-        at = (c.y[:, None], c.x[:, None] + up) if axis == 1 else (c.y[:, None] + up, c.x[:, None])
-        at = tuple(np.broadcast_arrays(*at))
-        is_raised = np.abs(up) <= 0.5 + c.crest[:, None]
-        body[tuple(index[is_raised] for index in at)] = True
-    rim, _ = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
-    raised, n_raised = label(body)  # type: ignore[misc]
-    return {way: rim[c.y, c.x] * (n_raised + 1) + raised[c.y, c.x] for way, c in found.items()}
+        y, x = (c.y[:, None], c.x[:, None] + up) if axis == 1 else (c.y[:, None] + up, c.x[:, None])
+        is_part = np.abs(up) <= 0.5 + c.crest[:, None]
+        at = np.broadcast_arrays(kinds[axis, sign][:, None], y, x)
+        body[tuple(index[is_part] for index in at)] = True
+    eight, four = np.ones((3, 3)), np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])
+    rim, n_rims = label(binary_dilation(within, eight), eight)  # type: ignore[misc]  # SciPy's stubs
+    part, _ = label(body, four * np.array([0, 1, 0])[:, None, None])  # type: ignore[misc]
+    return {way: rim[c.y, c.x] + (n_rims + 1) * part[kinds[way], c.y, c.x] for way, c in found.items()}
 
 
 class _Side(NamedTuple):
