@@ -22,7 +22,7 @@ MAX_CONTRADICTED = 0.05
 """Largest share of contradicted pixels, among those that nothing else makes invalid, of a height map that its data do
 not contradict as a whole; regions that are contradicted as a whole count with all of their pixels."""
 MAX_CONTRADICTED_REGION = 0.1
-"""Largest share of contradicted pixels of a region that depth jumps part from the rest and that the data do not
+"""Largest share of contradicted pixels of a region that depth jumps separate from the rest and that the data do not
 contradict as a whole: what is fitted of it, its level included, leans on all of its data."""
 
 MEANINGS = {
@@ -32,8 +32,8 @@ MEANINGS = {
     ),
     "masked in too many detectors": f"fewer than {FACET_IMAGES} images are informative: the others are masked there",
     "depth jump": (
-        "refine cuts the surface there, or contradicts the data of the 3 x 3 pixels (mean square residual above "
-        f"{EXPLAINED:g}); linear and nearfield find no jumps"
+        "refine cuts the surface there, or its fit does not explain the data of the 3 x 3 pixels (mean square residual "
+        f"above {EXPLAINED:g}); linear and nearfield do not mark jumps"
     ),
     "outside the data": "the pixel was not recorded",
     "floating": (
@@ -41,9 +41,10 @@ MEANINGS = {
         "another level explains the data as well"
     ),
     "contradicts the data": (
-        "micrographs traced on the map deviate from the data of the 3 x 3 pixels by a mean square above "
-        f"{CHI_SQUARE_LIMIT:g} standard deviations (times the median where instrument or calibration are uncertain); "
-        f"or the pixel is in a region between depth jumps of which more than {MAX_CONTRADICTED_REGION:.0%} does so"
+        "the mean square of the deviations of the data from micrographs traced on the map, in standard deviations, is "
+        f"above {CHI_SQUARE_LIMIT:g} over the 3 x 3 pixels (above {CHI_SQUARE_LIMIT:g} times its median where "
+        f"instrument or calibration are uncertain); or this holds for more than {MAX_CONTRADICTED_REGION:.0%} of a "
+        "region between depth jumps that contains the pixel"
     ),
 }
 """What each reason means, in words."""
