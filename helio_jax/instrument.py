@@ -282,7 +282,7 @@ class Instrument(Drawable, Settings):
         return any(d.beam_deg is not None for d in self.detector)
 
     def by_beam(self) -> tuple[tuple["Instrument", tuple[int, ...]], ...]:
-        """Split into instruments of one beam each, with the indices of their detectors."""
+        """Split into instruments of one beam each, without [covariance], with the indices of their detectors."""
         if not self.has_several_beams:
             return ((self, tuple(range(len(self.detector)))),)
         default = self.beam.incidence_deg, self.beam.azimuth_deg
@@ -293,7 +293,8 @@ class Instrument(Drawable, Settings):
         for (incidence, azimuth), of_beam in members.items():
             beam = self.beam.changed(incidence_deg=incidence, azimuth_deg=azimuth)
             detectors = tuple(self.detector[k].model_copy(update={"beam_deg": None}) for k in of_beam)
-            out.append((self.model_copy(update={"beam": beam, "detector": detectors, "readout": None}), tuple(of_beam)))
+            update = {"beam": beam, "detector": detectors, "readout": None, "covariance": None}
+            out.append((self.model_copy(update=update), tuple(of_beam)))
         return tuple(out)
 
     @property

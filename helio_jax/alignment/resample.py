@@ -108,10 +108,10 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
     """Combine the apertures and laws of all scans in one instrument, each rotated back by its sample's rotation.
 
     Where a scan's beam is oblique, each detector keeps the beam of its scan, and the raster sees the sample straight
-    down (`Instrument.has_several_beams`). How far the geometry may be off is that of the first scan's file, the same in
-    all scans (`errors_in_common`).
+    down (`Instrument.has_several_beams`). Where the geometry is uncertain, its errors are the same in all scans
+    (`errors_in_common`).
     """
-    detectors = []
+    detectors, names = [], _joined_names(stacks)
     beams = [s.instrument.beam for s in stacks]
     is_oblique = any(b.incidence_deg for b in beams)
     for stack, motion in zip(stacks, motions, strict=True):
@@ -123,7 +123,7 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
             rotation = math.degrees(aperture.rotation - motion.rotation)
             detectors.append(
                 Detector(
-                    name=f"{stack.name} {detector.name}"[:64],
+                    name=names[len(detectors)],
                     center_um=(float(center[0]), float(center[1])),
                     axes_um=(2 * aperture.semi_axes[0], 2 * aperture.semi_axes[1]),
                     rotation_deg=math.remainder(rotation, 360.0),
@@ -132,9 +132,36 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
                 )
             )
     beam = beams[0].changed(incidence_deg=0.0, azimuth_deg=0.0) if is_oblique else beams[0]
-    covariance = errors_in_common(stacks[0].instrument, [d.name for d in detectors])
+    covariance = errors_in_common(stacks[0].instrument, names)
     update = {"beam": beam, "detector": tuple(detectors), "law": _joined_law(stacks), "covariance": covariance}
     return stacks[0].instrument.model_copy(update=update)
+
+
+def _joined_names(stacks: Sequence[MicrographStack]) -> list[str]:
+    """Name the detectors of joined scans by scan and detector, each name once and of at most 64 characters."""
+    parts = [(number, stack.name, d.name) for number, stack in enumerate(stacks, 1) for d in stack.instrument.detector]
+    names = [f"{scan[: 63 - len(detector)]} {detector}" for _, scan, detector in parts]
+    if len(set(names)) == len(names):
+        return names
+    return [f"{number} {scan}"[: 63 - len(detector)] + f" {detector}" for number, scan, detector in parts]
+
+
+def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
+    """Refuse scans that have no errors in common (`errors_in_common`); raises as `check_joinable`."""
+    first = stacks[0].instrument
+    is_uncertain = first.uncertainty.is_stated or first.covariance is not None
+    for stack in stacks[1:]:
+        other = stack.instrument
+        for what, a, b in (
+            ("[uncertainty]", first.uncertainty, other.uncertainty),
+            ("[covariance]", first.covariance, other.covariance),
+            ("detectors", first.detector_names if is_uncertain else (), other.detector_names if is_uncertain else ()),
+        ):
+            if a != b:
+                raise InputFileError(
+                    f"scans that are joined must be by one instrument, but {what} of {stack.name!r} and "
+                    f"{stacks[0].name!r} differ: import them with the same instrument file"
+                )
 
 
 def check_joinable(stacks: Sequence[MicrographStack]) -> None:
@@ -142,7 +169,8 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 
     Raises:
         InputFileError: some are calibrated in another way than others, or state scattering laws that disagree or that
-            determine the exponent too badly.
+            determine the exponent too badly; or their instruments differ in [uncertainty] or [covariance], or, where
+            either is stated, in the names of their detectors.
     """
     kinds = {None if c is None else (c.method, c.without_multiple) for c in (s.calibration for s in stacks)}
     if len(kinds) > 1:
@@ -151,6 +179,7 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
             f"scans that are joined must be calibrated alike, got {names}: calibrate all imported files alike (helio "
             "calibrate); simulated and measured scans cannot be joined"
         )
+    _check_uncertainties(stacks)
     _joined_law(stacks)
 
 

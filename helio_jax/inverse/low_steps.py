@@ -67,9 +67,9 @@ _GAIN = 30.0
 in every round."""
 _SHAPE_STD, _SHAPE_STD_AWAY = 0.05, 0.8
 """Standard deviation of heights by the shape of the wall, as a fraction of the height found: 0.05, for staircases of
-facets a quarter of a pixel wide come out 10 % too low. Of a wall of 45 deg or less that faces away from the beam 0.05 +
-0.8 t . n, t . n the tangent of the incidence across it: the beam sees little of it, and at 30 deg those of two facets
-come out up to 40 % too low, which is 67 % of the height found."""
+facets a quarter of a pixel wide come out 10 % too low. Of a wall that faces away from the beam 0.8 t . n min(1, width /
+height) is added, t . n the tangent of the incidence across it: the beam sees little of a sloping one, and at 30 deg
+those of two facets come out up to 40 % too low, which is 67 % of the height found."""
 
 _Modelled = tuple[int, np.ndarray, np.ndarray]
 """A detector's number, and its signal and error of the model."""

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
-from helio_jax.alignment.resample import joined_instrument
+from helio_jax.alignment.resample import check_joinable, joined_instrument
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.errors import SceneError
+from helio_jax.errors import InputFileError, SceneError
 from helio_jax.forward.render import Corrections
-from helio_jax.geometry_prior import GeometryPrior
+from helio_jax.geometry_prior import ROTATION_STD_DEG, GeometryPrior
 from helio_jax.instrument import Covariance, Uncertainty
 from helio_jax.inverse.fit import _incidence_error
 from helio_jax.inverse.instrument_report import units_of
@@ -93,9 +93,10 @@ def test_turned_scans_share_the_errors_of_their_plate(bshem):
     joined = joined_instrument(scans, motions)
     found, own = GeometryPrior.of(joined).covariance, GeometryPrior.of(one).covariance
     floor = 3e-6 * np.diag(own).max()
+    turned = np.zeros((12, 12))  # the second scan's azimuths are off by its rotation, too
+    turned[7::2, 7::2] = math.radians(ROTATION_STD_DEG) ** 2
+    assert found[1:, 1:] == pytest.approx(np.tile(own[1:, 1:], (2, 2)) + turned, rel=1e-5, abs=floor)
     for rows in (slice(1, 7), slice(7, 13)):
-        for columns in (slice(1, 7), slice(7, 13)):
-            assert found[rows, columns] == pytest.approx(own[1:, 1:], rel=1e-5, abs=floor)
         assert found[0, rows] == pytest.approx(own[0, 1:], rel=1e-5, abs=1e-9)
     assert found[0, 0] == pytest.approx(own[0, 0], rel=1e-5)
 
@@ -108,12 +109,17 @@ def test_turned_scans_share_the_errors_of_their_plate(bshem):
     alone = joined_instrument(
         tuple(s.replace(instrument=with_plate_error(bshem, std=(SHIFT, 0.0, 0.0))) for s in scans), motions
     )
-    expected = SHIFT**2 * np.outer(by_shift, by_shift)
+    expected = SHIFT**2 * np.outer(by_shift, by_shift) + turned
     assert GeometryPrior.of(alone).covariance[1:, 1:] == pytest.approx(expected, rel=5e-3, abs=1e-5 * expected.max())
     known = joined_instrument(
         tuple(s.replace(instrument=bshem.model_copy(update={"uncertainty": Uncertainty()})) for s in scans), motions
     )
     assert known.covariance is None
+    long = tuple(s.replace(name=f"{'a' * 70} {k}") for k, s in enumerate(scans))
+    assert GeometryPrior.of(joined_instrument(long, motions)).covariance == pytest.approx(found)
+    for wrong in (one.model_copy(update={"uncertainty": Uncertainty()}), bshem):
+        with pytest.raises(InputFileError, match=r"must be by one instrument, but \[uncertainty\] of 'scan 1'"):
+            check_joinable((scans[0], scans[1].replace(instrument=wrong)))
 
 
 def test_covariance_of_another_instrument_is_refused(bshem):

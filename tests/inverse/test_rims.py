@@ -1,5 +1,6 @@
 """Rims of domes: rises in closed form, none elsewhere, and a traced low dome whose height the trapezoid rule misses."""
 
+import math
 from pathlib import Path
 
 import jax
@@ -209,15 +210,37 @@ def test_rim_of_a_dome_rises_by_more_than_the_trapezoid_rule(sign):
     assert np.all(np.abs(error) < 1.8 * stated), (error, stated)
 
 
-def test_pixels_that_no_image_shows_tell_nothing():
+@pytest.mark.parametrize("fill", (0.0, 7.0, -7.0))
+@pytest.mark.parametrize("border", (-3.0, 5.0))
+def test_pixels_that_no_image_shows_tell_nothing(border, fill):
+    """Whatever stands in pixels that are not observed, before the crest of a dome or beyond it."""
     surface = noisy(dome(18.4, 5.0), 1)
     noise = np.full(X.shape, NOISE)
-    noise[:, X[0] > 5.0] = np.inf
-    wild = Surface(surface.height, *(np.where(np.isinf(noise), 7.0, s) for s in (surface.slope_x, surface.slope_y)))
-    known, other = find_rims(surface, noise), find_rims(wild, noise)
+    noise[:, X[0] > border] = np.inf
+    slopes = (np.where(np.isinf(noise), fill, s) for s in (surface.slope_x, surface.slope_y))
+    known, other = find_rims(surface, noise), find_rims(Surface(surface.height, *slopes), noise)
+    assert known[1].is_rim.any()
     for rims, others in zip(known, other, strict=True):
-        assert rims.is_rim.any()
         np.testing.assert_array_equal(rims.outline, others.outline)
+        np.testing.assert_array_equal(rims.sigma, others.sigma)
+
+
+def test_rims_do_not_depend_on_the_azimuth_of_the_beam():
+    """The same dome under beams at 0, 90 and 180 deg, and a beam so steep that nothing is hidden."""
+    tangent = math.tan(math.radians(30.0))
+    rounding = 1e-17
+    seen = noisy(ellipsoid((9.0, 9.0), 8.0, share=0.9, shift=(tangent, 0.0)), 1)
+    at_0 = find_rims(seen, NOISE, (tangent, rounding))
+    transposed = Surface(*(np.ascontiguousarray(f.T) for f in (seen.height, seen.slope_y, seen.slope_x)))
+    at_90 = find_rims(transposed, NOISE, (rounding, tangent))
+    mirrored = Surface(*(f[:, ::-1] for f in (seen.height, -seen.slope_x, seen.slope_y)))
+    at_180 = find_rims(mirrored, NOISE, (-tangent, -rounding))
+    assert at_0[0].is_rim.sum() > 20 and at_0[1].is_rim.sum() > 100
+    for axis in (0, 1):
+        np.testing.assert_allclose(at_90[1 - axis].sigma.T, at_0[axis].sigma, rtol=1e-9)
+        np.testing.assert_allclose(at_180[axis].sigma[:, ::-1], at_0[axis].sigma, rtol=1e-9)
+    steep = noisy(ellipsoid((9.0, 9.0), 8.0, share=0.9), 1)
+    for rims, others in zip(find_rims(steep, NOISE), find_rims(steep, NOISE, (0.002, 0.0)), strict=True):
         np.testing.assert_array_equal(rims.sigma, others.sigma)
 
 
