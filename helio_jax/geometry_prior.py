@@ -18,8 +18,8 @@ _STEP = 0.1
 """Step of the difference quotients, in standard deviations of a parameter."""
 _INDEPENDENT = 1e-3
 """Least independent share of the standard deviation of a direction: the plate's few motions do not determine all."""
-ROTATION_STD_DEG = 0.3
-"""Standard deviation of a scan's rotation against the first one's, as `alignment.correction` takes it."""
+ROTATION_STD = math.radians(0.3)
+"""Standard deviation of the rotation that the stage states between two scans [rad]."""
 _WIDER = 1.01
 """[uncertainty] widens what [covariance] states where it is larger by more than this factor."""
 
@@ -96,7 +96,7 @@ def errors_in_common(instrument: Instrument, names: Sequence[str]) -> Covariance
     """State the errors of one instrument for several scans by it, between which the sample was turned.
 
     Distance, polar angles and azimuths are off by the same in all scans, for each sees the same plate; the azimuths of
-    every scan but the first also by the error of its rotation (`ROTATION_STD_DEG`).
+    every scan but the first also by the error of its rotation (`ROTATION_STD`).
 
     Args:
         instrument: of every scan.
@@ -106,17 +106,15 @@ def errors_in_common(instrument: Instrument, names: Sequence[str]) -> Covariance
         [covariance] of the joined scans; None where nothing is uncertain.
     """
     prior = GeometryPrior.of(instrument).covariance
+    if not prior.any():
+        return None
     of_detector = 1 + 2 * (np.arange(len(names)) % len(instrument.detector))
     own = np.concatenate([[0], np.stack([of_detector, of_detector + 1], 1).ravel()])
     joint = prior[np.ix_(own, own)]
     scan = np.arange(len(names)) // len(instrument.detector)
-    is_turned = (scan[:, None] == scan) & (scan > 0)
-    if np.any(joint):
-        joint[2::2, 2::2] += math.radians(ROTATION_STD_DEG) ** 2 * is_turned
+    joint[2::2, 2::2] += ROTATION_STD**2 * ((scan[:, None] == scan) & (scan > 0))
     parameters = ("sample distance", *(f"{kind} of {name}" for name in names for kind in ("polar", "azimuth")))
     is_known = np.diag(joint) <= 0.0
-    if is_known.all():
-        return None
     degrees: tuple[Literal["deg"], ...] = ("deg",) * (len(parameters) - 1)
     std = np.sqrt(np.diag(joint))
     correlation = joint / np.outer(*2 * [np.where(is_known, 1.0, std)]) + np.diag(1.0 * is_known)

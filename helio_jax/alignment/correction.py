@@ -18,14 +18,15 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import pitch, robust_std
 from helio_jax.block_fit import eliminate
 from helio_jax.errors import GuardError
+from helio_jax.geometry_prior import ROTATION_STD
 from helio_jax.robust import cauchy_weight
 
 ROBUST_LIMIT = 2.0
 """Residual at which a datum counts half, in robust standard deviations: masks and shadows are in no normal."""
 REWEIGHTINGS = 5
 """Solutions with weights of the one before."""
-SHIFT_STD, ROTATION_STD = 3.0, math.radians(0.3)
-"""Assumed standard deviations of the stage's shifts [pixels] and rotations [rad]."""
+SHIFT_STD = 3.0
+"""Assumed standard deviation of the stage's shifts [pixels]; of its rotations: `ROTATION_STD`."""
 N_OWN = 3
 """Unknowns of a pixel: albedo times normal."""
 WORST_CONDITION = 1e-10

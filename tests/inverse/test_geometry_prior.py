@@ -12,7 +12,7 @@ from helio_jax.alignment.resample import check_joinable, joined_instrument
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.forward.render import Corrections
-from helio_jax.geometry_prior import ROTATION_STD_DEG, GeometryPrior
+from helio_jax.geometry_prior import ROTATION_STD, GeometryPrior
 from helio_jax.instrument import Covariance, Uncertainty
 from helio_jax.inverse.fit import _incidence_error
 from helio_jax.inverse.instrument_report import units_of
@@ -94,7 +94,7 @@ def test_turned_scans_share_the_errors_of_their_plate(bshem):
     found, own = GeometryPrior.of(joined).covariance, GeometryPrior.of(one).covariance
     floor = 3e-6 * np.diag(own).max()
     turned = np.zeros((12, 12))  # the second scan's azimuths are off by its rotation, too
-    turned[7::2, 7::2] = math.radians(ROTATION_STD_DEG) ** 2
+    turned[7::2, 7::2] = ROTATION_STD**2
     assert found[1:, 1:] == pytest.approx(np.tile(own[1:, 1:], (2, 2)) + turned, rel=1e-5, abs=floor)
     for rows in (slice(1, 7), slice(7, 13)):
         assert found[0, rows] == pytest.approx(own[0, 1:], rel=1e-5, abs=1e-9)
