@@ -110,3 +110,52 @@ class EdgeError:
         common = np.zeros((self.run.max(initial=0) + 1, influence.shape[1]))
         np.add.at(common, self.run, np.sqrt(self.share)[:, None] * influence)
         return own.T @ own + common.T @ common
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What is assumed of the errors of a fit's residuals; those of which nothing is said are independent.
+
+    Attributes:
+        model: of the predicted data, the first residuals.
+        edges: of the edges between pixels, the next ones.
+        unfitted: change of the first residuals, those of the data and then of the edges, by one standard deviation of
+            each number that is uncertain but not fitted [residual, number]: a fit that takes it as stated answers to
+            its error as to noise.
+    """
+
+    model: ModelError | None = None
+    edges: EdgeError | None = None
+    unfitted: np.ndarray | None = None
+
+    def _parts(self) -> tuple[list[tuple[ModelError | EdgeError, slice]], int]:
+        """The errors with their rows, and the number of these."""
+        parts: list[tuple[ModelError | EdgeError, slice]] = []
+        n = 0
+        for assumed in (self.model, self.edges):
+            if assumed is not None:
+                parts.append((assumed, slice(n, n + assumed.share.size)))
+                n += assumed.share.size
+        return parts, n
+
+    def _considered(self, n_residuals: int) -> np.ndarray:
+        """Return `unfitted` for all residuals [residual, number]."""
+        considered = np.zeros((n_residuals, 0 if self.unfitted is None else self.unfitted.shape[1]))
+        if self.unfitted is not None:
+            considered[: len(self.unfitted)] = self.unfitted
+        return considered
+
+    def draw(self, rng: np.random.Generator, white: np.ndarray) -> np.ndarray:
+        """Draw errors of all residuals from independent ones [residual, sample]."""
+        noise = white.copy()
+        for assumed, rows in self._parts()[0]:
+            noise[rows] = assumed.draw(rng, noise[rows])
+        considered = self._considered(len(noise))
+        return noise + considered @ rng.standard_normal((considered.shape[1], noise.shape[1]))
+
+    def covariance(self, influence: np.ndarray) -> np.ndarray:
+        """Compute the covariance of the sums of the residuals' errors weighted by `influence` [residual, parameter]."""
+        parts, n = self._parts()
+        by_unfitted = influence.T @ self._considered(len(influence))
+        of_parts = [assumed.covariance(influence[rows]) for assumed, rows in parts]
+        return sum(of_parts, influence[n:].T @ influence[n:]) + by_unfitted @ by_unfitted.T

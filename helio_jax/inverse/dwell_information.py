@@ -13,7 +13,7 @@ import scipy.sparse as sparse
 
 from helio_jax.inverse.edges import noise_of_edges
 from helio_jax.inverse.fit import LinearisedFit, inflated, linearised_at
-from helio_jax.inverse.posterior import Linearised, Posterior, sample_posterior, tilts_of
+from helio_jax.inverse.posterior import Linearised, Marginal, Posterior, sample_posterior, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.state import FitState
@@ -125,8 +125,13 @@ class DwellInformation:
 
     def residual_factor(self, seconds: np.ndarray, edge_factor: np.ndarray | float) -> np.ndarray:
         """Compute the factor of the residuals of data, then of edges [residual]; arguments as `linear_at`."""
-        of_edges = np.broadcast_to(edge_factor, self.at.edge_error.run.size)
+        of_edges = np.broadcast_to(edge_factor, self._n_edges)
         return np.concatenate([np.sqrt(self.information(seconds)[0]).ravel(), of_edges])
+
+    @property
+    def _n_edges(self) -> int:
+        (ny, nx) = self.at.linear.shape
+        return ny * (nx - 1) + (ny - 1) * nx
 
     def noise_ratio(self, seconds: np.ndarray) -> np.ndarray:
         """Compute how much less noise every pixel has than so far, by all of its images [y, x]; 1 without such."""
@@ -162,10 +167,12 @@ class DwellInformation:
         edge_factor = self.edge_factor(t)
         linear = self.linear_at(t, edge_factor)
         share = np.where(self.is_observed, self.model * t / (self.counting + self.model * t), 0.0)
-        error = replace(self.at.error, share=share)
         # of data with smaller standard deviations the same error is more of them
-        unfitted = self.residual_factor(t, edge_factor)[:, None] * self.at.unfitted
-        found = sample_posterior(linear, n_samples, error=error, edge_error=self.at.edge_error, unfitted=unfitted)
+        before = self.at.errors
+        assert before.model is not None and before.unfitted is not None
+        unfitted = self.residual_factor(t, edge_factor)[:, None] * before.unfitted
+        errors = replace(before, model=replace(before.model, share=share), unfitted=unfitted)
+        found = sample_posterior(linear, n_samples, errors=errors)
         return inflated(found.levelled(self.at.planes), self.state).on_raster(self.shape, self.at.stride)
 
 
@@ -222,14 +229,8 @@ class RegionVariance:
         """
         about = self.about
         t = about.thinned(seconds)
-        linear = about.linear_at(t, self.edge_factor)
-        jc, solve = linear.instrument, linear.solver()
-        border = linear.transposed(jc)
-        answer = solve(border)
-        own = np.linalg.inv(jc.T @ jc - border.T @ answer)
-        free = solve(self.of_surface)
-        instrument = own @ (self.of_instrument - answer.T @ self.of_surface)
-        surface = free - answer @ instrument
+        left = Marginal.of(about.linear_at(t, self.edge_factor))
+        surface, instrument = left.with_sums(self.of_surface, self.of_instrument)
         value = float(np.sum(self.of_surface * surface) + np.sum(self.of_instrument * instrument))
         at_fit = about.at.linear
         seen = _data_rows(at_fit, surface, instrument, t.size)

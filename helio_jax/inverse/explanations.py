@@ -5,8 +5,8 @@ the border is free, of a step in the beam's shadow (`shadow_steps`). Where the d
 objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any
 images: there, patches are tried first, and so they are on a substrate that is too dark. With a flat border they are
 also tried where the fit moves the instrument far beyond what is stated (`is_strained`), and so are, at the end, gains
-and offsets that are not what is stated (`wider_readout`). A level that explains the images about as well as the one
-that is kept is undecided.
+and offsets that are not what is stated (`wider_readout`). At last the geometry is tested, where it is stated as exact
+(`geometry_score`). A level that explains the images about as well as the one that is kept is undecided.
 """
 
 import math
@@ -25,6 +25,7 @@ from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.surface import Surface, surface_of_heights
+from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
@@ -38,6 +39,7 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
+from helio_jax.inverse.geometry_score import LIKELY, largest_changes, score_geometry, usual_uncertainty
 from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -185,6 +187,7 @@ def explain(
             fits.say(f"another explanation is given up: {e}")
         except KeyboardInterrupt:
             best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
+    best = fits.with_likely_geometry(best)
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
     return best._replace(fit=fit, steps=fits.steps)
 
@@ -284,8 +287,9 @@ class _Fits:
         region: np.ndarray | None = None,
         anchors: Anchors | None = None,
         settings: ReconstructSettings | None = None,
+        uncertainty: Uncertainty | None = None,
     ) -> FitProblem:
-        """Pose the fit from a surface on; `settings`: other ones than stated."""
+        """Pose the fit from a surface on; `settings`, `uncertainty` of the instrument: other ones than stated."""
         return FitProblem.of(
             *signal_of(self.stack),
             self.stack.instrument,
@@ -294,6 +298,7 @@ class _Fits:
             settings or self.settings,
             region,
             scan_order(self.stack),
+            uncertainty=uncertainty,
             patches=patches,
             anchors=anchors,
             parallax=parallax_of(self.stack),
@@ -590,6 +595,30 @@ class _Fits:
                 fit = interrupted(fit, OTHER_TRIED)
                 break
         return None if fit is best.fit else best._replace(fit=fit)
+
+    def with_likely_geometry(self, best: Explanation) -> Explanation:
+        """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
+
+        That fit is kept if it explains data and instrument better (`LIKELY`).
+        """
+        fit = best.fit
+        score = None if fit.is_interrupted else score_geometry(fit)
+        if score is None or not score.is_likely:
+            return best
+        self.say(f"the geometry is fitted, too, for the micrographs ask for {largest_changes(score.values)}")
+        problem, surface = fit.problem, fit.state.surface
+        known = problem.patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
+        try:
+            found = self.fitted(surface, surface, *known)
+            if found.is_interrupted:
+                return best._replace(fit=interrupted(fit, OTHER_TRIED))
+            gained = improvement(self.residuals(fit), self.residuals(found)) + instrument_improvement(fit, found)
+            return best._replace(fit=replace(found, geometry_score=score)) if gained > LIKELY else best
+        except PredictionError as e:
+            self.say(f"another geometry is given up: {e}")
+            return best
+        except KeyboardInterrupt:
+            return best._replace(fit=interrupted(fit, OTHER_TRIED))
 
     def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
         """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""

@@ -7,7 +7,7 @@ robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is con
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import contraction_of, extrapolation, remaining_error, status_of
-from helio_jax.inverse.correlated_errors import EdgeError, ModelError
+from helio_jax.inverse.correlated_errors import EdgeError, Errors, ModelError
 from helio_jax.inverse.edges import AxisEdges
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
@@ -35,6 +35,9 @@ from helio_jax.inverse.state import FitState, Predict, between, predict_correcti
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
+
+if TYPE_CHECKING:
+    from helio_jax.inverse.geometry_score import GeometryScore
 
 ALTERNATING, LEAST_RELAXATION = 0.6, 0.3
 """Extrapolation below which the next iteration is relaxed: each change undoes two thirds of the last (iterates that
@@ -77,6 +80,7 @@ class Fit:
         is_bias_subtracted: whether the bias by noise was subtracted.
         prior_widths: standard deviations of the priors of gains and offsets over those stated, by the names of the
             parameters; empty: as stated.
+        geometry_score: what the data said of a geometry that is stated as exact, where it was fitted for that.
     """
 
     problem: FitProblem
@@ -101,6 +105,7 @@ class Fit:
     is_interrupted: bool = False
     is_bias_subtracted: bool = False
     prior_widths: Mapping[str, float] = field(default_factory=dict)
+    geometry_score: "GeometryScore | None" = None
 
     @property
     def chi_square(self) -> list[float]:
@@ -117,8 +122,7 @@ def posterior_at(problem: FitProblem, state: FitState, n_samples: int, sums: Anc
     at = linearised_at(problem, state)
     thin = (slice(None, None, at.stride),) * 2
     of_sums = None if sums is None else derivative_of_sums(sums.thinned(thin), at.planes, at.linear)
-    known = {"error": at.error, "edge_error": at.edge_error, "sums": of_sums, "unfitted": at.unfitted}
-    found = sample_posterior(at.linear, n_samples, **known)
+    found = sample_posterior(at.linear, n_samples, errors=at.errors, sums=of_sums)
     return inflated(found.levelled(at.planes), state).on_raster(problem.raster.shape, at.stride)
 
 
@@ -127,22 +131,18 @@ class LinearisedFit(NamedTuple):
 
     Attributes:
         linear: its residuals.
-        error, edge_error: what is assumed of errors that agree between neighbours.
+        errors: what is assumed of the errors of the residuals.
         planes: heights of the substrate for one prior standard deviation of each tilt [2, y, x], um.
         problem, state: on the thinned raster.
         stride: thinning.
-        unfitted: change of the residuals of data and edges by numbers that are uncertain and not fitted
-            (`sample_posterior`) [residual, number].
     """
 
     linear: Linearised
-    error: ModelError
-    edge_error: EdgeError
+    errors: Errors
     planes: np.ndarray
     problem: FitProblem
     state: FitState
     stride: int
-    unfitted: np.ndarray
 
 
 def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
@@ -161,7 +161,7 @@ def linearised_at(problem: FitProblem, state: FitState) -> LinearisedFit:
     rim_errors = _rim_errors(edges, fixed, linear.edge_scale)
     of_data = np.hstack([_incidence_error(part, unknowns, fixed), _law_error(part, linear)])
     unfitted = np.asarray(block_diag(of_data, rim_errors))
-    return LinearisedFit(linear, error, edge_error, planes, part, there, stride, unfitted)
+    return LinearisedFit(linear, Errors(error, edge_error, unfitted), planes, part, there, stride)
 
 
 def inflated(posterior: Posterior, state: FitState) -> Posterior:

@@ -6,6 +6,7 @@ instrument from the stack, and, if the settings say so, that the border of the i
 """
 
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache, partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -134,6 +135,7 @@ def _check_finite(rec: Reconstruction) -> None:
 
 def warnings_of(fit: "Fit") -> tuple[str, ...]:
     """List what to know before the heights of a fit are trusted."""
+    from helio_jax.inverse.geometry_score import geometry_warnings
     from helio_jax.inverse.wider_readout import warning_of
 
     tolerance = fit.problem.settings.tolerance_um
@@ -151,7 +153,8 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
             "what was fitted of instrument and model deviates more from what is stated than its uncertainty explains: "
             f"all error bars are inflated by {fit.posterior.inflation:.1f}"
         )
-    if fit.parameters.aim.size or fit.parameters.distance.size:
+    found += geometry_warnings(fit)
+    if fit.geometry_score is None and (fit.parameters.aim.size or fit.parameters.distance.size):
         found.append(GEOMETRY_WARNING)
     if fit.problem.settings.has_own_law:
         found.append(LAW_WARNING)
@@ -256,6 +259,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
             "chi_square": fit.chi_square,
             "assumed": found.assumed,
             "readout_priors": priors_of(fit),
+            "geometry_score": None if fit.geometry_score is None else asdict(fit.geometry_score),
             "anchors": as_records(anchors),
         },
     )

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.surface import Surface, along
-from helio_jax.inverse.correlated_errors import EdgeError, ModelError
+from helio_jax.inverse.correlated_errors import Errors
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.residuals import (
     SLOPE_STD,
@@ -320,83 +320,93 @@ def linearise(unknowns: Unknowns, fixed: FixedTerms) -> Linearised:
     return Linearised(matrix, by_instrument, common, of_surface, tuple(names), shape, float(scale))
 
 
+@dataclass(frozen=True)
+class Marginal:
+    """What linearised residuals tell of the instrument, the surface marginalised; all errors are independent.
+
+    Attributes:
+        linear: the residuals.
+        solve: solves with the information matrix of the surface, for [3 * pixel, ...].
+        answer: minus the change of the surface when a parameter is forced [3 * pixel, parameter].
+        covariance: of the parameters, in prior deviations [parameter, parameter].
+    """
+
+    linear: Linearised
+    solve: Callable[[np.ndarray], np.ndarray]
+    answer: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, linear: Linearised) -> "Marginal":
+        """Factorise the information.
+
+        Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1.
+        """
+        jc, solve = linear.instrument, linear.solver()
+        border = linear.transposed(jc)
+        answer = solve(border)
+        return cls(linear, solve, answer, np.linalg.inv(jc.T @ jc - border.T @ answer))
+
+    def influence(self) -> np.ndarray:
+        """Compute by how much every residual, were it larger, would lower the parameters [residual, parameter]."""
+        return (self.linear.instrument - self.linear.apply(self.answer)) @ self.covariance
+
+    def with_sums(self, of_surface: np.ndarray, of_instrument: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the covariance of surface [3 * pixel, sum] and parameters [parameter, sum] with sums of both.
+
+        Args:
+            of_surface, of_instrument: derivatives of the sums, of the same shapes.
+        """
+        instrument = self.covariance @ (of_instrument - self.answer.T @ of_surface)
+        return self.solve(of_surface) - self.answer @ instrument, instrument
+
+
 def sample_posterior(
     linear: Linearised,
     n_samples: int,
     seed: int = 0,
-    error: ModelError | None = None,
-    edge_error: EdgeError | None = None,
+    errors: Errors = Errors(),
     sums: np.ndarray | None = None,
-    unfitted: np.ndarray | None = None,
 ) -> Posterior:
     """Factorise the information and draw samples of the joint posterior.
 
-    With a `ModelError` or an `EdgeError` the fit is still the one that takes all errors for independent, as it was
-    done; its spread is that of data, or edges, whose errors are not.
+    The fit is the one that takes all errors for independent, as it was done; its spread is that of data and edges with
+    the errors that are assumed.
 
     Args:
         linear: residuals at the fit, from `linearise`, those of the data first, then those of the edges.
         n_samples: samples.
         seed: of the noise.
-        error: what is assumed of the predicted data.
-        edge_error: what is assumed of the edges between pixels.
+        errors: what is assumed of the errors of the residuals; default: independent.
         sums: derivative of sums whose covariance with all else is wanted, with respect to the surface and then the
             instrument [3 * pixel + parameter, sum].
-        unfitted: change of the first residuals, those of the data and then of the edges, by one standard deviation of
-            each number that is uncertain but not fitted [residual, number]: a fit that takes it as stated answers to
-            its error as to noise.
 
-    Source: Schur complement: Triggs et al., Bundle Adjustment (2000), sec. 6.1; numbers that are not fitted: Schmidt,
-        Adv. Control Syst. 3 (1966) 293 (consider analysis); samples: Bardsley, Solonen, Haario and
-        Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its linear case; errors that the fit
-        takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
+    Source: numbers that are not fitted: Schmidt, Adv. Control Syst. 3 (1966) 293 (consider analysis); samples:
+        Bardsley, Solonen, Haario and Laine, SIAM J. Sci. Comput. 36 (2014) A1895 (randomise-then-optimise), in its
+        linear case; errors that the fit takes for independent: White, Econometrica 48 (1980) 817 (the sandwich).
     """
-    jc, solve = linear.instrument, linear.solver()
-    border = linear.transposed(jc)
-    answer = solve(border)
-    own = np.linalg.inv(jc.T @ jc - border.T @ answer)
-    influence = (jc - linear.apply(answer)) @ own
-    rng = np.random.default_rng(seed)
-    noise = rng.standard_normal((jc.shape[0], n_samples))
-    errors, n_done = [], 0
-    for assumed in (error, edge_error):
-        if assumed is not None:
-            rows = slice(n_done, n_done + assumed.share.size)
-            noise[rows], n_done = assumed.draw(rng, noise[rows]), rows.stop
-            errors.append((assumed, rows))
-    considered = np.zeros((jc.shape[0], 0 if unfitted is None else unfitted.shape[1]))
-    if unfitted is not None:
-        considered[: len(unfitted)] = unfitted
-        noise += considered @ rng.standard_normal((considered.shape[1], n_samples))
-
-    def covariance(influence: np.ndarray) -> np.ndarray:
-        of_all = np.zeros((influence.shape[1],) * 2)
-        for assumed, rows in errors:
-            of_all = of_all + assumed.covariance(influence[rows])
-        by_unfitted = influence.T @ considered
-        return of_all + influence[n_done:].T @ influence[n_done:] + by_unfitted @ by_unfitted.T
-
+    found, rng = Marginal.of(linear), np.random.default_rng(seed)
+    noise = errors.draw(rng, rng.standard_normal((len(linear.instrument), n_samples)))
+    influence = found.influence()
     instrument = influence.T @ noise
-    surface = solve(linear.transposed(noise)) - answer @ instrument
+    surface = found.solve(linear.transposed(noise)) - found.answer @ instrument
     to_height = lambda a: np.moveaxis(a[::3], 1, 0).reshape(-1, *linear.shape)  # noqa: E731
-    found = Posterior(
+    posterior = Posterior(
         to_height(surface),
         instrument.T,
-        -to_height(answer),
-        covariance(influence),
+        -to_height(found.answer),
+        errors.covariance(influence),
         linear.names,
-        independent_covariance=own,
+        independent_covariance=found.covariance,
     )
     if sums is None:
-        return found
-    free = solve(sums[: len(answer)])
-    of_instrument = own @ (sums[len(answer) :] - answer.T @ sums[: len(answer)])
-    of_surface = free - answer @ of_instrument
-    together = linear.apply(of_surface) + jc @ of_instrument
+        return posterior
+    of_surface, of_instrument = found.with_sums(*np.split(sums, [len(found.answer)]))
+    together = linear.apply(of_surface) + linear.instrument @ of_instrument
     naive = together.T @ together
     fields = np.moveaxis(of_surface.T.reshape(-1, *linear.shape, 3), -1, 1)
-    inflation = np.diag(covariance(together)) / np.diag(naive)
-    return replace(found, sums=SumsPosterior(fields, of_instrument.T, naive, inflation))
+    inflation = np.diag(errors.covariance(together)) / np.diag(naive)
+    return replace(posterior, sums=SumsPosterior(fields, of_instrument.T, naive, inflation))
 
 
 def tilts_of(names: tuple[str, ...]) -> list[int]:

@@ -367,7 +367,11 @@ def border_residuals(surface: Surface, parameters: Parameters, fixed: FixedTerms
 
 def residuals(unknowns: Unknowns, fixed: FixedTerms) -> dict[str, jax.Array]:
     """Compute all residuals in standard deviations."""
-    surface, parameters = surface_of(unknowns, fixed), unknowns.parameters
+    return residuals_at(surface_of(unknowns, fixed), unknowns.parameters, fixed)
+
+
+def residuals_at(surface: Surface, parameters: Parameters, fixed: FixedTerms) -> dict[str, jax.Array]:
+    """Compute the residuals of a surface, in standard deviations."""
     edge_x, edge_y = edge_residuals(surface, parameters, fixed)
     return {
         "data": data_residuals(surface, parameters, fixed),

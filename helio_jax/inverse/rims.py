@@ -5,12 +5,14 @@ column cuts them in an ellipse: the slope at a distance t from the rim is c (1 -
 the distance of the crest from the rim, r = 0 where the tangent at the rim is vertical, r = infinity on a parabola. Of a
 cone or a wall the slope is constant (L and r infinite). Where in its edge a rim lies, and how steep the rim itself is,
 follows to some extent from the slopes of the first pixels within; what they do not tell of r is common to a whole
-outline. An oblique beam shears the sections along its azimuth: the two sides of a dome then have an r each.
+outline. An oblique beam shears the sections along its azimuth, and moves the others off the middle: the sides of a dome
+that rise and that fall along the beam then have an r each, and of the sheared sections each direction.
 
 The first pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
 Rows that leave the image before they reach a crest tell nothing.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -63,6 +65,8 @@ N_INDEPENDENT = 8.0
 """So many edges of an outline count as independent: errors of the fitted slopes agree along it."""
 LEAST_SHEAR = 0.05
 """Beam shifts per height up to this (incidence of 3 deg) make no difference between the sides of a dome."""
+ACROSS = 0.05
+"""Slopes whose share along the beam is smaller do not fall along it."""
 HIDING = 0.2, 0.3
 """Where a side falls along an oblique beam and the root of r is below the first number, with a probability above the
 second, its foot may be hidden behind the limb: edges there may be depth jumps and count as no rims."""
@@ -209,6 +213,7 @@ class _Candidates(NamedTuple):
         crest: distance of the crest from the first, in pixels.
         outer: slope of the first pixel outside.
         beyond: size of the slope of the second pixel outside, over the largest of level pixels.
+        falls: whether the first pixel within falls along the beam.
     """
 
     y: np.ndarray
@@ -218,6 +223,7 @@ class _Candidates(NamedTuple):
     crest: np.ndarray
     outer: np.ndarray
     beyond: np.ndarray
+    falls: np.ndarray
 
     def only(self, which: np.ndarray) -> "_Candidates":
         """Keep some of them [candidate]."""
@@ -237,24 +243,30 @@ def find_rims(
     slopes = np.asarray(surface.slope_x), np.asarray(surface.slope_y)
     steep = np.hypot(*slopes)
     std = np.broadcast_to(noise * (1.0 + steep**2), steep.shape)
+    size, along = math.hypot(*shift), shift[0] * slopes[0] + shift[1] * slopes[1]
+    falls = (along < -ACROSS * size * steep) & (size > LEAST_SHEAR)
     ways = [(axis, sign) for axis in (1, 0) for sign in (1, -1)]
-    found = {way: _candidates(slopes[1 - way[0]], steep, std, *way) for way in ways}
+    found = {way: _candidates(slopes[1 - way[0]], steep, std, falls, *way) for way in ways}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
     numbers = _outlines(found, steep.shape)
-    shear = {axis: along if abs(along) > LEAST_SHEAR else 0.0 for axis, along in zip((1, 0), shift, strict=True)}
+    is_sheared = {axis: abs(along) > LEAST_SHEAR for axis, along in zip((1, 0), shift, strict=True)}
     n_sides = 0
     for number in np.unique(np.concatenate(list(numbers.values()))):
         mine = {way: c.only(numbers[way] == number) for way, c in found.items()}
         beyond = np.concatenate([c.beyond for c in mine.values()])
         if len(beyond) < LEAST_EDGES or np.median(beyond) > 1.0:
             continue
-        alike = {way: c for way, c in mine.items() if not shear[way[0]]}
-        sides = [alike, *({way: c} for way, c in mine.items() if shear[way[0]])]
+        parts = [[way for way in ways if not is_sheared[way[0]]], *([way] for way in ways if is_sheared[way[0]])]
+        sides = [
+            {way: mine[way].only(mine[way].falls == is_falling) for way in part}
+            for part in parts
+            for is_falling in (False, True)
+        ]
         sides = [_Side.of(side) for side in sides if any(len(c.y) for c in side.values())]
         if sum(side.gain for side in sides) < DECISIVE:
             continue
         for side in sides:
-            if not side.may_hide_below(shear):
+            if not side.may_hide_its_foot:
                 n_sides += 1
                 side.set_edges(out, n_sides)
     return out[1], out[0]
@@ -320,16 +332,12 @@ class _Side(NamedTuple):
         """Probability of each of `OFFSETS` [offset]."""
         return softmax(self.evidence + LOG_PRIOR)
 
-    def may_hide_below(self, shear: dict[int, float]) -> bool:
-        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen.
-
-        Args:
-            shear: shift of the beam per height along each axis.
-        """
-        falls = (sign * shear[axis] * c.slope[:, :1] < 0.0 for (axis, sign), c in self.mine.items())
+    @property
+    def may_hide_its_foot(self) -> bool:
+        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen."""
         root, probability = HIDING
         is_steep = self.probability[np.sqrt(OFFSETS) < root].sum() > probability
-        return bool(is_steep and np.mean(np.concatenate(list(falls))) > 0.5)
+        return bool(is_steep and all(c.falls.all() for c in self.mine.values()))
 
     @property
     def gain(self) -> float:
@@ -354,12 +362,17 @@ class _Side(NamedTuple):
                 out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
 
 
-def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int, sign: int) -> _Candidates:
-    """Find the first pixels within rims along an axis (0: y, 1: x), upwards or downwards (`sign`)."""
+def _candidates(
+    slope: np.ndarray, steep: np.ndarray, std: np.ndarray, falls: np.ndarray, axis: int, sign: int
+) -> _Candidates:
+    """Find the first pixels within rims along an axis (0: y, 1: x), upwards or downwards (`sign`).
+
+    Rows and columns of less than four pixels have none.
+    """
     way = (slice(None), slice(None, None, sign)) if axis == 1 else (slice(None, None, sign), slice(None))
     turned = (lambda a: a[way]) if axis == 1 else (lambda a: a[way].T)
-    s, t, e = sign * turned(slope), turned(steep), turned(std)
-    far, near, first, second = (slice(k, s.shape[1] - 3 + k) for k in range(4))
+    s, t, e, falling = sign * turned(slope), turned(steep), turned(std), turned(falls)
+    far, near, first, second = (slice(k, max(0, s.shape[1] - 3) + k) for k in range(4))
     size, is_known = np.abs(s[:, first]), np.isfinite(e)
     is_rim = np.logical_and.reduce([is_known[:, k] for k in (far, near, first, second)])
     is_rim &= (t[:, far] < LEVEL[0] * size) & (t[:, near] < LEVEL[1] * size) & (size > LEAST_SLOPE * e[:, first])
@@ -376,7 +389,7 @@ def _candidates(slope: np.ndarray, steep: np.ndarray, std: np.ndarray, axis: int
     position = first if sign > 0 else s.shape[1] - 1 - first
     place = (row, position) if axis == 1 else (position, row)
     level = np.hypot(LEVEL_STD * e[row, column], LEVEL_SHARE * s[row, first])
-    found = _Candidates(*place, s[at], std, crest, s[row, column + 1], t[row, column] / level)
+    found = _Candidates(*place, s[at], std, crest, s[row, column + 1], t[row, column] / level, falling[row, first])
     return found.only(crest > LEAST_CREST)
 
 

@@ -36,6 +36,7 @@ from helio_jax.inverse.rims import find_rims
 from helio_jax.inverse.solver import CommonHeights, Solution, solve, whitened_parameters
 from helio_jax.inverse.state import FitState, Held
 from helio_jax.robust import cauchy_weight
+from helio_jax.validity import FACET_IMAGES
 
 MODE_BLOCK = 4
 """Common modes and anchors are filled up to a multiple of this."""
@@ -97,7 +98,8 @@ def edges_of(
     problem: FitProblem, surface: Surface, cut: float, occluded: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[AxisEdges, AxisEdges]:
     """Find the edges of a surface along x and along y; those at walls or `occluded` count as depth jumps."""
-    noise = np.where(problem.has_enough_images, problem.pixel_noise, np.inf)
+    is_seen = problem.is_observed.sum(0) >= FACET_IMAGES
+    noise = np.where(is_seen, problem.pixel_noise, np.inf)
     rims_x, rims_y = find_rims(surface, noise, problem.shift)
     found = (
         find_edges(surface.height, surface.slope_x, problem.raster.dx, 1, problem.pixel_noise, cut, rims_x),

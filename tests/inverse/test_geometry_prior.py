@@ -14,6 +14,7 @@ from helio_jax.errors import InputFileError, SceneError
 from helio_jax.forward.render import Corrections
 from helio_jax.geometry_prior import ROTATION_STD, GeometryPrior
 from helio_jax.instrument import Covariance, Uncertainty
+from helio_jax.inverse.correlated_errors import Errors
 from helio_jax.inverse.fit import _incidence_error
 from helio_jax.inverse.instrument_report import units_of
 from helio_jax.inverse.posterior import exact_height_covariance, linearise, sample_posterior
@@ -213,6 +214,6 @@ def test_incidence_that_is_not_fitted_is_in_the_error_bars(bshem, hill):
     right[: len(expected)] = error.ravel()
     answer = np.linalg.lstsq(dense, right, rcond=None)[0][: 3 * AXIS.size**2 : 3]
     exact = np.sqrt(np.diag(exact_height_covariance(linear)) + answer**2)
-    found = sample_posterior(linear, 4000, unfitted=error).height_std.ravel()
+    found = sample_posterior(linear, 4000, errors=Errors(unfitted=error)).height_std.ravel()
     assert np.abs(answer).max() > 0.3 * np.sqrt(np.diag(exact_height_covariance(linear))).min()
     assert found == pytest.approx(exact, rel=0.06)  # 5 standard errors

@@ -11,7 +11,9 @@ from scipy.ndimage import label
 import helio_jax as hx
 from helio_jax.forward.surface import Surface, along
 from helio_jax.inverse.rims import OFFSETS, find_rims, rises
+from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows.pipeline import record
+from helio_jax.workflows.scene_file import SceneFile
 from helio_jax.workflows.truth import true_height
 
 NOISE = 0.02
@@ -134,13 +136,15 @@ DOMES = {
     "low": {"foot": (12.0, 12.0), "rise": 4.0, "share": 0.2},
     "steep": {"foot": (9.0, 9.0), "rise": 8.0, "share": 0.88},
     "oblique": {"foot": (12.0, 12.0), "rise": 6.0, "share": 0.4, "shift": (OBLIQUE, 0.0)},
+    "half ball, oblique": {"foot": (12.0, 12.0), "rise": 12.0, "share": 1.0, "shift": (OBLIQUE, 0.0)},
     "hidden foot": {"foot": (12.0, 12.0), "rise": 8.4, "share": 0.66, "shift": (OBLIQUE, 0.0)},
     "oblong pixels": {"foot": (24.0, 24.0), "rise": 16.8, "share": 0.66, "dx": 2.0},
     "elongated": {"foot": (16.0, 6.0), "rise": 4.0, "share": 0.5},
     "cut by the border": {"foot": (14.0, 14.0), "rise": 9.0, "share": 0.6, "at": (-32.0, 0.0)},
 }
 """Noise of 0.005 to 0.02 are signals of 200 to 50 times the noise. With one r for all sides, the product of r and L the
-same along x and y, coarse values of r, or crests put at the border, pulls are 2.5 to 150."""
+same along x and y, coarse values of r, or crests put at the border, pulls are 2.5 to 150; with one r for the sides of
+the half ball across the beam, of which the half behind hides its foot, 3 and more."""
 
 
 @pytest.mark.parametrize("noise", (0.005, 0.02))
@@ -225,6 +229,14 @@ def test_pixels_that_no_image_shows_tell_nothing(border, fill):
         np.testing.assert_array_equal(rims.sigma, others.sigma)
 
 
+@pytest.mark.parametrize("shape", [(n, m) for n in (1, 2, 3, 4) for m in (1, 2, 3, 4, 20)])
+def test_small_rasters_have_no_rims(shape):
+    """Rasters thinned to a few rows or columns, too."""
+    surface = Surface(*np.random.default_rng(1).standard_normal((3, *shape)))
+    for rims in find_rims(surface, NOISE, (OBLIQUE, 0.0)):
+        assert not rims.is_rim.any()
+
+
 def test_rims_do_not_depend_on_the_azimuth_of_the_beam():
     """The same dome under beams at 0, 90 and 180 deg, and a beam so steep that nothing is hidden."""
     tangent = math.tan(math.radians(30.0))
@@ -235,7 +247,7 @@ def test_rims_do_not_depend_on_the_azimuth_of_the_beam():
     at_90 = find_rims(transposed, NOISE, (rounding, tangent))
     mirrored = Surface(*(f[:, ::-1] for f in (seen.height, -seen.slope_x, seen.slope_y)))
     at_180 = find_rims(mirrored, NOISE, (-tangent, -rounding))
-    assert at_0[0].is_rim.sum() > 20 and at_0[1].is_rim.sum() > 100
+    assert at_0[0].is_rim.sum() > 20 and at_0[1].is_rim.sum() > 50
     for axis in (0, 1):
         np.testing.assert_allclose(at_90[1 - axis].sigma.T, at_0[axis].sigma, rtol=1e-9)
         np.testing.assert_allclose(at_180[axis].sigma[:, ::-1], at_0[axis].sigma, rtol=1e-9)
@@ -253,6 +265,27 @@ def test_no_rims_where_slopes_are_even(seed):
         assert not any((rims.outline > 0).any() for rims in find_rims(noisy(surface, seed), NOISE))
 
 
+def traced_dome(rise: float, folder: Path) -> tuple[SceneFile, MicrographStack]:
+    """Trace a half ellipsoid."""
+    foot = 170.0
+    at = np.linspace(-350.0, 350.0, 351)
+    u = np.hypot(*np.meshgrid(at, at)) / foot
+    np.savez(folder / "dome.npz", x=at, y=at, height=rise * np.sqrt(np.maximum(1.0 - u**2, 0.0)))
+    (folder / "scene.toml").write_text(SCENE)
+    scene = hx.load_scene(folder / "scene.toml")
+    stack = record(scene, hx.simulate(scene))
+    assert isinstance(stack, MicrographStack)
+    return scene, stack
+
+
+def error_of_the_top(rec: hx.Reconstruction, scene: SceneFile, rise: float) -> tuple[float, float]:
+    """Compute the error of the mean height of the top, and its stated standard deviation [um]."""
+    truth = true_height(scene, rec).height
+    top = truth > 0.9 * rise
+    height, std = rec.spread(lambda z: float(np.mean(z[top])))
+    return height - truth[top].mean(), std
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("rise", "limit"), ((34.0, 0.05), (140.0, 0.06)))
 def test_height_of_a_traced_dome(rise: float, limit: float, tmp_path: Path):
@@ -260,16 +293,19 @@ def test_height_of_a_traced_dome(rise: float, limit: float, tmp_path: Path):
 
     With the trapezoid rule alone the low one came out 5.5 % too low, stated 1.0 %.
     """
-    foot = 170.0
-    at = np.linspace(-350.0, 350.0, 351)
-    u = np.hypot(*np.meshgrid(at, at)) / foot
-    np.savez(tmp_path / "dome.npz", x=at, y=at, height=rise * np.sqrt(np.maximum(1.0 - u**2, 0.0)))
-    (tmp_path / "scene.toml").write_text(SCENE)
-    scene = hx.load_scene(tmp_path / "scene.toml")
-    rec = hx.reconstruct(record(scene, hx.simulate(scene)), settings=scene.reconstruct)
-    truth = true_height(scene, rec).height
-    top = truth > 0.9 * rise
-    height, std = rec.spread(lambda z: float(np.mean(z[top])))
-    error = height - truth[top].mean()
+    scene, stack = traced_dome(rise, tmp_path)
+    error, std = error_of_the_top(hx.reconstruct(stack, settings=scene.reconstruct), scene, rise)
     assert abs(error) < min(2.5 * std, limit * rise), (error, std)
     assert std < 0.1 * rise
+
+
+@pytest.mark.slow
+def test_height_of_a_dome_in_two_images(tmp_path: Path):
+    """Where two of four images show its inside; by the trapezoid rule alone 5.3 standard deviations too low."""
+    scene, stack = traced_dome(34.0, tmp_path)
+    is_seen = np.ones(stack.shape, bool)
+    is_seen[2:, 8:-8, 8:-8] = False
+    hidden = {name: np.where(is_seen, getattr(stack, name), np.nan) for name in ("counts", "variance")}
+    rec = hx.reconstruct(stack.replace(is_observed=is_seen, **hidden), settings=scene.reconstruct)
+    error, std = error_of_the_top(rec, scene, 34.0)
+    assert abs(error) < 2.5 * std, (error, std)

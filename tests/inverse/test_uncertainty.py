@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.correlated_errors import ModelError
+from helio_jax.inverse.correlated_errors import Errors, ModelError
 from helio_jax.inverse.posterior import (
     Linearised,
     exact_height_covariance,
@@ -195,8 +195,8 @@ def test_independent_errors_change_nothing(bshem):
     linear = linearise(*level_fit(bshem, shape))
     share = np.full((3, *shape), 0.5)
     plain = sample_posterior(linear, 200)
-    apart = sample_posterior(linear, 200, error=ModelError(share, (0.0, 0.0)))
-    wide = sample_posterior(linear, 200, error=ModelError(share, (7.0, 7.0)))
+    apart = sample_posterior(linear, 200, errors=Errors(ModelError(share, (0.0, 0.0))))
+    wide = sample_posterior(linear, 200, errors=Errors(ModelError(share, (7.0, 7.0))))
     assert apart.instrument_covariance == pytest.approx(plain.instrument_covariance, rel=1e-9, abs=1e-12)
     assert apart.height_std.mean() == pytest.approx(plain.height_std.mean(), rel=0.1)
     assert wide.height_std.mean() > 2.0 * plain.height_std.mean()
