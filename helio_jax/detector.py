@@ -76,6 +76,8 @@ def cone_ellipse(polar: float, azimuth: float, half_angle: float, distance: floa
     return Aperture((r * math.cos(azimuth), r * math.sin(azimuth)), (0.5 * (far - near), minor), azimuth)
 
 
+MAX_NAME = 64
+"""Most characters of the name of a detector."""
 _KINDS = (
     (("center_um", "axes_um"), ("rotation_deg", "height_um")),
     (("polar_deg", "half_angle_deg"), ("azimuth_deg", "at_infinity")),
@@ -91,7 +93,7 @@ class Detector(Settings):
     that an atom hits counts it (of two ellipses in one plane: the first in the list); cones at infinity come last.
     """
 
-    name: str = Field(min_length=1, max_length=64)
+    name: str = Field(min_length=1, max_length=MAX_NAME)
     """Name shown in figures and files."""
     center_um: tuple[float, float] | None = None
     """Centre (x, y) of the ellipse on the plate, lab frame [um]."""

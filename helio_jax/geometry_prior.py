@@ -92,27 +92,44 @@ class GeometryPrior:
         return float(distance), np.array(aim[::2]), np.array(aim[1::2]), incidence
 
 
-def errors_in_common(instrument: Instrument, names: Sequence[str]) -> Covariance | None:
-    """State the errors of one instrument for several scans by it, between which the sample was turned.
+def errors_in_common(
+    instruments: Sequence[Instrument], plates: Sequence[int], names: Sequence[str]
+) -> Covariance | None:
+    """State the errors of the instruments of several scans, between which the sample was turned.
 
-    Distance, polar angles and azimuths are off by the same in all scans, for each sees the same plate; the azimuths of
-    every scan but the first also by the error of its rotation (`ROTATION_STD`).
+    Polar angles and azimuths of one plate are off by the same in all of its scans, those of different plates
+    independently; the azimuths of every scan but the first also by the error of its rotation (`ROTATION_STD`). The
+    distance is one for all: as uncertain as that of the scan which knows least of it.
 
     Args:
-        instrument: of every scan.
-        names: of the joined scans' detectors, scan by scan, each in the instrument's order.
+        instruments: of every scan.
+        plates: number of the plate of every scan; scans of one plate state the same errors.
+        names: of the joined scans' detectors, scan by scan, each in its instrument's order.
 
     Returns:
         [covariance] of the joined scans; None where nothing is uncertain.
     """
-    prior = GeometryPrior.of(instrument).covariance
-    if not prior.any():
+    priors = [GeometryPrior.of(instrument).covariance for instrument in instruments]
+    if not any(prior.any() for prior in priors):
         return None
-    of_detector = 1 + 2 * (np.arange(len(names)) % len(instrument.detector))
-    own = np.concatenate([[0], np.stack([of_detector, of_detector + 1], 1).ravel()])
-    joint = prior[np.ix_(own, own)]
-    scan = np.arange(len(names)) // len(instrument.detector)
-    joint[2::2, 2::2] += ROTATION_STD**2 * ((scan[:, None] == scan) & (scan > 0))
+    distance = max(prior[0, 0] for prior in priors)
+    scan = np.repeat(np.arange(len(priors)), [len(prior) - 1 for prior in priors])
+    plate, own = np.asarray(plates)[scan], np.concatenate([np.arange(1, len(prior)) for prior in priors])
+    is_azimuth = own % 2 == 0
+    # with an error of 1 of the distance, in its standard deviations
+    by_distance = np.concatenate([p[0, 1:] / math.sqrt(p[0, 0]) if p[0, 0] else p[0, 1:] for p in priors])
+    joint = np.outer(by_distance, by_distance)
+    for number in np.unique(plate):
+        of = plate == number
+        prior = priors[scan[of][0]]
+        joint[np.ix_(of, of)] = prior[np.ix_(own[of], own[of])]
+    rotation = (scan[:, None] == scan) & (scan > 0) & np.outer(is_azimuth, is_azimuth)
+    joint = np.block(
+        [
+            [np.full((1, 1), distance), math.sqrt(distance) * by_distance[None]],
+            [math.sqrt(distance) * by_distance[:, None], joint + ROTATION_STD**2 * rotation],
+        ]
+    )
     parameters = ("sample distance", *(f"{kind} of {name}" for name in names for kind in ("polar", "azimuth")))
     is_known = np.diag(joint) <= 0.0
     degrees: tuple[Literal["deg"], ...] = ("deg",) * (len(parameters) - 1)

@@ -18,6 +18,8 @@ from helio_jax.drawable import Drawable
 from helio_jax.errors import SceneError
 from helio_jax.settings import Settings, Unit
 
+MAX_DETECTORS = 64
+"""Most detectors of an instrument, those of joined scans in all."""
 POLAR_STD_DEG = 5.0
 """Prior standard deviation of the apertures' polar angles where rotated scans calibrate the instrument and its file
 states none: they see the sample from somewhere between its base and its top [deg]."""
@@ -209,7 +211,7 @@ class Instrument(Drawable, Settings):
     covariance: Covariance | None = None
     readout: CampaignReadout | None = None
     law: CampaignLaw | None = None
-    detector: tuple[Detector, ...] = Field(min_length=1, max_length=64)
+    detector: tuple[Detector, ...] = Field(min_length=1, max_length=MAX_DETECTORS)
 
     @model_validator(mode="after")
     def _has_distinct_names(self) -> "Instrument":

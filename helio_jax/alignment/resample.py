@@ -17,15 +17,18 @@ from scipy import ndimage
 from helio_jax.alignment.rigid import Rigid
 from helio_jax.arrays import as_json, pitch
 from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
+from helio_jax.detector import MAX_NAME
 from helio_jax.errors import GuardError, InputFileError
 from helio_jax.geometry_prior import errors_in_common
-from helio_jax.instrument import Detector, Instrument
+from helio_jax.instrument import MAX_DETECTORS, Detector, Instrument, Uncertainty
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
 MAX_PIXELS = 4_000_000
 """Largest common raster."""
 LAWS_DIFFER = 3.0
 """Difference of two scattering laws from which on they are not of one sample [standard deviations]."""
+SAME_PLACE = 0.01
+"""Apertures nearer to one another are the same [um]."""
 _MARCH = 0.5
 """Step of the search for what shadows a point [pixels]."""
 
@@ -132,35 +135,60 @@ def joined_instrument(stacks: tuple[MicrographStack, ...], motions: tuple[Rigid,
                 )
             )
     beam = beams[0].changed(incidence_deg=0.0, azimuth_deg=0.0) if is_oblique else beams[0]
-    covariance = errors_in_common(stacks[0].instrument, names)
-    update = {"beam": beam, "detector": tuple(detectors), "law": _joined_law(stacks), "covariance": covariance}
+    instruments = [s.instrument for s in stacks]
+    update = {
+        "beam": beam,
+        "detector": tuple(detectors),
+        "law": _joined_law(stacks),
+        "uncertainty": _joined_uncertainty(instruments),
+        "covariance": errors_in_common(instruments, _plates(instruments), names),
+    }
     return stacks[0].instrument.model_copy(update=update)
 
 
 def _joined_names(stacks: Sequence[MicrographStack]) -> list[str]:
-    """Name the detectors of joined scans by scan and detector, each name once and of at most 64 characters."""
+    """Name the detectors of joined scans by scan and detector, each name once and of at most `MAX_NAME` characters."""
     parts = [(number, stack.name, d.name) for number, stack in enumerate(stacks, 1) for d in stack.instrument.detector]
-    names = [f"{scan[: 63 - len(detector)]} {detector}" for _, scan, detector in parts]
-    if len(set(names)) == len(names):
-        return names
-    return [f"{number} {scan}"[: 63 - len(detector)] + f" {detector}" for number, scan, detector in parts]
+    for names in (
+        [f"{scan} {detector}" for _, scan, detector in parts],
+        [f"{f'{number} {scan}'[: MAX_NAME // 2 - 1]} {detector[: MAX_NAME // 2]}" for number, scan, detector in parts],
+    ):
+        if len(set(names)) == len(names) and max(map(len, names)) <= MAX_NAME:
+            return names
+    return [f"{number} {at}" for at, (number, _, _) in enumerate(parts, 1)]
+
+
+def _plates(instruments: Sequence[Instrument]) -> list[int]:
+    """Number the plates of instruments: one where the apertures lie alike, in their order."""
+    centers = [np.array([a.center for a in instrument.apertures()]) for instrument in instruments]
+    first_of: list[int] = []
+    for number, here in enumerate(centers):
+        same = (
+            k for k in first_of if centers[k].shape == here.shape and np.allclose(centers[k], here, atol=SAME_PLACE)
+        )
+        first_of.append(next(same, number))
+    return first_of
+
+
+def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:
+    """Return the uncertainty of joined scans: of everything that of the scan which knows least."""
+    stated = [instrument.uncertainty.model_dump() for instrument in instruments]
+    return Uncertainty(**{name: max(each[name] for each in stated) for name in stated[0]})
 
 
 def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
-    """Refuse scans that have no errors in common (`errors_in_common`); raises as `check_joinable`."""
-    first = stacks[0].instrument
-    is_uncertain = first.uncertainty.is_stated or first.covariance is not None
-    for stack in stacks[1:]:
-        other = stack.instrument
+    """Refuse scans by one plate that state different errors of it; raises as `check_joinable`."""
+    instruments = [s.instrument for s in stacks]
+    for number, (stack, first) in enumerate(zip(stacks, _plates(instruments), strict=True)):
         for what, a, b in (
-            ("[uncertainty]", first.uncertainty, other.uncertainty),
-            ("[covariance]", first.covariance, other.covariance),
-            ("detectors", first.detector_names if is_uncertain else (), other.detector_names if is_uncertain else ()),
+            ("[uncertainty]", instruments[first].uncertainty, instruments[number].uncertainty),
+            ("[covariance]", instruments[first].covariance, instruments[number].covariance),
         ):
             if a != b:
                 raise InputFileError(
-                    f"scans that are joined must be by one instrument, but {what} of {stack.name!r} and "
-                    f"{stacks[0].name!r} differ: import them with the same instrument file"
+                    f"{stack.name!r} and {stacks[first].name!r} are scans by one pinhole plate, whose errors they "
+                    f"share, but their tables {what} differ: give the tables [uncertainty] and [covariance] of one of "
+                    "their instrument files to both, and import them anew"
                 )
 
 
@@ -169,9 +197,14 @@ def check_joinable(stacks: Sequence[MicrographStack]) -> None:
 
     Raises:
         InputFileError: some are calibrated in another way than others, or state scattering laws that disagree or that
-            determine the exponent too badly; or their instruments differ in [uncertainty] or [covariance], or, where
-            either is stated, in the names of their detectors.
+            determine the exponent too badly; scans by one plate differ in [uncertainty] or [covariance]; or they have
+            more detectors in all than an instrument may have.
     """
+    n_detectors = sum(len(s.instrument.detector) for s in stacks)
+    if n_detectors > MAX_DETECTORS:
+        raise InputFileError(
+            f"scans that are joined have {n_detectors} detectors in all, the limit is {MAX_DETECTORS}: join fewer scans"
+        )
     kinds = {None if c is None else (c.method, c.without_multiple) for c in (s.calibration for s in stacks)}
     if len(kinds) > 1:
         names = ", ".join(f"{s.name}: {'none' if s.calibration is None else s.calibration.method}" for s in stacks)

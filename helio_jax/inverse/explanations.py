@@ -30,6 +30,7 @@ from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
+from helio_jax.inverse.convergence import has_converged
 from helio_jax.inverse.fit import (
     Fit,
     Report,
@@ -39,7 +40,8 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
-from helio_jax.inverse.geometry_score import LIKELY, largest_changes, score_geometry, usual_uncertainty
+from helio_jax.inverse.geometry_change import LIKELY, largest_changes
+from helio_jax.inverse.geometry_score import score_geometry, usual_uncertainty
 from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -599,11 +601,13 @@ class _Fits:
     def with_likely_geometry(self, best: Explanation) -> Explanation:
         """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
 
-        That fit is kept if it explains data and instrument better (`LIKELY`).
+        So they may where gains and offsets are not what is stated: that can stand for a wrong geometry. The fit is
+        kept if it explains data and instrument better (`LIKELY`).
         """
         fit = best.fit
-        score = None if fit.is_interrupted else score_geometry(fit)
-        if score is None or not score.is_likely:
+        is_at_rest = not fit.is_interrupted and has_converged(fit.changes, self.settings.refine.tolerance_um)
+        score = score_geometry(fit) if is_at_rest else None
+        if score is None or not (score.is_likely or fit.prior_widths):
             return best
         self.say(f"the geometry is fitted, too, for the micrographs ask for {largest_changes(score.values)}")
         problem, surface = fit.problem, fit.state.surface

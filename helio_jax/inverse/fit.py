@@ -7,7 +7,7 @@ robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is con
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from helio_jax.inverse.backtracking import with_backtracking
 from helio_jax.inverse.convergence import contraction_of, extrapolation, remaining_error, status_of
 from helio_jax.inverse.correlated_errors import EdgeError, Errors, ModelError
 from helio_jax.inverse.edges import AxisEdges
+from helio_jax.inverse.geometry_change import GeometryScore
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.parameters import HELD, Parameters
@@ -35,9 +36,6 @@ from helio_jax.inverse.state import FitState, Predict, between, predict_correcti
 from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
-
-if TYPE_CHECKING:
-    from helio_jax.inverse.geometry_score import GeometryScore
 
 ALTERNATING, LEAST_RELAXATION = 0.6, 0.3
 """Extrapolation below which the next iteration is relaxed: each change undoes two thirds of the last (iterates that
@@ -105,7 +103,7 @@ class Fit:
     is_interrupted: bool = False
     is_bias_subtracted: bool = False
     prior_widths: Mapping[str, float] = field(default_factory=dict)
-    geometry_score: "GeometryScore | None" = None
+    geometry_score: GeometryScore | None = None
 
     @property
     def chi_square(self) -> list[float]:

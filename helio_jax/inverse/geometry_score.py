@@ -6,8 +6,7 @@ gives, by the linearised model, the change of geometry that the data ask for, an
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from helio_jax.forward.surface import Surface
 from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.fit import Fit, linearised_at
+from helio_jax.inverse.geometry_change import GeometryScore, largest_changes
 from helio_jax.inverse.instrument_report import describe_instrument, plain_name, units_of
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Marginal
@@ -35,45 +35,13 @@ USUAL_DEG = 3.0
 """Prior standard deviation of polar angles and azimuths of a file that may be wrong [deg]."""
 USUAL_DISTANCE = 0.05
 """The same of the sample distance, over that distance."""
-LIKELY = 3.0
-"""Natural logarithm of the Bayes factor from which on another geometry is likely: strong evidence (Kass and Raftery,
-J. Am. Stat. Assoc. 90 (1995) 773, sec. 3.2)."""
 _DETERMINED = 0.99
 """A combination of which the data leave more of the prior variance decides nothing."""
-_NAMED, _MOST_NAMED = 2.0, 4
-"""Changes of so many standard deviations are named, the largest ones, so many at most."""
 FITTED = (
     "the geometry is not what the instrument file states as exact, and was fitted: {named}; calibrate the instrument "
     "(helio calibrate) or state its [uncertainty]; a surface that does not scatter by the cosine law can look alike"
 )
 """Warning of a fit whose geometry was fitted for what the data say of it."""
-
-
-@dataclass(frozen=True)
-class GeometryScore:
-    """What the data of a fit say of a geometry that it took for exact.
-
-    Attributes:
-        log_bayes: logarithm of the Bayes factor of a geometry that is uncertain by the usual (`USUAL_DEG`,
-            `USUAL_DISTANCE`) over the stated one; above 0 where the data ask for another one.
-        values: name -> (change that the data ask for, its standard deviation, unit).
-    """
-
-    log_bayes: float
-    values: Mapping[str, tuple[float, float, str]]
-
-    @property
-    def is_likely(self) -> bool:
-        """Whether another geometry is likely."""
-        return self.log_bayes > LIKELY
-
-
-def largest_changes(values: Mapping[str, tuple[float, float, str]]) -> str:
-    """Name the most certain of some changes (value, standard deviation, unit), one at least, in words."""
-    ranked = sorted(values.items(), key=lambda item: -abs(item[1][0]) / item[1][1])
-    certain = [item for item in ranked if abs(item[1][0]) > _NAMED * item[1][1]][:_MOST_NAMED]
-    shown = certain or ranked[:1]
-    return ", ".join(f"{name} {value:+.3g} +- {std:.2g} {unit}" for name, (value, std, unit) in shown)
 
 
 def geometry_warnings(fit: Fit) -> tuple[str, ...]:

@@ -119,8 +119,47 @@ def test_turned_scans_share_the_errors_of_their_plate(bshem):
     long = tuple(s.replace(name=f"{'a' * 70} {k}") for k, s in enumerate(scans))
     assert GeometryPrior.of(joined_instrument(long, motions)).covariance == pytest.approx(found)
     for wrong in (one.model_copy(update={"uncertainty": Uncertainty()}), bshem):
-        with pytest.raises(InputFileError, match=r"must be by one instrument, but \[uncertainty\] of 'scan 1'"):
+        with pytest.raises(InputFileError, match=r"'scan 1' and 'scan 0' are scans by one pinhole plate.*uncertainty"):
             check_joinable((scans[0], scans[1].replace(instrument=wrong)))
+
+
+def test_scans_by_different_plates_err_independently(bshem):
+    """Another mounting of the same detectors, stated with the same table, and a plate with fewer apertures.
+
+    Rejects errors that are copied from the first scan, by name: those of a shifted plate are other ones of each.
+    """
+    one = with_plate_error(bshem, std=(SHIFT, 0.0, 0.0))
+    mounted = [one.detector[(i + 1) % 3].model_copy(update={"name": d.name}) for i, d in enumerate(one.detector)]
+    others = (
+        one.model_copy(update={"detector": tuple(mounted)}),
+        with_plate_error(bshem.model_copy(update={"detector": bshem.detector[:2]}), std=(0.0, 0.0, 15.0)),
+    )
+    blank = MicrographStack(np.ones((3, 4, 4)), 10.0 * np.arange(4), 10.0 * np.arange(4), one, n_rays=1.0)
+    few = MicrographStack(blank.counts[:2], blank.x, blank.y, others[1], n_rays=1.0, name="few")
+    scans = blank.replace(name="first"), blank.replace(instrument=others[0], name="turned"), few
+    check_joinable(scans)
+    found = GeometryPrior.of(joined_instrument(scans, (Rigid(0.0, (0.0, 0.0)),) * 3)).covariance
+    first, turned, last = (GeometryPrior.of(s.instrument).covariance for s in scans)
+    floor = 3e-6 * first.max()
+    is_azimuth = np.arange(6) % 2 == 1
+    rotation = ROTATION_STD**2 * np.outer(is_azimuth, is_azimuth)
+    assert found[1:7, 1:7] == pytest.approx(first[1:, 1:], rel=1e-5, abs=floor)
+    assert found[7:13, 7:13] == pytest.approx(turned[1:, 1:] + rotation, rel=1e-5, abs=floor)
+    assert found[1:7, 7:13] == pytest.approx(np.zeros((6, 6)), abs=floor)
+    assert found[0, 0] == pytest.approx(last[0, 0], rel=1e-5)
+
+
+@pytest.mark.parametrize("length", (62, 64))
+def test_many_scans_and_long_names_are_joined(bshem, length: int):
+    """Names of joined detectors differ and are not too long; more detectors than an instrument may have are refused."""
+    detectors = tuple(d.model_copy(update={"name": f"{i}" * length}) for i, d in enumerate(bshem.detector))
+    long = bshem.model_copy(update={"detector": detectors})
+    blank = MicrographStack(np.ones((3, 4, 4)), 10.0 * np.arange(4), 10.0 * np.arange(4), long, n_rays=1.0, name="a")
+    joined = joined_instrument((blank,) * 21, (Rigid(0.0, (0.0, 0.0)),) * 21)
+    assert len(set(joined.detector_names)) == 63 and max(map(len, joined.detector_names)) <= 64
+    GeometryPrior.of(joined)
+    with pytest.raises(InputFileError, match="66 detectors in all, the limit is 64"):
+        check_joinable((blank,) * 22)
 
 
 def test_covariance_of_another_instrument_is_refused(bshem):

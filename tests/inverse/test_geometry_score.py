@@ -1,0 +1,108 @@
+"""A geometry that is stated as exact and is wrong: what the data say of it, by closed form, by refit and in a scan."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import helio_jax as hx
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.render import Corrections
+from helio_jax.inverse.fit import Fit, fit_heights
+from helio_jax.inverse.geometry_change import LIKELY, largest_changes
+from helio_jax.inverse.geometry_score import USUAL_DEG, _log_bayes, score_geometry, usual_uncertainty
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.settings import ReconstructSettings
+
+SIDE = 25
+PITCH = 40.0
+DOSE = 2e6
+
+
+def hill_and_raster() -> tuple[np.ndarray, Raster]:
+    """Two hills of different heights on a flat border, 25 x 25."""
+    x = PITCH * np.arange(SIDE)
+    gx, gy = np.meshgrid(x - x.mean(), x - x.mean())
+    height = 150.0 * np.exp(-((gx + 120.0) ** 2 + gy**2) / 2 / 110.0**2)
+    return height - 90.0 * np.exp(-((gx - 180.0) ** 2 + (gy - 120.0) ** 2) / 2 / 90.0**2), Raster(x=x, y=x)
+
+
+def nothing_traced(height, normals, *_, **__) -> Corrections:
+    return Corrections.none((3, *height.shape))
+
+
+def fitted(instrument: hx.Instrument, truth: hx.Instrument, seed: int) -> Fit:
+    """Fit by one instrument the micrographs that another one records, without masks and multiple scattering."""
+    height, raster = hill_and_raster()
+    rng = np.random.default_rng(seed)
+    signal = np.asarray(hx.render(height, Optics.of(truth), raster, corrections="none"))
+    counts = rng.poisson(DOSE * signal)
+    start = hx.forward.surface.surface_of_heights(0.9 * height, raster)
+    settings = ReconstructSettings()
+    problem = FitProblem.of(counts / DOSE, np.maximum(counts, 1.0) / DOSE**2, instrument, raster, start, settings)
+    return fit_heights(problem, start, nothing_traced)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_right_geometry_is_not_doubted(bshem, seed):
+    """Estimates within 4 standard deviations, Bayes factor below 1. False alarms: 1 in 700 by the former."""
+    score = score_geometry(fitted(bshem, bshem, seed))
+    assert score is not None and score.log_bayes < 0.0
+    for value, std, _ in score.values.values():
+        assert abs(value) < 4.0 * std
+
+
+def test_wrong_polar_angle_is_found_and_named(bshem):
+    """One aperture 3 deg off: it is the change that is named first, within 3 standard deviations of the truth.
+
+    A fit with the usual uncertainty gives the same within two standard deviations: the score is its first step.
+    """
+    aim = np.zeros((3, 2))
+    aim[1, 0] = np.radians(3.0)
+    fit = fitted(bshem, bshem.moved(aim, 0.0), 1)
+    score = score_geometry(fit)
+    assert score is not None and score.is_likely
+    name = f"polar {bshem.detector_names[1]}"
+    value, std, unit = score.values[name]
+    assert unit == "deg" and abs(value - 3.0) < 3.0 * std and std < 0.5 * USUAL_DEG
+    assert largest_changes(score.values).startswith(name)
+
+    p = fit.problem
+    free = FitProblem.of(
+        p.signal, p.variance, bshem, p.raster, fit.surface, p.reconstruct_settings, uncertainty=usual_uncertainty(p)
+    )
+    refit = fit_heights(free, fit.state.surface, nothing_traced)
+    moved = np.degrees(free.moves(refit.parameters)[1, 1])
+    assert abs(moved - value) < 2.0 * std
+
+
+def test_an_uncertain_geometry_is_not_tested(bshem):
+    """Directions that the file states as uncertain are unknowns of the fit already."""
+    fit = fitted(bshem, bshem, 0)
+    geometry = replace(fit.problem.geometry, covariance=1e-4 * np.eye(7))
+    assert score_geometry(replace(fit, problem=replace(fit.problem, geometry=geometry))) is None
+
+
+@pytest.mark.parametrize("noise", (0.1, 1.0))
+def test_bayes_factor_in_closed_form(noise):
+    """One number, measured as d with the standard deviation s: log BF = (d^2 / s^2 / (1 + s^2) - log(1 + 1 / s^2)) / 2.
+
+    Wakefield (2009), eq. 2. With errors that agree between pixels, S > C, the same with the larger s.
+    """
+    d, s2 = 0.7, noise**2
+    c = s2 / (1.0 + s2)
+    found = _log_bayes(np.array([d * (1.0 - c)]), np.array([[c]]), np.array([[c]]))
+    # C - C^2 is the variance of the drawn estimate, (1 - C)^2 s^2
+    assert found == pytest.approx(0.5 * (d**2 / s2 / (1.0 + s2) - np.log1p(1.0 / s2)))
+    wide = 2.5 * s2
+    spread = c + (wide - s2) * (1.0 - c) ** 2
+    found = _log_bayes(np.array([d * (1.0 - c)]), np.array([[c]]), np.array([[spread]]))
+    assert found == pytest.approx(0.5 * (d**2 / wide / (1.0 + wide) - np.log1p(1.0 / wide)))
+
+
+def test_what_the_data_do_not_tell_decides_nothing():
+    """A second number of which next to nothing is known changes the Bayes factor by less than 0.01."""
+    one = _log_bayes(np.array([0.5]), np.array([[0.01]]), np.array([[0.01]]))
+    both = np.diag([0.01, 1.0 - 1e-9])
+    assert _log_bayes(np.array([0.5, 1e-6]), both, both) == pytest.approx(one, abs=0.01)
+    assert LIKELY > 1.0
