@@ -13,7 +13,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +54,22 @@ def true_settings(member: Member, rng: np.random.Generator) -> dict[str, Any]:
         azimuths = [d["azimuth_deg"] + turn for d in member.tables["detector"]]
         return {f"detector.{k}.azimuth_deg": azimuths[k] for k in range(n)}
     if member.world == "instrument nearer":
-        return {f"detector.{k}.polar_deg": member.tables["detector"][k]["polar_deg"] + 4.0 for k in range(n)}
+        return _with_polar(member, dict.fromkeys(range(n), 4.0))
+    if member.world == "instrument farther":  # polar angles by 3 deg, distance by 5 %
+        turns = dict.fromkeys(range(n), float(rng.choice((-3.0, 3.0))))
+        stated = member.tables["plate"].get("sample_distance_um", member.tables["plate"]["working_distance_um"])
+        distance = stated * (1.0 + float(rng.choice((-0.05, 0.05))))
+        return _with_polar(member, turns) | {"plate.sample_distance_um": distance}
+    if member.world == "aperture off":
+        return _with_polar(member, {int(rng.integers(n)): float(rng.choice((-3.0, 3.0)))})
     if member.world == "wide spot":
         return {"beam.pinhole_radius_um": 0.9 * member.tables["scan"]["pixel_size_um"]}
     return {}
+
+
+def _with_polar(member: Member, turns: Mapping[int, float]) -> dict[str, float]:
+    """Return settings of polar angles that are off by some degrees, by number of the detector."""
+    return {f"detector.{k}.polar_deg": member.tables["detector"][k]["polar_deg"] + turn for k, turn in turns.items()}
 
 
 def disturbed(world: str, stack: MicrographStack, rng: np.random.Generator) -> MicrographStack:

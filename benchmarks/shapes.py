@@ -401,8 +401,10 @@ WORLDS = (
     "wide spot",
     "dead detector",
     "mirrored raster",
+    "instrument farther",
+    "aperture off",
 )
-"""What is wrong in family `wrong`."""
+"""What is wrong in family `wrong`, of its members 0, 1, 2 and so on."""
 
 
 def wrong(rng: Rng, scan: Scan) -> Member:

@@ -161,13 +161,14 @@ def _joined_names(stacks: Sequence[MicrographStack]) -> list[str]:
 def _plates(instruments: Sequence[Instrument]) -> list[int]:
     """Number the plates of instruments: one where the apertures lie alike, in their order."""
     centers = [np.array([a.center for a in instrument.apertures()]) for instrument in instruments]
-    first_of: list[int] = []
+
+    def is_same(one: np.ndarray, other: np.ndarray) -> bool:
+        return one.shape == other.shape and bool(np.max(np.abs(one - other)) < SAME_PLACE)
+
+    numbers: list[int] = []
     for number, here in enumerate(centers):
-        same = (
-            k for k in first_of if centers[k].shape == here.shape and np.allclose(centers[k], here, atol=SAME_PLACE)
-        )
-        first_of.append(next(same, number))
-    return first_of
+        numbers.append(next((k for k in numbers if is_same(centers[k], here)), number))
+    return numbers
 
 
 def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:

@@ -40,8 +40,8 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
-from helio_jax.inverse.geometry_change import LIKELY, largest_changes
-from helio_jax.inverse.geometry_score import score_geometry, usual_uncertainty
+from helio_jax.inverse.geometry_change import LIKELY, GeometryScore, largest_changes
+from helio_jax.inverse.geometry_score import score_geometry, surface_misfit, usual_uncertainty
 from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -73,6 +73,7 @@ from helio_jax.inverse.wider_readout import (
     evidence,
     fit_wider_readout,
     instrument_improvement,
+    widths,
     with_widths,
 )
 from helio_jax.micrograph import MicrographStack
@@ -601,28 +602,55 @@ class _Fits:
     def with_likely_geometry(self, best: Explanation) -> Explanation:
         """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
 
-        So they may where gains and offsets are not what is stated: that can stand for a wrong geometry. The fit is
-        kept if it explains data and instrument better (`LIKELY`).
+        So they may where gains and offsets are not what is stated: that can stand for a wrong geometry, and so can
+        patches of other albedos, which have to explain more by `GAIN` than the fit without them. Interrupted or given
+        up, it returns the explanation as it was, marked.
         """
         fit = best.fit
         is_at_rest = not fit.is_interrupted and has_converged(fit.changes, self.settings.refine.tolerance_um)
         score = score_geometry(fit) if is_at_rest else None
         if score is None or not (score.is_likely or fit.prior_widths):
             return best
-        self.say(f"the geometry is fitted, too, for the micrographs ask for {largest_changes(score.values)}")
-        problem, surface = fit.problem, fit.state.surface
-        known = problem.patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
+        if score.is_likely:
+            best = best._replace(fit=replace(fit, geometry_score=score))
+        self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
+        patches, none = fit.problem.patches, AlbedoPatches.none(self.stack.shape[1:])
+        gained, least = 0.0, LIKELY
         try:
-            found = self.fitted(surface, surface, *known)
-            if found.is_interrupted:
-                return best._replace(fit=interrupted(fit, OTHER_TRIED))
-            gained = improvement(self.residuals(fit), self.residuals(found)) + instrument_improvement(fit, found)
-            return best._replace(fit=replace(found, geometry_score=score)) if gained > LIKELY else best
+            for known in (none, patches) if patches.objects else (none,):
+                found = self._with_geometry(fit, score, known)
+                if found.is_interrupted:
+                    return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
+                more = self.gained_by_geometry(fit, found)
+                if more > gained + least:
+                    best, gained, least = best._replace(fit=replace(found, geometry_score=score)), more, GAIN
         except PredictionError as e:
             self.say(f"another geometry is given up: {e}")
-            return best
         except KeyboardInterrupt:
-            return best._replace(fit=interrupted(fit, OTHER_TRIED))
+            best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
+        return best
+
+    def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches) -> Fit:
+        """Fit with an uncertain geometry, from where the score says that this ends."""
+        problem, surface = fit.problem, fit.state.surface
+        known = patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
+        posed, start = self.pose(surface, *known), score.parameters
+        as_stated = {name: factor * getattr(start, name) for name, factor in widths(fit).items()}
+        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
+        return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
+
+    def gained_by_geometry(self, fit: Fit, found: Fit) -> float:
+        """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.
+
+        In half chi-square; 0 where the instrument alone is less likely by `GAIN`, or the data, traced, contradict it in
+        more pixels (`MORE_CONTRADICTED`).
+        """
+        of_instrument = instrument_improvement(fit, found)
+        before, after = self.residuals(fit), self.residuals(found)
+        right = self.right_chi_square(before)
+        share = self.contradicted(before, right).mean()
+        is_more = self.contradicted(after, right).mean() > max(MIN_CONTRADICTED, MORE_CONTRADICTED * share)
+        return 0.0 if is_more or of_instrument < -GAIN else surface_misfit(fit) - surface_misfit(found) + of_instrument
 
     def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
         """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""

@@ -78,7 +78,7 @@ class Fit:
         is_bias_subtracted: whether the bias by noise was subtracted.
         prior_widths: standard deviations of the priors of gains and offsets over those stated, by the names of the
             parameters; empty: as stated.
-        geometry_score: what the data said of a geometry that is stated as exact, where it was fitted for that.
+        geometry_score: what the data say of a geometry that is stated as exact, where another one is likely.
     """
 
     problem: FitProblem
@@ -239,7 +239,13 @@ def after_one_solve(problem: FitProblem, state: FitState) -> np.ndarray:
     return step(problem, state, s.robust_limits[-1], s.jump_limits[-1], True)[0].residuals
 
 
-def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: Report | None = None) -> Fit:
+def fit_heights(
+    problem: FitProblem,
+    start: Surface,
+    predict: Predict,
+    report: Report | None = None,
+    parameters: Parameters | None = None,
+) -> Fit:
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
     Where changes alternate, the next iteration starts between the last two surfaces (relaxed by `extrapolation`), or
@@ -253,10 +259,12 @@ def fit_heights(problem: FitProblem, start: Surface, predict: Predict, report: R
         start: heights and slopes, e.g. of the photometric solution.
         predict: multiple scattering and masked form factors on a surface.
         report: called before each outer iteration.
+        parameters: to start from; default: `FitProblem.start_parameters`.
 
     Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
     """
     s, state = problem.settings, FitState.at(problem, start)
+    state = state if parameters is None else replace(state, parameters=parameters)
     changes: list[float] = []
     reached: FitState | None = None
     solved = state

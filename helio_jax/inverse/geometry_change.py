@@ -2,6 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+from helio_jax.inverse.parameters import Parameters
 
 LIKELY = 3.0
 """Natural logarithm of the Bayes factor from which on another geometry is likely: strong evidence (Kass and Raftery,
@@ -18,15 +21,21 @@ class GeometryScore:
         log_bayes: logarithm of the Bayes factor of a geometry that is uncertain by the usual
             (`geometry_score.usual_uncertainty`) over the stated one; above 0 where the data ask for another one.
         values: name -> (change that the data ask for, its standard deviation, unit).
+        parameters: of the fit with that change, to first order, where the geometry is uncertain by the usual.
     """
 
     log_bayes: float
     values: Mapping[str, tuple[float, float, str]]
+    parameters: Parameters
 
     @property
     def is_likely(self) -> bool:
         """Whether another geometry is likely."""
         return self.log_bayes > LIKELY
+
+    def as_record(self) -> dict[str, Any]:
+        """Return what files keep of it."""
+        return {"log_bayes": self.log_bayes, "values": dict(self.values)}
 
 
 def largest_changes(values: Mapping[str, tuple[float, float, str]]) -> str:

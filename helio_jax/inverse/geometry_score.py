@@ -22,14 +22,10 @@ from helio_jax.inverse.instrument_report import describe_instrument, plain_name,
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Marginal
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.residuals import (
-    FixedTerms,
-    Unknowns,
-    residuals_at,
-    surface_of,
-)
+from helio_jax.inverse.residuals import FixedTerms, Unknowns, residuals, residuals_at, surface_of
 from helio_jax.inverse.state import FitState, set_corrections
 from helio_jax.inverse.steps import freeze
+from helio_jax.inverse.strain import INSTRUMENT
 
 USUAL_DEG = 3.0
 """Prior standard deviation of polar angles and azimuths of a file that may be wrong [deg]."""
@@ -42,6 +38,12 @@ FITTED = (
     "(helio calibrate) or state its [uncertainty]; a surface that does not scatter by the cosine law can look alike"
 )
 """Warning of a fit whose geometry was fitted for what the data say of it."""
+DOUBTFUL = (
+    "the micrographs may ask for another geometry than the instrument file states as exact: {named}; a fit with an "
+    "uncertain geometry did not explain them better and was not kept: calibrate the instrument (helio calibrate) or "
+    "state its [uncertainty]"
+)
+"""Warning of a fit of which the data say so, and whose geometry is as stated."""
 
 
 def geometry_warnings(fit: Fit) -> tuple[str, ...]:
@@ -49,6 +51,8 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     score = fit.geometry_score
     if score is None:
         return ()
+    if not fit.problem.geometry.is_aimed:
+        return (DOUBTFUL.format(named=largest_changes(score.values)),)
     fitted = describe_instrument(fit).get("values", {})
     values = {name: tuple(fitted[name][i] for i in (0, 1, 3)) for name in score.values if name in fitted}
     return (FITTED.format(named=largest_changes(values or score.values)),)
@@ -94,7 +98,28 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
     changes, std = matrix @ estimate[own], np.sqrt(np.diag(matrix @ spread @ matrix.T))
     shown = (plain_name(names[i], fit.instrument.detector_names) for i in np.flatnonzero(own))
     values = zip(changes.tolist(), std.tolist(), np.array(units)[own].tolist(), strict=True)
-    return GeometryScore(log_bayes, dict(zip(shown, values, strict=True)))
+    return GeometryScore(log_bayes, dict(zip(shown, values, strict=True)), _moved(state.parameters, estimate))
+
+
+def _moved(parameters: Parameters, change: np.ndarray) -> Parameters:
+    """Add a change to the free parameters, in their order [parameter]."""
+    own, moved = [np.asarray(getattr(parameters, name)) for name in parameters.free()], {}
+    parts = np.split(change, np.cumsum([value.size for value in own])[:-1])
+    for name, value, part in zip(parameters.free(), own, parts, strict=True):
+        moved[name] = value + part.reshape(value.shape)
+    return parameters.replaced(**moved)
+
+
+def surface_misfit(fit: Fit) -> float:
+    """Compute half the sum of the squared residuals of a fit's last solve, the instrument's pulls left out.
+
+    Those of the data, and of what holds the surface together: a wrong geometry shows in slopes that no surface has.
+    """
+    s = fit.problem.settings
+    unknowns, fixed = freeze(fit.problem, fit.state, s.robust_limits[-1], s.jump_limits[-1])
+    with jax.enable_x64(True):
+        found = residuals(unknowns, fixed)
+        return 0.5 * float(sum(np.sum(np.square(r)) for name, r in found.items() if name not in INSTRUMENT))
 
 
 def _with_geometry(fit: Fit, free: FitProblem) -> FitState:
@@ -140,8 +165,10 @@ def _log_bayes(estimate: np.ndarray, covariance: np.ndarray, spread: np.ndarray)
     """
     left, ways = np.linalg.eigh(covariance)
     ways = ways[:, left < _DETERMINED]
+    size, along = np.linalg.eigh(spread - covariance)
+    more = along * np.maximum(size, 0.0) @ along.T  # errors that agree tell no more than independent ones
     m, c = ways.T @ estimate, ways.T @ covariance @ ways
-    exact = ways.T @ (spread - covariance @ covariance) @ ways
+    exact = ways.T @ (covariance - covariance @ covariance + more) @ ways
     uncertain = exact + (np.eye(len(m)) - c) @ (np.eye(len(m)) - c)
     return _log_density(m, uncertain) - _log_density(m, exact)
 

@@ -6,7 +6,6 @@ instrument from the stack, and, if the settings say so, that the border of the i
 """
 
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import cache, partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -259,7 +258,7 @@ def _refined(stack, settings, make_predict, report, start) -> _Refined:
             "chi_square": fit.chi_square,
             "assumed": found.assumed,
             "readout_priors": priors_of(fit),
-            "geometry_score": None if fit.geometry_score is None else asdict(fit.geometry_score),
+            "geometry_score": fit.geometry_score and fit.geometry_score.as_record(),
             "anchors": as_records(anchors),
         },
     )

@@ -13,7 +13,8 @@ Rows that leave the image before they reach a crest tell nothing.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,8 +143,14 @@ class RimEdges:
     next_variance: np.ndarray
     evidence: np.ndarray
 
+    def parts(self, sizes: Sequence[int]) -> Iterator["RimEdges"]:
+        """Split into parts of so many edges."""
+        ends = np.cumsum(sizes)
+        for start, end in zip(ends - sizes, ends, strict=True):
+            yield RimEdges(*(getattr(self, f.name)[:, start:end] for f in fields(self)))
 
-def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float) -> RimEdges:
+
+def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: np.ndarray) -> RimEdges:
     """Compute the rises beside rims from the slopes of the pixels within.
 
     The distance d of the first pixel from the rim is uniform in (0, 1) pixels, c has a scale-free prior. Parallel
@@ -153,7 +160,7 @@ def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float)
         slope: slopes away from the rim, of the first and the following pixels [edge, pixel].
         std: their standard deviations; infinite: not known [edge, pixel].
         crest: distance of the crest from the first pixel, in pixels [edge].
-        typical: r of an edge is one of `OFFSETS` times `typical` / L, in pixels.
+        typical: r of an edge is one of `OFFSETS` times `typical` / L, in pixels [edge].
 
     Source: own derivation, tests/inverse/test_rims.py.
     """
@@ -162,7 +169,7 @@ def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: float)
     per_offset = []
     for number, r in enumerate(OFFSETS):
         length = crest[:, None, None] + d
-        offset = r * typical / length
+        offset = r * typical[:, None, None] / length
         profile = _Profile(offset, np.full_like(length, FAR) if number == len(OFFSETS) - 1 else length)
         at = profile.slope(d + ahead)
         inverse = np.where((ahead < 2) | (ahead < NEAR_CREST * crest[:, None]), 1.0 / std, 0.0)[:, None]
@@ -250,22 +257,25 @@ def find_rims(
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
     numbers = _outlines(found, steep.shape)
     is_sheared = {axis: abs(along) > LEAST_SHEAR for axis, along in zip((1, 0), shift, strict=True)}
-    n_sides = 0
+    outlines = []
     for number in np.unique(np.concatenate(list(numbers.values()))):
         mine = {way: c.only(numbers[way] == number) for way, c in found.items()}
         beyond = np.concatenate([c.beyond for c in mine.values()])
         if len(beyond) < LEAST_EDGES or np.median(beyond) > 1.0:
             continue
-        parts = [[way for way in ways if not is_sheared[way[0]]], *([way] for way in ways if is_sheared[way[0]])]
+        groups = [[way for way in ways if not is_sheared[way[0]]], *([way] for way in ways if is_sheared[way[0]])]
         sides = [
-            {way: mine[way].only(mine[way].falls == is_falling) for way in part}
-            for part in parts
+            {way: side for way in group if len((side := mine[way].only(mine[way].falls == is_falling)).y)}
+            for group in groups
             for is_falling in (False, True)
         ]
-        sides = [_Side.of(side) for side in sides if any(len(c.y) for c in side.values())]
-        if sum(side.gain for side in sides) < DECISIVE:
+        outlines.append([side for side in sides if side])
+    n_sides, beside = 0, _rises_of([side for sides in outlines for side in sides])
+    for sides in outlines:
+        judged = [_Side.of(side, next(beside)) for side in sides]
+        if sum(side.gain for side in judged) < DECISIVE:
             continue
-        for side in sides:
+        for side in judged:
             if not side.may_hide_its_foot:
                 n_sides += 1
                 side.set_edges(out, n_sides)
@@ -296,6 +306,30 @@ def _outlines(found: dict[tuple[int, int], _Candidates], shape: tuple[int, ...])
     return {way: rim[c.y, c.x] + (n_rims + 1) * part[kinds[way], c.y, c.x] for way, c in found.items()}
 
 
+def _rises_of(sides: list[dict[tuple[int, int], _Candidates]]) -> Iterator[dict[tuple[int, int], RimEdges]]:
+    """Compute the rises of sides, all at once.
+
+    Between the sections of an ellipsoid along its axes the product of r and L goes with the square of L, of which
+    the crests of rows and columns tell.
+    """
+    all_of = [c for side in sides for c in side.values()]
+    if not all_of:
+        return
+    typical = []
+    for side in sides:
+        crests = {
+            axis: np.concatenate([np.zeros(0), *(c.crest for way, c in side.items() if way[0] == axis)])
+            for axis in (1, 0)
+        }
+        middle = 0.5 + float(np.median(np.concatenate(list(crests.values()))))
+        of_axis = {axis: (0.5 + float(np.median(c))) ** 2 / middle for axis, c in crests.items() if len(c)}
+        typical += [np.full(len(c.y), of_axis[axis]) for (axis, _), c in side.items()]
+    slope, std, crest = (np.concatenate([getattr(c, name) for c in all_of]) for name in ("slope", "std", "crest"))
+    found = rises(slope, std, crest, np.concatenate(typical)).parts([len(c.y) for c in all_of])
+    for side in sides:
+        yield {way: next(found) for way in side}
+
+
 class _Side(NamedTuple):
     """Candidates that share an r, by axis and direction.
 
@@ -310,22 +344,10 @@ class _Side(NamedTuple):
     evidence: np.ndarray
 
     @classmethod
-    def of(cls, mine: dict[tuple[int, int], _Candidates]) -> "_Side":
-        """Compute rises and evidence.
-
-        Between the sections of an ellipsoid along its axes the product of r and L goes with the square of L, of which
-        the crests of rows and columns tell.
-        """
-        crests = {
-            axis: np.concatenate([np.zeros(0), *(c.crest for way, c in mine.items() if way[0] == axis)])
-            for axis in (1, 0)
-        }
-        typical = 0.5 + float(np.median(np.concatenate(list(crests.values()))))
-        of_axis = {axis: (0.5 + float(np.median(c))) ** 2 / typical for axis, c in crests.items() if len(c)}
-        beside = {way: rises(c.slope, c.std, c.crest, of_axis[way[0]]) for way, c in mine.items() if way[0] in of_axis}
+    def of(cls, mine: dict[tuple[int, int], _Candidates], beside: dict[tuple[int, int], RimEdges]) -> "_Side":
+        """Sum up the evidence."""
         evidence = np.sum([b.evidence.sum(1) for b in beside.values()], axis=0)
-        n = sum(len(c) for c in crests.values())
-        return cls(mine, beside, evidence * min(1.0, N_INDEPENDENT / n))
+        return cls(mine, beside, evidence * min(1.0, N_INDEPENDENT / sum(len(c.y) for c in mine.values())))
 
     @property
     def probability(self) -> np.ndarray:

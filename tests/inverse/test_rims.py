@@ -194,11 +194,11 @@ def test_rises_in_closed_form():
             return np.sqrt(2.0 * length * t - t**2 + 2.0 * cut)
 
         slope = (length[:, None] - at) / height(at, length[:, None])
-        found = rises(slope, std, crest, 9.0)
+        found = rises(slope, std, crest, np.full(4, 9.0))
         assert np.argmax(found.evidence.sum(1)) == number
         np.testing.assert_allclose(found.rise[number], height(d) - height(0.0 * d), rtol=0.06)
         np.testing.assert_allclose(found.next_rise[number], height(1.0 + d) - height(d), rtol=0.03)
-    even = rises(np.full((1, 4), 0.5), std[:1], np.full(1, 12.0), 12.0)
+    even = rises(np.full((1, 4), 0.5), std[:1], np.full(1, 12.0), np.full(1, 12.0))
     assert np.argmax(even.evidence[:, 0]) == len(OFFSETS) - 1
     np.testing.assert_allclose(even.rise[-1], 0.25, rtol=1e-2)
     np.testing.assert_allclose(np.sqrt(even.variance[-1]), 0.5 / np.sqrt(12.0), rtol=1e-2)
