@@ -55,10 +55,9 @@ def true_settings(member: Member, rng: np.random.Generator) -> dict[str, Any]:
         return {f"detector.{k}.azimuth_deg": azimuths[k] for k in range(n)}
     if member.world == "instrument nearer":
         return _with_polar(member, dict.fromkeys(range(n), 4.0))
-    if member.world == "instrument farther":  # polar angles by 3 deg, distance by 5 %
+    if member.world == "angles and distance":
         turns = dict.fromkeys(range(n), float(rng.choice((-3.0, 3.0))))
-        stated = member.tables["plate"].get("sample_distance_um", member.tables["plate"]["working_distance_um"])
-        distance = stated * (1.0 + float(rng.choice((-0.05, 0.05))))
+        distance = member.tables["plate"]["sample_distance_um"] * (1.0 + float(rng.choice((-0.05, 0.05))))
         return _with_polar(member, turns) | {"plate.sample_distance_um": distance}
     if member.world == "aperture off":
         return _with_polar(member, {int(rng.integers(n)): float(rng.choice((-3.0, 3.0)))})

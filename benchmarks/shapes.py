@@ -401,7 +401,7 @@ WORLDS = (
     "wide spot",
     "dead detector",
     "mirrored raster",
-    "instrument farther",
+    "angles and distance",
     "aperture off",
 )
 """What is wrong in family `wrong`, of its members 0, 1, 2 and so on."""

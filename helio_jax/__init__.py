@@ -113,8 +113,8 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edges               edges of the raster: smooth, kink or jump
   rims                where a dome, steepest at its rim, meets a level surface
   strain              how far a fit moves the instrument from what is stated
-  geometry_change     what the data ask of a geometry that is stated as exact
-  geometry_score      whether they do (Rao's score test)
+  geometry_change     change of a geometry stated as exact that the data ask for
+  geometry_score      whether they ask for one (Rao's score test)
   wider_readout       fit of gains or offsets that are far from what is stated
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   photometric_start   surfaces that a fit starts from

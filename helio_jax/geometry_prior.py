@@ -116,7 +116,7 @@ def errors_in_common(
     scan = np.repeat(np.arange(len(priors)), [len(prior) - 1 for prior in priors])
     plate, own = np.asarray(plates)[scan], np.concatenate([np.arange(1, len(prior)) for prior in priors])
     is_azimuth = own % 2 == 0
-    # with an error of 1 of the distance, in its standard deviations
+    # how the directions change with one standard deviation of the distance; those of different plates only so together
     by_distance = np.concatenate([p[0, 1:] / math.sqrt(p[0, 0]) if p[0, 0] else p[0, 1:] for p in priors])
     joint = np.outer(by_distance, by_distance)
     for number in np.unique(plate):

@@ -159,7 +159,7 @@ def _joined_names(stacks: Sequence[MicrographStack]) -> list[str]:
 
 
 def _plates(instruments: Sequence[Instrument]) -> list[int]:
-    """Number the plates of instruments: one where the apertures lie alike, in their order."""
+    """Return for every instrument the number of the first one with apertures in the same places, in the same order."""
     centers = [np.array([a.center for a in instrument.apertures()]) for instrument in instruments]
 
     def is_same(one: np.ndarray, other: np.ndarray) -> bool:

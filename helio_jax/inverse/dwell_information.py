@@ -130,7 +130,7 @@ class DwellInformation:
 
     @property
     def _n_edges(self) -> int:
-        (ny, nx) = self.at.linear.shape
+        ny, nx = self.at.linear.shape
         return ny * (nx - 1) + (ny - 1) * nx
 
     def noise_ratio(self, seconds: np.ndarray) -> np.ndarray:
@@ -230,7 +230,7 @@ class RegionVariance:
         about = self.about
         t = about.thinned(seconds)
         left = Marginal.of(about.linear_at(t, self.edge_factor))
-        surface, instrument = left.with_sums(self.of_surface, self.of_instrument)
+        surface, instrument = left.times(self.of_surface, self.of_instrument)
         value = float(np.sum(self.of_surface * surface) + np.sum(self.of_instrument * instrument))
         at_fit = about.at.linear
         seen = _data_rows(at_fit, surface, instrument, t.size)

@@ -603,25 +603,26 @@ class _Fits:
         """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
 
         So they may where gains and offsets are not what is stated: that can stand for a wrong geometry, and so can
-        patches of other albedos, which have to explain more by `GAIN` than the fit without them. Interrupted or given
-        up, it returns the explanation as it was, marked.
+        patches of other albedos, which have to explain more by `GAIN` than the fit without them. Returns the best
+        explanation so far where it is interrupted or nothing can be predicted.
         """
         fit = best.fit
-        is_at_rest = not fit.is_interrupted and has_converged(fit.changes, self.settings.refine.tolerance_um)
-        score = score_geometry(fit) if is_at_rest else None
-        if score is None or not (score.is_likely or fit.prior_widths):
+        if fit.is_interrupted or not has_converged(fit.changes, self.settings.refine.tolerance_um):
             return best
-        if score.is_likely:
-            best = best._replace(fit=replace(fit, geometry_score=score))
-        self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
-        patches, none = fit.problem.patches, AlbedoPatches.none(self.stack.shape[1:])
-        gained, least = 0.0, LIKELY
         try:
+            score = score_geometry(fit)
+            if score is None or not (score.is_likely or fit.prior_widths):
+                return best
+            if score.is_likely:
+                best = best._replace(fit=replace(fit, geometry_score=score))
+            self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
+            patches, none = fit.problem.patches, AlbedoPatches.none(self.stack.shape[1:])
+            residuals, gained, least = self.residuals(fit), 0.0, LIKELY
             for known in (none, patches) if patches.objects else (none,):
                 found = self._with_geometry(fit, score, known)
                 if found.is_interrupted:
                     return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-                more = self.gained_by_geometry(fit, found)
+                more = self.gained_by_geometry(fit, residuals, found)
                 if more > gained + least:
                     best, gained, least = best._replace(fit=replace(found, geometry_score=score)), more, GAIN
         except PredictionError as e:
@@ -639,18 +640,17 @@ class _Fits:
         start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
         return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
 
-    def gained_by_geometry(self, fit: Fit, found: Fit) -> float:
+    def gained_by_geometry(self, fit: Fit, residuals: np.ndarray, found: Fit) -> float:
         """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.
 
         In half chi-square; 0 where the instrument alone is less likely by `GAIN`, or the data, traced, contradict it in
-        more pixels (`MORE_CONTRADICTED`).
+        more pixels (`MORE_CONTRADICTED`). `residuals`: traced ones of the fit without [detector, y, x].
         """
-        of_instrument = instrument_improvement(fit, found)
-        before, after = self.residuals(fit), self.residuals(found)
-        right = self.right_chi_square(before)
-        share = self.contradicted(before, right).mean()
-        is_more = self.contradicted(after, right).mean() > max(MIN_CONTRADICTED, MORE_CONTRADICTED * share)
-        return 0.0 if is_more or of_instrument < -GAIN else surface_misfit(fit) - surface_misfit(found) + of_instrument
+        of_instrument, right = instrument_improvement(fit, found), self.right_chi_square(residuals)
+        before, after = (self.contradicted(r, right).mean() for r in (residuals, self.residuals(found)))
+        if of_instrument < -GAIN or after > max(MIN_CONTRADICTED, MORE_CONTRADICTED * before):
+            return 0.0
+        return surface_misfit(fit) - surface_misfit(found) + of_instrument
 
     def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
         """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""

@@ -263,8 +263,7 @@ def fit_heights(
 
     Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
     """
-    s, state = problem.settings, FitState.at(problem, start)
-    state = state if parameters is None else replace(state, parameters=parameters)
+    s, state = problem.settings, FitState.at(problem, start, parameters)
     changes: list[float] = []
     reached: FitState | None = None
     solved = state

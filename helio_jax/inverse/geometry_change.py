@@ -18,10 +18,10 @@ class GeometryScore:
     """What the data of a fit say of a geometry that it took for exact.
 
     Attributes:
-        log_bayes: logarithm of the Bayes factor of a geometry that is uncertain by the usual
-            (`geometry_score.usual_uncertainty`) over the stated one; above 0 where the data ask for another one.
+        log_bayes: logarithm of the Bayes factor of an uncertain geometry (`geometry_score.usual_uncertainty`) over the
+            stated one; above 0 where the data ask for another one.
         values: name -> (change that the data ask for, its standard deviation, unit).
-        parameters: of the fit with that change, to first order, where the geometry is uncertain by the usual.
+        parameters: of a fit with that uncertain geometry, to first order.
     """
 
     log_bayes: float

@@ -35,7 +35,7 @@ _DETERMINED = 0.99
 """A combination of which the data leave more of the prior variance decides nothing."""
 FITTED = (
     "the geometry is not what the instrument file states as exact, and was fitted: {named}; calibrate the instrument "
-    "(helio calibrate) or state its [uncertainty]; a surface that does not scatter by the cosine law can look alike"
+    "(helio calibrate) or state its [uncertainty]"
 )
 """Warning of a fit whose geometry was fitted for what the data say of it."""
 DOUBTFUL = (
@@ -64,7 +64,7 @@ def usual_uncertainty(problem: FitProblem) -> Uncertainty:
     What the file states as uncertain stays as it is.
     """
     stated = Uncertainty() if problem.instrument is None else problem.instrument.uncertainty
-    distance = stated.sample_distance_um or USUAL_DISTANCE * float(problem.optics.sample_distance)
+    distance = problem.geometry.distance_std or USUAL_DISTANCE * float(problem.optics.sample_distance)
     usual = {"polar_deg": USUAL_DEG, "azimuth_deg": USUAL_DEG, "sample_distance_um": distance}
     return stated.model_copy(update=usual)
 
@@ -88,7 +88,7 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
         by_surface, by = jax.tree.map(np.asarray, _gradient(unknowns, fixed))
     found, names = Marginal.of(at.linear), at.linear.names
     gradient = np.concatenate([np.ravel(getattr(by, name)) for name in unknowns.parameters.free()])
-    estimate = -found.with_sums(_of_kept(by_surface, at.stride), gradient)[1]
+    estimate = -found.parameters_times(_of_kept(by_surface, at.stride), gradient)
     exact = [name for name in ("distance", "aim") if not getattr(fit.parameters, name).size]
     own = np.array([name.partition("[")[0] in exact for name in names])
     spread = at.errors.covariance(found.influence()[:, own])
@@ -123,7 +123,7 @@ def surface_misfit(fit: Fit) -> float:
 
 
 def _with_geometry(fit: Fit, free: FitProblem) -> FitState:
-    """Return a fit's state in a problem whose geometry is unknown: at the stated one."""
+    """Return a fit's state in a problem whose geometry is uncertain: at the stated one."""
     held, means = fit.state.held, free.prior_means()
     before = fit.state.parameters
     parameters = before.replaced(aim=means.aim, distance=before.distance if before.distance.size else means.distance)

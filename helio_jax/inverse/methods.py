@@ -153,7 +153,7 @@ def warnings_of(fit: "Fit") -> tuple[str, ...]:
             f"all error bars are inflated by {fit.posterior.inflation:.1f}"
         )
     found += geometry_warnings(fit)
-    if fit.geometry_score is None and (fit.parameters.aim.size or fit.parameters.distance.size):
+    if fit.parameters.aim.size or fit.parameters.distance.size:
         found.append(GEOMETRY_WARNING)
     if fit.problem.settings.has_own_law:
         found.append(LAW_WARNING)

@@ -348,17 +348,21 @@ class Marginal:
         return cls(linear, solve, answer, np.linalg.inv(jc.T @ jc - border.T @ answer))
 
     def influence(self) -> np.ndarray:
-        """Compute by how much every residual, were it larger, would lower the parameters [residual, parameter]."""
+        """Compute minus the derivative of the fitted parameters by every residual [residual, parameter]."""
         return (self.linear.instrument - self.linear.apply(self.answer)) @ self.covariance
 
-    def with_sums(self, of_surface: np.ndarray, of_instrument: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the covariance of surface [3 * pixel, sum] and parameters [parameter, sum] with sums of both.
+    def parameters_times(self, surface: np.ndarray, instrument: np.ndarray) -> np.ndarray:
+        """Multiply the rows of the parameters in the joint covariance by vectors [parameter, ...].
 
         Args:
-            of_surface, of_instrument: derivatives of the sums, of the same shapes.
+            surface, instrument: parts of the vectors [3 * pixel, ...], [parameter, ...].
         """
-        instrument = self.covariance @ (of_instrument - self.answer.T @ of_surface)
-        return self.solve(of_surface) - self.answer @ instrument, instrument
+        return self.covariance @ (instrument - self.answer.T @ surface)
+
+    def times(self, surface: np.ndarray, instrument: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Multiply the joint covariance of surface and parameters by vectors, in parts as `parameters_times`."""
+        of_parameters = self.parameters_times(surface, instrument)
+        return self.solve(surface) - self.answer @ of_parameters, of_parameters
 
 
 def sample_posterior(
@@ -401,7 +405,7 @@ def sample_posterior(
     )
     if sums is None:
         return posterior
-    of_surface, of_instrument = found.with_sums(*np.split(sums, [len(found.answer)]))
+    of_surface, of_instrument = found.times(*np.split(sums, [len(found.answer)]))
     together = linear.apply(of_surface) + linear.instrument @ of_instrument
     naive = together.T @ together
     fields = np.moveaxis(of_surface.T.reshape(-1, *linear.shape, 3), -1, 1)

@@ -12,6 +12,7 @@ The first pixel outside is level: masks and multiple scattering are not predicte
 Rows that leave the image before they reach a crest tell nothing.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -256,19 +257,18 @@ def find_rims(
     found = {way: _candidates(slopes[1 - way[0]], steep, std, falls, *way) for way in ways}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
     numbers = _outlines(found, steep.shape)
-    is_sheared = {axis: abs(along) > LEAST_SHEAR for axis, along in zip((1, 0), shift, strict=True)}
+    is_sheared = {1: abs(shift[0]) > LEAST_SHEAR, 0: abs(shift[1]) > LEAST_SHEAR}
+    groups = [[way for way in ways if not is_sheared[way[0]]], *([way] for way in ways if is_sheared[way[0]])]
     outlines = []
     for number in np.unique(np.concatenate(list(numbers.values()))):
         mine = {way: c.only(numbers[way] == number) for way, c in found.items()}
         beyond = np.concatenate([c.beyond for c in mine.values()])
         if len(beyond) < LEAST_EDGES or np.median(beyond) > 1.0:
             continue
-        groups = [[way for way in ways if not is_sheared[way[0]]], *([way] for way in ways if is_sheared[way[0]])]
-        sides = [
-            {way: side for way in group if len((side := mine[way].only(mine[way].falls == is_falling)).y)}
-            for group in groups
-            for is_falling in (False, True)
-        ]
+        sides = []
+        for group, is_falling in itertools.product(groups, (False, True)):
+            parts = {way: mine[way].only(mine[way].falls == is_falling) for way in group}
+            sides.append({way: part for way, part in parts.items() if len(part.y)})
         outlines.append([side for side in sides if side])
     n_sides, beside = 0, _rises_of([side for sides in outlines for side in sides])
     for sides in outlines:

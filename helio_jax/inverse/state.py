@@ -79,10 +79,10 @@ class FitState:
     held: Held
 
     @classmethod
-    def at(cls, problem: FitProblem, start: Surface) -> "FitState":
-        """Start at a surface, parameters at their prior means, without corrections."""
+    def at(cls, problem: FitProblem, start: Surface, parameters: Parameters | None = None) -> "FitState":
+        """Start at a surface, without corrections; default of `parameters`: `FitProblem.start_parameters`."""
         surface = Surface(*(np.asarray(f) for f in (start.height, start.slope_x, start.slope_y)))
-        parameters = problem.start_parameters()
+        parameters = problem.start_parameters() if parameters is None else parameters
         held = _held(problem, Corrections.none(problem.signal.shape), surface, parameters)
         return cls(surface, parameters, np.zeros(problem.signal.shape), held)
 

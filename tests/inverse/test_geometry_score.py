@@ -1,6 +1,7 @@
 """A geometry that is stated as exact and is wrong: what the data say of it, by closed form, by refit and in a scan."""
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import helio_jax as hx
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import surface_of_heights
+from helio_jax.inverse import explanations
 from helio_jax.inverse.fit import Fit, fit_heights
 from helio_jax.inverse.geometry_change import LIKELY, largest_changes
 from helio_jax.inverse.geometry_score import USUAL_DEG, _log_bayes, score_geometry, usual_uncertainty
@@ -115,6 +117,22 @@ def test_a_wrong_geometry_is_fitted_and_the_warning_names_it(bshem, turn):
 
     assert right.provenance["geometry_score"] is None
     assert not any("geometry" in w for w in right.warnings)
+
+
+def test_what_is_known_of_the_distance_stays(bshem):
+    """A standard deviation from [covariance], too, which the table [uncertainty] does not state."""
+    problem = fitted(bshem, bshem, 0).problem
+    known = replace(problem.geometry, covariance=np.diag([20.0**2, *np.zeros(6)]))
+    assert usual_uncertainty(replace(problem, geometry=known)).sample_distance_um == pytest.approx(20.0)
+    assert usual_uncertainty(problem).sample_distance_um == pytest.approx(0.05 * bshem.sample_distance)
+
+
+def test_interrupted_during_the_test_the_fit_is_kept(bshem, monkeypatch):
+    """Ctrl-C after the fit, while its geometry is tested, loses nothing but the test."""
+    monkeypatch.setattr(explanations, "score_geometry", mock.Mock(side_effect=KeyboardInterrupt))
+    rec = reconstruct_stack(recorded(bshem, bshem, 0), ReconstructSettings(), lambda _: nothing_traced)
+    assert rec.status.startswith("interrupted while another explanation was tried")
+    assert rec.height.max() > 100.0
 
 
 @pytest.mark.parametrize("noise", (0.1, 1.0))
