@@ -93,7 +93,7 @@ class GeometryPrior:
 
 
 def errors_in_common(
-    instruments: Sequence[Instrument], plates: Sequence[int], names: Sequence[str]
+    instruments: Sequence[Instrument], plates: Sequence[tuple[int, Sequence[int]]], names: Sequence[str]
 ) -> Covariance | None:
     """State the errors of the instruments of several scans, between which the sample was turned.
 
@@ -103,7 +103,8 @@ def errors_in_common(
 
     Args:
         instruments: of every scan.
-        plates: number of the plate of every scan; scans of one plate state the same errors.
+        plates: for every scan, the number of the scan that has all apertures of its plate, and which of those each of
+            its own is; scans by one plate state the same errors.
         names: of the joined scans' detectors, scan by scan, each in its instrument's order.
 
     Returns:
@@ -114,14 +115,15 @@ def errors_in_common(
         return None
     distance = max(prior[0, 0] for prior in priors)
     scan = np.repeat(np.arange(len(priors)), [len(prior) - 1 for prior in priors])
-    plate, own = np.asarray(plates)[scan], np.concatenate([np.arange(1, len(prior)) for prior in priors])
+    plate = np.array([number for number, _ in plates])[scan]
+    own = np.concatenate([[1 + 2 * a + k for a in apertures for k in (0, 1)] for _, apertures in plates])
     is_azimuth = own % 2 == 0
     # how the directions change with one standard deviation of the distance; those of different plates only so together
     by_distance = np.concatenate([p[0, 1:] / math.sqrt(p[0, 0]) if p[0, 0] else p[0, 1:] for p in priors])
     joint = np.outer(by_distance, by_distance)
     for number in np.unique(plate):
         of = plate == number
-        prior = priors[scan[of][0]]
+        prior = priors[number]
         joint[np.ix_(of, of)] = prior[np.ix_(own[of], own[of])]
     rotation = (scan[:, None] == scan) & (scan > 0) & np.outer(is_azimuth, is_azimuth)
     joint = np.block(

@@ -344,7 +344,7 @@ class Instrument(Drawable, Settings):
         rotation: float = 0.0,
         incidence: float = 0.0,
     ) -> "Instrument":
-        """Return the instrument with changed aperture angles, plate, sample distance and incidence.
+        """Return the instrument with changed aperture angles, plate, sample distance and incidence, without covariance.
 
         Each aperture is shifted along its azimuth by the change of polar angle of its centre, seen from the nominal
         spot, and rotated about the plate normal through that spot by the change of azimuth; then the plate moves as one
@@ -373,7 +373,7 @@ class Instrument(Drawable, Settings):
         if incidence and self.has_several_beams:
             raise SceneError("the incidence of an instrument of several beams cannot be moved: move that of its scans")
         beam = self.beam.changed(incidence_deg=self.beam.incidence_deg + math.degrees(incidence))
-        return Instrument(beam=beam, plate=plate, uncertainty=self.uncertainty, detector=tuple(detectors))
+        return self.model_copy(update={"beam": beam, "plate": plate, "detector": tuple(detectors), "covariance": None})
 
     def at_distance(self, distance: float) -> "Instrument":
         """Return the instrument, its plate unchanged, at another sample distance [um]."""

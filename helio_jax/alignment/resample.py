@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from helio_jax.alignment.rigid import Rigid
-from helio_jax.arrays import as_json, pitch
+from helio_jax.arrays import pitch
 from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
 from helio_jax.detector import MAX_NAME
 from helio_jax.errors import GuardError, InputFileError
@@ -158,17 +158,30 @@ def _joined_names(stacks: Sequence[MicrographStack]) -> list[str]:
     return [f"{number} {at}" for at, (number, _, _) in enumerate(parts, 1)]
 
 
-def _plates(instruments: Sequence[Instrument]) -> list[int]:
-    """Return for every instrument the number of the first one with apertures in the same places, in the same order."""
+def _plates(instruments: Sequence[Instrument]) -> list[tuple[int, list[int]]]:
+    """Find the scans by one plate: those whose apertures are in the same places, in any order, or a part of them.
+
+    Returns:
+        For every instrument the number of the first one with all apertures of its plate, and which of its apertures
+        each own one is.
+    """
     centers = [np.array([a.center for a in instrument.apertures()]) for instrument in instruments]
+    numbers = sorted(range(len(centers)), key=lambda k: -len(centers[k]))
+    plates: dict[int, tuple[int, list[int]]] = {}
+    for number in numbers:
+        whole = (k for k, (plate, _) in plates.items() if k == plate)
+        matched = ((k, _matched(centers[number], centers[k])) for k in whole)
+        own = number, list(range(len(centers[number])))
+        plates[number] = next(((k, same) for k, same in matched if same is not None), own)
+    return [plates[number] for number in range(len(instruments))]
 
-    def is_same(one: np.ndarray, other: np.ndarray) -> bool:
-        return one.shape == other.shape and bool(np.max(np.abs(one - other)) < SAME_PLACE)
 
-    numbers: list[int] = []
-    for number, here in enumerate(centers):
-        numbers.append(next((k for k in numbers if is_same(centers[k], here)), number))
-    return numbers
+def _matched(here: np.ndarray, there: np.ndarray) -> list[int] | None:
+    """Find the place among others [aperture, 2] that each of some places is; None: some are not among them."""
+    apart = np.abs(here[:, None] - there).max(axis=2)
+    same = np.argmin(apart, axis=1)
+    is_matched = np.all(apart.min(axis=1) < SAME_PLACE) and len(set(same.tolist())) == len(same)
+    return same.tolist() if is_matched else None
 
 
 def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:
@@ -180,7 +193,7 @@ def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:
 def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
     """Refuse scans by one plate that state different errors of it; raises as `check_joinable`."""
     instruments = [s.instrument for s in stacks]
-    for number, (stack, first) in enumerate(zip(stacks, _plates(instruments), strict=True)):
+    for number, (stack, (first, _)) in enumerate(zip(stacks, _plates(instruments), strict=True)):
         for what, a, b in (
             ("[uncertainty]", instruments[first].uncertainty, instruments[number].uncertainty),
             ("[covariance]", instruments[first].covariance, instruments[number].covariance),
@@ -265,10 +278,15 @@ def _calibration(stacks: Sequence[MicrographStack]) -> Calibration | None:
 
 
 def _widest(priors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the largest of what several calibrations state of each setting, number by number."""
-    names = dict.fromkeys(name for stated in priors for name in stated)
-    stated = {name: np.broadcast_arrays(*(p[name] for p in priors if name in p)) for name in names}
-    return {name: as_json(np.max(values, axis=0)) for name, values in stated.items()}
+    """Return the largest of what several calibrations state of each setting.
+
+    Settings that are lists, the limits of a fit's solves, are those of the first that states them.
+    """
+    stated: dict[str, Any] = {}
+    for name, value in (item for each in priors for item in each.items()):
+        is_list = isinstance(value, (list, tuple))
+        stated[name] = stated.get(name, value) if is_list else max(value, stated.get(name, value))
+    return stated
 
 
 def is_lit(height: np.ndarray, x: np.ndarray, y: np.ndarray, shift: np.ndarray) -> np.ndarray:

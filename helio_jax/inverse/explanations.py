@@ -94,6 +94,10 @@ UNLIKELY_GAIN = 3.0
 OTHER_TRIED = "while another explanation was tried"
 FREE_TRIED = "while free gains and offsets were tried"
 """Said of a fit that was interrupted meanwhile."""
+USUAL_OFFSET = 0.1
+"""Offsets of an instrument whose geometry is not as stated are uncertain by so much, over the signal, at least."""
+FEW_DETECTORS = 3
+"""With so many detectors a geometry that is fitted may be less likely by `GAIN`, with more in proportion."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -632,23 +636,34 @@ class _Fits:
         return best
 
     def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches) -> Fit:
-        """Fit with an uncertain geometry, from where the score says that this ends."""
+        """Fit with an uncertain geometry, from where the score says that this ends.
+
+        The offsets are uncertain by `USUAL_OFFSET` at least: background that nobody subtracted looks alike.
+        """
         problem, surface = fit.problem, fit.state.surface
-        known = patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
+        before, stated = widths(fit), self.settings.refine.offset_std
+        wider = dict(before) | {"offset": max(before["offset"], USUAL_OFFSET / stated if stated else 1.0)}
+        settings = with_widths(self.settings, wider)
+        known = patches, problem.region, problem.anchors, settings, usual_uncertainty(problem)
         posed, start = self.pose(surface, *known), score.parameters
-        as_stated = {name: factor * getattr(start, name) for name, factor in widths(fit).items()}
-        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
-        return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
+        same = {name: before[name] / wider[name] * getattr(start, name) for name in wider}
+        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **same)
+        found = self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
+        return replace(found, prior_widths=wider if max(wider.values()) > 1.0 else {})
 
     def gained_by_geometry(self, fit: Fit, residuals: np.ndarray, found: Fit) -> float:
         """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.
 
-        In half chi-square; 0 where the instrument alone is less likely by `GAIN`, or the data, traced, contradict it in
-        more pixels (`MORE_CONTRADICTED`). `residuals`: traced ones of the fit without [detector, y, x].
+        In half chi-square; 0 where the instrument alone is less likely by `GAIN` for every three detectors, or the
+        data, traced, contradict it in more pixels (`MORE_CONTRADICTED`). A plate that is turned moves all apertures.
+
+        Args:
+            residuals: traced ones of the fit without [detector, y, x].
         """
         of_instrument, right = instrument_improvement(fit, found), self.right_chi_square(residuals)
         before, after = (self.contradicted(r, right).mean() for r in (residuals, self.residuals(found)))
-        if of_instrument < -GAIN or after > max(MIN_CONTRADICTED, MORE_CONTRADICTED * before):
+        worst = GAIN * max(1.0, len(fit.problem.signal) / FEW_DETECTORS)
+        if of_instrument < -worst or after > max(MIN_CONTRADICTED, MORE_CONTRADICTED * before):
             return 0.0
         return surface_misfit(fit) - surface_misfit(found) + of_instrument
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from helio_jax.errors import SceneError
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.render import (
@@ -30,6 +31,8 @@ from helio_jax.inverse.state import FitState, set_corrections, with_responses
 
 N_SAMPLES = 256
 """Samples of the posterior: standard deviations are known to 4 %."""
+LEAST_SAMPLES = 2
+"""Standard deviations of fewer samples mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,10 @@ def fisher(
         settings: priors of gain, offset, drift ...; whether the border is flat (table [reconstruct]).
         corrections: masks and multiple scattering, as in `hx.render`.
         albedo: relative reflectivity, scalar or [y, x].
-        n_samples: from which standard deviations are taken; they are known to 1 / sqrt(2 n).
+        n_samples: from which standard deviations are taken, 2 at least; they are known to 1 / sqrt(2 n).
+
+    Raises:
+        SceneError: too few samples.
 
     Example:
         >>> three = hx.fisher(height, hx.Optics.of(instrument), raster, dose=1e6)
@@ -82,6 +88,8 @@ def fisher(
 
     Source: Cramer-Rao bound with Gaussian priors; sampling as in `posterior.sample_posterior`.
     """
+    if n_samples < LEAST_SAMPLES:
+        raise SceneError(f"n_samples is {n_samples}: standard deviations need {LEAST_SAMPLES} samples at least")
     problem, state = pose_experiment(
         height, optics, raster, dose, background, uncertainty, settings, corrections, albedo
     )

@@ -12,6 +12,7 @@ import numpy as np
 from helio_jax.forward.optics import Raster
 from helio_jax.inverse.explanations import scan_order
 from helio_jax.inverse.fit import Fit
+from helio_jax.inverse.geometry_score import is_geometry_fitted, usual_uncertainty
 from helio_jax.inverse.linear import parallax_of, signal_of
 from helio_jax.inverse.parameters import NAMES, Parameters
 from helio_jax.inverse.problem import FitProblem
@@ -41,7 +42,7 @@ def with_further_images(
     n = fit.problem.signal.shape[0]
     signal, variance = signal_of(stack)
     signal[:n], variance[:n] = fit.problem.signal, fit.problem.variance
-    surface, known = fit.state.surface, fit.problem
+    surface, known, is_fitted = fit.state.surface, fit.problem, is_geometry_fitted(fit)
     parallax = parallax_of(stack)
     if parallax is not None:
         parallax[0][:n] = known.parallax
@@ -57,11 +58,15 @@ def with_further_images(
         patches=known.patches,
         anchors=known.anchors,
         parallax=parallax,
+        uncertainty=usual_uncertainty(known) if is_fitted else None,
     )
     problem = replace(
         problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share
     )
-    state = replace(FitState.at(problem, surface), parameters=_extended(problem, fit.state.parameters))
+    state = replace(
+        FitState.at(problem, surface),
+        parameters=_extended(problem, fit.state.parameters, detector if is_fitted else None),
+    )
     state = update_corrections(problem, state, predict)
     model = expected(problem, state, is_noisy=True)
     further = np.where(problem.is_observed[n:], model[n:], np.nan)
@@ -130,8 +135,12 @@ def parallax_of_image(image: np.ndarray, height: np.ndarray, raster: Raster, shi
     return np.where(known, change, 0.0)
 
 
-def _extended(problem: FitProblem, parameters: Parameters) -> Parameters:
-    """Give the further images' parameters their prior means, and keep those of the first ones."""
+def _extended(problem: FitProblem, parameters: Parameters, alike: np.ndarray | None) -> Parameters:
+    """Give the further images' parameters their prior means, and keep those of the first ones.
+
+    `alike`: number of the image whose aperture each further one has, which keeps the direction that was fitted; None:
+    prior means.
+    """
     start = problem.start_parameters()
     values = {}
     for name in NAMES:
@@ -140,5 +149,7 @@ def _extended(problem: FitProblem, parameters: Parameters) -> Parameters:
             new = old
         elif old.ndim and new.ndim == old.ndim and old.shape[1:] == new.shape[1:]:
             new[: len(old)] = old
+            if name == "aim" and alike is not None:
+                new[len(old) :] = old[alike]
         values[name] = new
     return Parameters(**values)

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from helio_jax.inverse.parameters import Parameters
 
 LIKELY = 3.0
@@ -22,11 +24,13 @@ class GeometryScore:
             stated one; above 0 where the data ask for another one.
         values: name -> (change that the data ask for, its standard deviation, unit).
         parameters: of a fit with that uncertain geometry, to first order.
+        height_change: of the same fit, um [y, x].
     """
 
     log_bayes: float
     values: Mapping[str, tuple[float, float, str]]
     parameters: Parameters
+    height_change: np.ndarray
 
     @property
     def is_likely(self) -> bool:

@@ -22,7 +22,9 @@ from helio_jax.inverse.instrument_report import describe_instrument, plain_name,
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Marginal
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Unknowns, residuals, residuals_at, surface_of
+from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.state import FitState, set_corrections
 from helio_jax.inverse.steps import freeze
 from helio_jax.inverse.strain import INSTRUMENT
@@ -39,9 +41,9 @@ FITTED = (
 )
 """Warning of a fit whose geometry was fitted for what the data say of it."""
 DOUBTFUL = (
-    "the micrographs may ask for another geometry than the instrument file states as exact: {named}; a fit with an "
-    "uncertain geometry did not explain them better and was not kept: calibrate the instrument (helio calibrate) or "
-    "state its [uncertainty]"
+    "the micrographs may ask for another geometry than the instrument file states as exact: {named}; no fit with an "
+    "uncertain geometry was kept, but the error bars hold what it would change: calibrate the instrument (helio "
+    "calibrate) or state its [uncertainty]"
 )
 """Warning of a fit of which the data say so, and whose geometry is as stated."""
 
@@ -51,11 +53,18 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     score = fit.geometry_score
     if score is None:
         return ()
-    if not fit.problem.geometry.is_aimed:
+    if not is_geometry_fitted(fit):
         return (DOUBTFUL.format(named=largest_changes(score.values)),)
-    fitted = describe_instrument(fit).get("values", {})
+    if fit.posterior is None:
+        return (FITTED.format(named=f"{largest_changes(score.values)} by the test before (no error bars)"),)
+    fitted = describe_instrument(fit)["values"]
     values = {name: tuple(fitted[name][i] for i in (0, 1, 3)) for name in score.values if name in fitted}
     return (FITTED.format(named=largest_changes(values or score.values)),)
+
+
+def is_geometry_fitted(fit: Fit) -> bool:
+    """Whether a fit's geometry, stated as exact, was fitted for what the data say of it."""
+    return fit.geometry_score is not None and fit.problem.geometry.is_aimed
 
 
 def usual_uncertainty(problem: FitProblem) -> Uncertainty:
@@ -88,7 +97,8 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
         by_surface, by = jax.tree.map(np.asarray, _gradient(unknowns, fixed))
     found, names = Marginal.of(at.linear), at.linear.names
     gradient = np.concatenate([np.ravel(getattr(by, name)) for name in unknowns.parameters.free()])
-    estimate = -found.parameters_times(_of_kept(by_surface, at.stride), gradient)
+    surface, estimate = found.times(_of_kept(by_surface, at.stride), gradient)
+    height_change, estimate = -surface[::3].reshape(at.linear.shape), -estimate
     exact = [name for name in ("distance", "aim") if not getattr(fit.parameters, name).size]
     own = np.array([name.partition("[")[0] in exact for name in names])
     spread = at.errors.covariance(found.influence()[:, own])
@@ -98,7 +108,12 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
     changes, std = matrix @ estimate[own], np.sqrt(np.diag(matrix @ spread @ matrix.T))
     shown = (plain_name(names[i], fit.instrument.detector_names) for i in np.flatnonzero(own))
     values = zip(changes.tolist(), std.tolist(), np.array(units)[own].tolist(), strict=True)
-    return GeometryScore(log_bayes, dict(zip(shown, values, strict=True)), _moved(state.parameters, estimate))
+    return GeometryScore(
+        log_bayes,
+        dict(zip(shown, values, strict=True)),
+        _moved(state.parameters, estimate),
+        on_raster(height_change, p.raster.shape, at.stride),
+    )
 
 
 def _moved(parameters: Parameters, change: np.ndarray) -> Parameters:
@@ -113,13 +128,15 @@ def _moved(parameters: Parameters, change: np.ndarray) -> Parameters:
 def surface_misfit(fit: Fit) -> float:
     """Compute half the sum of the squared residuals of a fit's last solve, the instrument's pulls left out.
 
-    Those of the data, and of what holds the surface together: a wrong geometry shows in slopes that no surface has.
+    Those of the data, limited as elsewhere, and of what holds the surface together: a wrong geometry shows in slopes
+    that no surface has.
     """
     s = fit.problem.settings
     unknowns, fixed = freeze(fit.problem, fit.state, s.robust_limits[-1], s.jump_limits[-1])
     with jax.enable_x64(True):
         found = residuals(unknowns, fixed)
-        return 0.5 * float(sum(np.sum(np.square(r)) for name, r in found.items() if name not in INSTRUMENT))
+        of_surface = sum(np.sum(np.square(r)) for name, r in found.items() if name not in ("data", *INSTRUMENT))
+    return half_chi_square(fit.residuals) + 0.5 * float(of_surface)
 
 
 def _with_geometry(fit: Fit, free: FitProblem) -> FitState:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
+from helio_jax.errors import SceneError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate, Uncertainty
 from helio_jax.inverse.posterior import exact_height_covariance, linearise
 from helio_jax.inverse.problem import FitProblem
@@ -55,6 +56,14 @@ def test_more_detectors_count_as_more_dose():
     six = inner(hx.posterior_std(height, ring(6), raster, 1e5, **KNOWN))
     three = inner(hx.posterior_std(height, ring(3), raster, 2e5, **KNOWN))
     assert six == pytest.approx(three, rel=0.05)
+
+
+def test_too_few_samples_are_refused(bshem):
+    """None, which crashed, and one, of which no standard deviation follows."""
+    raster = hx.Raster.regular((5, 5), 40.0)
+    for n in (0, 1):
+        with pytest.raises(SceneError, match=f"n_samples is {n}.*2 samples at least"):
+            hx.fisher(np.zeros((5, 5)), hx.Optics.of(bshem), raster, 1e6, n_samples=n)
 
 
 def test_samples_agree_with_the_dense_inverse(bshem):

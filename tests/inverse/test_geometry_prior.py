@@ -124,15 +124,15 @@ def test_turned_scans_share_the_errors_of_their_plate(bshem):
 
 
 def test_scans_by_different_plates_err_independently(bshem):
-    """Another mounting of the same detectors, stated with the same table, and a plate with fewer apertures.
+    """A plate with apertures in other directions, stated with the same table, and one with fewer, elsewhere.
 
     Rejects errors that are copied from the first scan, by name: those of a shifted plate are other ones of each.
     """
     one = with_plate_error(bshem, std=(SHIFT, 0.0, 0.0))
-    mounted = [one.detector[(i + 1) % 3].model_copy(update={"name": d.name}) for i, d in enumerate(one.detector)]
+    elsewhere, further = (bshem.moved(np.full((3, 2), (0.0, np.radians(turn))), 0.0) for turn in (40.0, 80.0))
     others = (
-        one.model_copy(update={"detector": tuple(mounted)}),
-        with_plate_error(bshem.model_copy(update={"detector": bshem.detector[:2]}), std=(0.0, 0.0, 15.0)),
+        one.model_copy(update={"detector": elsewhere.detector}),
+        with_plate_error(bshem.model_copy(update={"detector": further.detector[:2]}), std=(0.0, 0.0, 15.0)),
     )
     blank = MicrographStack(np.ones((3, 4, 4)), 10.0 * np.arange(4), 10.0 * np.arange(4), one, n_rays=1.0)
     few = MicrographStack(blank.counts[:2], blank.x, blank.y, others[1], n_rays=1.0, name="few")
@@ -147,6 +147,34 @@ def test_scans_by_different_plates_err_independently(bshem):
     assert found[7:13, 7:13] == pytest.approx(turned[1:, 1:] + rotation, rel=1e-5, abs=floor)
     assert found[1:7, 7:13] == pytest.approx(np.zeros((6, 6)), abs=floor)
     assert found[0, 0] == pytest.approx(last[0, 0], rel=1e-5)
+
+
+def test_apertures_of_one_plate_err_alike_in_any_order(bshem):
+    """A scan by two of three detectors, another with the table in another order: each aperture errs by the same.
+
+    Rejects plates that are compared aperture by aperture in the order of the tables: their errors were independent.
+    """
+    uncertain = bshem.model_copy(update={"uncertainty": Uncertainty(polar_deg=2.0, azimuth_deg=1.0)})
+    orders = (0, 1), (0, 1, 2), (2, 0, 1)
+    scans = tuple(
+        MicrographStack(
+            np.ones((len(order), 4, 4)),
+            10.0 * np.arange(4),
+            10.0 * np.arange(4),
+            uncertain.model_copy(update={"detector": tuple(bshem.detector[k] for k in order)}),
+            n_rays=1.0,
+            name=f"scan {number}",
+        )
+        for number, order in enumerate(orders)
+    )
+    check_joinable(scans)
+    found = GeometryPrior.of(joined_instrument(scans, (Rigid(0.0, (0.0, 0.0)),) * 3)).covariance[1::2, 1::2]
+    aperture = np.concatenate(orders)
+    expected = np.radians(2.0) ** 2 * (aperture[:, None] == aperture)
+    assert found == pytest.approx(expected, rel=1e-4, abs=1e-5 * expected.max())
+    other = scans[0].replace(instrument=scans[0].instrument.model_copy(update={"uncertainty": Uncertainty()}))
+    with pytest.raises(InputFileError, match="'scan 0' and 'scan 1' are scans by one pinhole plate"):
+        check_joinable((other, *scans[1:]))
 
 
 @pytest.mark.parametrize("length", (62, 64))

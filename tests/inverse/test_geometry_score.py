@@ -7,18 +7,29 @@ import numpy as np
 import pytest
 
 import helio_jax as hx
+from helio_jax.alignment.rigid import Rigid
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import surface_of_heights
 from helio_jax.inverse import explanations
 from helio_jax.inverse.fit import Fit, fit_heights
+from helio_jax.inverse.further_images import with_further_images
 from helio_jax.inverse.geometry_change import LIKELY, largest_changes
-from helio_jax.inverse.geometry_score import USUAL_DEG, _log_bayes, score_geometry, usual_uncertainty
+from helio_jax.inverse.geometry_score import (
+    USUAL_DEG,
+    _log_bayes,
+    is_geometry_fitted,
+    score_geometry,
+    surface_misfit,
+    usual_uncertainty,
+)
 from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
-from helio_jax.micrograph import MicrographStack
+from helio_jax.micrograph import MicrographSet, MicrographStack
+from helio_jax.workflows.next_scan import _joint, _like
+from helio_jax.workflows.several_scans import JoinedScans
 
 SIDE = 25
 PITCH = 40.0
@@ -158,3 +169,53 @@ def test_what_the_data_do_not_tell_decides_nothing():
     both = np.diag([0.01, 1.0 - 1e-9])
     assert _log_bayes(np.array([0.5, 1e-6]), both, both) == pytest.approx(one, abs=0.01)
     assert LIKELY > 1.0
+
+
+def test_error_bars_hold_a_geometry_that_is_not_fitted(bshem, monkeypatch):
+    """All azimuths 6 deg off, and no fit with another geometry kept: 2 standard deviations hold 90 % of the heights.
+
+    Against those by the right instrument; without what another geometry would change, they hold half of them.
+    """
+    monkeypatch.setattr(explanations._Fits, "gained_by_geometry", lambda *_: 0.0)
+    aim = np.zeros((3, 2))
+    aim[:, 1] = np.radians(6.0)
+    wrong, right = (
+        reconstruct_stack(recorded(bshem, truth, 2), ReconstructSettings(), lambda _: nothing_traced)
+        for truth in (bshem.moved(aim, 0.0), bshem)
+    )
+    assert any("no fit with an uncertain geometry was kept" in w for w in wrong.warnings)
+    error = np.abs(wrong.height - right.height)[wrong.is_valid]
+    assert np.mean(error < 2.0 * wrong.height_std[wrong.is_valid]) > 0.9
+
+
+def test_misfit_grows_with_data_that_are_far_off(bshem):
+    """A tenth of the data farther and farther off: each fit explains less. Rejects squares of weighted residuals."""
+    fit = fitted(bshem, bshem, 0)
+    off = np.random.default_rng(3).random(fit.residuals.shape) < 0.1
+    misfits = [surface_misfit(replace(fit, residuals=np.where(off, k, fit.residuals))) for k in (0, 4, 8, 16)]
+    assert misfits[0] < misfits[1] < misfits[2] <= misfits[3]
+
+
+def test_further_images_keep_a_geometry_that_was_fitted(bshem):
+    """All polar angles 3 deg off, and an image by the same plate turned by 90 deg that is not recorded yet.
+
+    Posed with it, the recorded images are explained as well as by the fit, and each aperture has the same change in
+    both. By the stated geometry the squared residuals are 300 times as large.
+    """
+    bshem = bshem.model_copy(update={"beam": bshem.beam.changed(incidence_deg=0.0)})
+    aim = np.zeros((3, 2))
+    aim[:, 0] = np.radians(3.0)
+    here = Rigid(0.0, (0.0, 0.0))
+    present = recorded(bshem, bshem.moved(aim, 0.0), 2).replace(dwell=1.0)
+    stack = JoinedScans.at(MicrographSet((present,)), (here,), (0.0,), None).stack
+    fit = explanations.explain(stack, ReconstructSettings(), lambda _: nothing_traced, None).fit
+    assert is_geometry_fitted(fit)
+
+    joint = _joint(stack, [present], [_like(present, 90.0)], (here,))
+    seconds = np.ones((6, SIDE, SIDE))
+    predict = lambda height, *_, **__: Corrections.none((6, *height.shape))  # noqa: E731
+    problem, state = with_further_images(fit, joint, predict, seconds, np.arange(3))
+    assert np.nanmean(state.residuals[:3] ** 2) < 1.2 * np.mean(fit.residuals**2)
+    moves = problem.moves(state.parameters)
+    np.testing.assert_allclose(moves[:, 3:], moves[:, :3], atol=1e-12)
+    assert np.degrees(moves[1, :3]) == pytest.approx(3.0, abs=0.7)
