@@ -94,8 +94,6 @@ UNLIKELY_GAIN = 3.0
 OTHER_TRIED = "while another explanation was tried"
 FREE_TRIED = "while free gains and offsets were tried"
 """Said of a fit that was interrupted meanwhile."""
-USUAL_OFFSET = 0.1
-"""Offsets of an instrument whose geometry is not as stated are uncertain by so much, over the signal, at least."""
 FEW_DETECTORS = 3
 """With so many detectors a geometry that is fitted may be less likely by `GAIN`, with more in proportion."""
 AT_REST = 0.1
@@ -636,20 +634,13 @@ class _Fits:
         return best
 
     def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches) -> Fit:
-        """Fit with an uncertain geometry, from where the score says that this ends.
-
-        The offsets are uncertain by `USUAL_OFFSET` at least: background that nobody subtracted looks alike.
-        """
+        """Fit with an uncertain geometry, from where the score says that this ends."""
         problem, surface = fit.problem, fit.state.surface
-        before, stated = widths(fit), self.settings.refine.offset_std
-        wider = dict(before) | {"offset": max(before["offset"], USUAL_OFFSET / stated if stated else 1.0)}
-        settings = with_widths(self.settings, wider)
-        known = patches, problem.region, problem.anchors, settings, usual_uncertainty(problem)
+        known = patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
         posed, start = self.pose(surface, *known), score.parameters
-        same = {name: before[name] / wider[name] * getattr(start, name) for name in wider}
-        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **same)
-        found = self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
-        return replace(found, prior_widths=wider if max(wider.values()) > 1.0 else {})
+        as_stated = {name: factor * getattr(start, name) for name, factor in widths(fit).items()}
+        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
+        return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
 
     def gained_by_geometry(self, fit: Fit, residuals: np.ndarray, found: Fit) -> float:
         """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.

@@ -36,8 +36,8 @@ USUAL_DISTANCE = 0.05
 _DETERMINED = 0.99
 """A combination of which the data leave more of the prior variance decides nothing."""
 FITTED = (
-    "the geometry is not what the instrument file states as exact, and was fitted: {named}; calibrate the instrument "
-    "(helio calibrate) or state its [uncertainty]"
+    "the geometry is not what the instrument file states as exact, and was fitted: {named}; background that was not "
+    "subtracted can look alike: check it, calibrate the instrument (helio calibrate) or state its [uncertainty]"
 )
 """Warning of a fit whose geometry was fitted for what the data say of it."""
 DOUBTFUL = (
