@@ -373,7 +373,14 @@ class Instrument(Drawable, Settings):
         if incidence and self.has_several_beams:
             raise SceneError("the incidence of an instrument of several beams cannot be moved: move that of its scans")
         beam = self.beam.changed(incidence_deg=self.beam.incidence_deg + math.degrees(incidence))
-        return self.model_copy(update={"beam": beam, "plate": plate, "detector": tuple(detectors), "covariance": None})
+        return Instrument(
+            beam=beam,
+            plate=plate,
+            detector=tuple(detectors),
+            uncertainty=self.uncertainty,
+            readout=self.readout,
+            law=self.law,
+        )
 
     def at_distance(self, distance: float) -> "Instrument":
         """Return the instrument, its plate unchanged, at another sample distance [um]."""

@@ -95,7 +95,8 @@ OTHER_TRIED = "while another explanation was tried"
 FREE_TRIED = "while free gains and offsets were tried"
 """Said of a fit that was interrupted meanwhile."""
 FEW_DETECTORS = 3
-"""With so many detectors a geometry that is fitted may be less likely by `GAIN`, with more in proportion."""
+"""A fitted geometry may be less likely than the stated one by `GAIN` with up to so many detectors, with more in
+proportion: a plate that is turned moves all apertures."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -144,8 +145,10 @@ def explain(
 
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as
-    they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`). Interrupted
-    after the first fit, it returns the best of those that were compared. Arguments as `reconstruct_stack`.
+    they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), objects also
+    in many more: they have no further unknowns that could explain something else, and contradicted pixels around their
+    outlines. Interrupted after the first fit, it returns the best of those that were compared. Arguments as
+    `reconstruct_stack`.
     """
     stack = with_level_of_law(stack, settings.refine)
     fits = _Fits(stack, settings, make_predict, report, start)
@@ -180,6 +183,8 @@ def explain(
                 best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
+            if other == fits.from_objects:  # it has no further unknowns
+                most = math.inf
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
                 most = max(most, MORE_CONTRADICTED * share)
             is_less = fits.contradicted(rest, right).mean() < most
@@ -334,6 +339,13 @@ class _Fits:
     def residuals(self, fit: Fit) -> np.ndarray:
         """Compute (model - data) / standard deviation of a fit, predicted anew [detector, y, x]."""
         return residuals_of_state(fit.problem, fit.state, self.predict_trial)
+
+    def traced_misfit(self, fit: Fit) -> float:
+        """Compute half the chi-square of a fit, predicted anew; infinite where its surface cannot be traced."""
+        try:
+            return half_chi_square(self.residuals(fit))
+        except PredictionError:
+            return math.inf
 
     def residuals_of_first(self, fit: Fit) -> np.ndarray:
         """Compute the residuals of a first fit; where its surface cannot be traced, those of its last solve.
@@ -505,11 +517,14 @@ class _Fits:
         return Explanation(self.fitted(*self.plain_start, patches), np.zeros(self.stack.shape[1:], bool))
 
     def from_objects(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
-        """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better."""
+        """Fit from objects on a flat substrate; None where there are none, or steps are measured, which are better.
+
+        Where other outlines explain the data about as well, the better of two fits.
+        """
         if self.settings.border != "flat" or not self.settings.refine.objects or best.n_steps:
             return None
         none, (surface, smoothed) = AlbedoPatches.none(self.stack.shape[1:]), self.plain_start
-        objects = find_objects(
+        found = find_objects(
             self.by_cosine_law,
             self.settings,
             surface,
@@ -517,13 +532,19 @@ class _Fits:
             lambda surface: self.misfit(surface, none),
             self.say,
         )
-        if objects is None:
+        fits: list[tuple[float, Fit, np.ndarray]] = []
+        for objects in found:
+            start = self.promising(objects.surface(surface), best)
+            if start is None or (fits and fits[-1][1].is_interrupted):
+                continue
+            fit = self.fitted(start, smoothed, none, objects.number)
+            fits.append((self.traced_misfit(fit), fit, objects.number))
+        if not fits:
             return None
-        start = self.promising(objects.surface(surface), best)
-        if start is None:
-            return None
-        fit = self.fitted(start, smoothed, none, objects.number)
-        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
+        _, fit, number = min(fits, key=lambda one: one[0])
+        if fits[-1][1].is_interrupted:  # whichever is better
+            fit = interrupted(fit, OTHER_TRIED)
+        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), number, "objects on")
 
     def from_pits(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from pits with flat floors in a flat substrate; None where there are none."""
@@ -645,8 +666,8 @@ class _Fits:
     def gained_by_geometry(self, fit: Fit, residuals: np.ndarray, found: Fit) -> float:
         """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.
 
-        In half chi-square; 0 where the instrument alone is less likely by `GAIN` for every three detectors, or the
-        data, traced, contradict it in more pixels (`MORE_CONTRADICTED`). A plate that is turned moves all apertures.
+        In half chi-square; 0 where the instrument alone is too unlikely (`GAIN`, `FEW_DETECTORS`), or the
+        data, traced, contradict it in more pixels (`MORE_CONTRADICTED`).
 
         Args:
             residuals: traced ones of the fit without [detector, y, x].

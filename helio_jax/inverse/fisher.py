@@ -11,7 +11,6 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from helio_jax.errors import SceneError
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.render import (
@@ -26,13 +25,12 @@ from helio_jax.inverse.fit import posterior_at
 from helio_jax.inverse.instrument_report import listed_one_by_one, plain_name, units_of
 from helio_jax.inverse.posterior import Posterior
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.samples import check_samples
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import FitState, set_corrections, with_responses
 
 N_SAMPLES = 256
 """Samples of the posterior: standard deviations are known to 4 %."""
-LEAST_SAMPLES = 2
-"""Standard deviations of fewer samples mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +86,7 @@ def fisher(
 
     Source: Cramer-Rao bound with Gaussian priors; sampling as in `posterior.sample_posterior`.
     """
-    if n_samples < LEAST_SAMPLES:
-        raise SceneError(f"n_samples is {n_samples}: standard deviations need {LEAST_SAMPLES} samples at least")
+    check_samples(n_samples)
     problem, state = pose_experiment(
         height, optics, raster, dose, background, uncertainty, settings, corrections, albedo
     )

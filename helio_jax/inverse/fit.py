@@ -106,6 +106,11 @@ class Fit:
     geometry_score: GeometryScore | None = None
 
     @property
+    def is_geometry_fitted(self) -> bool:
+        """Whether the geometry, stated as exact, was fitted for what the data say of it."""
+        return self.geometry_score is not None and self.problem.geometry.is_aimed
+
+    @property
     def chi_square(self) -> list[float]:
         """Mean square residual of the data of every detector, each counted by its robust weight, squared."""
         total = np.sum((self.weight * self.residuals) ** 2, axis=(1, 2))
@@ -364,7 +369,7 @@ def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     if fit.is_interrupted or not n_samples:
         return fit
     posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
-    if fit.geometry_score is not None and not fit.problem.geometry.is_aimed:
+    if fit.geometry_score is not None and not fit.is_geometry_fitted:
         posterior = posterior.with_common_mode(fit.geometry_score.height_change)
     return replace(fit, posterior=posterior)
 

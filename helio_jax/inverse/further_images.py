@@ -12,7 +12,7 @@ import numpy as np
 from helio_jax.forward.optics import Raster
 from helio_jax.inverse.explanations import scan_order
 from helio_jax.inverse.fit import Fit
-from helio_jax.inverse.geometry_score import is_geometry_fitted, usual_uncertainty
+from helio_jax.inverse.geometry_score import usual_uncertainty
 from helio_jax.inverse.linear import parallax_of, signal_of
 from helio_jax.inverse.parameters import NAMES, Parameters
 from helio_jax.inverse.problem import FitProblem
@@ -42,7 +42,7 @@ def with_further_images(
     n = fit.problem.signal.shape[0]
     signal, variance = signal_of(stack)
     signal[:n], variance[:n] = fit.problem.signal, fit.problem.variance
-    surface, known, is_fitted = fit.state.surface, fit.problem, is_geometry_fitted(fit)
+    surface, known, is_fitted = fit.state.surface, fit.problem, fit.is_geometry_fitted
     parallax = parallax_of(stack)
     if parallax is not None:
         parallax[0][:n] = known.parallax
@@ -63,11 +63,8 @@ def with_further_images(
     problem = replace(
         problem, held_level=known.held_level, slope_noise=known.slope_noise, noise_share=known.noise_share
     )
-    state = replace(
-        FitState.at(problem, surface),
-        parameters=_extended(problem, fit.state.parameters, detector if is_fitted else None),
-    )
-    state = update_corrections(problem, state, predict)
+    parameters = _extended(problem, fit.state.parameters, detector if is_fitted else None)
+    state = update_corrections(problem, FitState.at(problem, surface, parameters), predict)
     model = expected(problem, state, is_noisy=True)
     further = np.where(problem.is_observed[n:], model[n:], np.nan)
     per_second = noise_of_signal(known.signal, known.variance * seconds[:n], further, detector)

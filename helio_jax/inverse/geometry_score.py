@@ -52,18 +52,15 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     score = fit.geometry_score
     if score is None:
         return ()
-    if not is_geometry_fitted(fit):
+    if not fit.is_geometry_fitted:
         return (DOUBTFUL.format(named=largest_changes(score.values)),)
     if fit.posterior is None:
-        return (FITTED.format(named=f"{largest_changes(score.values)} by the test before (no error bars)"),)
+        return (
+            FITTED.format(named=f"{largest_changes(score.values)}, expected before the fit, which has no error bars"),
+        )
     fitted = describe_instrument(fit)["values"]
     values = {name: tuple(fitted[name][i] for i in (0, 1, 3)) for name in score.values if name in fitted}
     return (FITTED.format(named=largest_changes(values or score.values)),)
-
-
-def is_geometry_fitted(fit: Fit) -> bool:
-    """Whether a fit's geometry, stated as exact, was fitted for what the data say of it."""
-    return fit.geometry_score is not None and fit.problem.geometry.is_aimed
 
 
 def usual_uncertainty(problem: FitProblem) -> Uncertainty:
@@ -96,8 +93,7 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
         by_surface, by = jax.tree.map(np.asarray, _gradient(unknowns, fixed))
     found, names = Marginal.of(at.linear), at.linear.names
     gradient = np.concatenate([np.ravel(getattr(by, name)) for name in unknowns.parameters.free()])
-    surface, estimate = found.times(_of_kept(by_surface, at.stride), gradient)
-    height_change, estimate = -surface[::3].reshape(at.linear.shape), -estimate
+    surface, estimate = found.times(-_of_kept(by_surface, at.stride), -gradient)
     exact = [name for name in ("distance", "aim") if not getattr(fit.parameters, name).size]
     own = np.array([name.partition("[")[0] in exact for name in names])
     spread = at.errors.covariance(found.influence()[:, own])
@@ -111,7 +107,7 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
         log_bayes,
         dict(zip(shown, values, strict=True)),
         _moved(state.parameters, estimate),
-        on_raster(height_change, p.raster.shape, at.stride),
+        on_raster(surface[::3].reshape(at.linear.shape), p.raster.shape, at.stride),
     )
 
 

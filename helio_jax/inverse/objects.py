@@ -56,6 +56,10 @@ STARTS = -0.3, 0.1, 0.2, 0.35, 0.5
 """Shifts of an object's relief that are tried at first, in widths of the object ..."""
 STEPS = (0.14, -0.14), (0.07, -0.07), (0.035, -0.035)
 """... and then around the best one."""
+ABOUT_AS_WELL = 1.05
+"""Another outline that leaves up to so many times the misfit of the best one is a rival of it ..."""
+OTHER_OUTLINE = 0.1
+"""... where it differs from that one in a larger share of its pixels."""
 _SQUARE = np.ones((3, 3))
 
 
@@ -114,12 +118,18 @@ class ObjectSearch:
     unexplained: Callable[[Surface], np.ndarray]
     report: Callable[[str], None] = lambda said: None
 
-    def find(self, objects: Objects) -> Trial | None:
+    def find(self, objects: Objects) -> list[Objects]:
         """Find each object's outline and level, from outlines that are too wide.
 
-        None where a flat substrate explains too little (`MOST_MISFIT`).
+        A relief that is only shifted has not the object's shape: two outlines can explain the data about as well
+        (`ABOUT_AS_WELL`) that fits tell apart.
+
+        Returns:
+            The best objects and, where some have a rival outline, those with all rivals; none where a flat substrate
+            explains too little (`MOST_MISFIT`).
         """
         best, n = self._tried(objects), len(objects.shift)
+        rivals: dict[int, Objects] = {}
         limit = MOST_MISFIT * self.misfit(self.relief)
         sizes = np.bincount(objects.number.ravel())[1:]
         for place, number in enumerate(np.argsort(-sizes)[:MOST_OBJECTS] + 1, 1):
@@ -128,14 +138,23 @@ class ObjectSearch:
             most = MOST_START * _best(starts).misfit
             best = _best(self._without_segments(trial, number) for trial in starts if trial.misfit <= most)
             if best.misfit > HOPELESS * limit:
-                return None
-            best = _best([best, *(self._peeled(t, number) for t in self._shifted(best, number, STARTS))])
-            for steps in STEPS:
+                return []
+            tried = [best]
+            for steps in (STARTS, *STEPS):
                 others = list(self._shifted(best, number, steps))
-                best = _best([best, *others, *(self._peeled(t, number) for t in others)])
+                tried += [*others, *(self._peeled(t, number) for t in others)]
+                best = _best(tried)
+            tried.append(self._peeled(best, number))
+            best = _best(tried)
             if best.misfit > limit:
-                return None
-        return best
+                return []
+            rival = _rival(tried, best, number)
+            if rival is not None:
+                rivals[number] = rival
+        found = best.objects
+        for number, rival in rivals.items():
+            found = found.outlined(number, rival.number == number).shifted(number, rival.shift[number - 1])
+        return [best.objects, found] if rivals else [best.objects]
 
     def _tried(self, objects: Objects) -> Trial:
         return Trial(objects, self.misfit(objects.surface(self.relief)))
@@ -191,8 +210,8 @@ def find_objects(
     predict: Predict,
     misfit: Callable[[Surface], float],
     report: Callable[[str], None] = lambda said: None,
-) -> Objects | None:
-    """Find the objects on a flat substrate in micrographs; None if no sharp edges enclose anything.
+) -> list[Objects]:
+    """Find the objects on a flat substrate in micrographs, as `ObjectSearch.find`; none if no sharp edges enclose any.
 
     Args:
         stack: micrographs, in units of the beam; the substrate at height 0.
@@ -206,11 +225,10 @@ def find_objects(
     sharp = jumps(substrate.ratio, substrate.ratio_std) > SHARP
     enclosed = enclosed_by(sharp)
     if not enclosed.any():
-        return None
+        return []
     raster = Raster.of(stack)
     search = ObjectSearch(relief, sharp, (raster.dy, raster.dx), misfit, substrate.unexplained, report)
-    found = search.find(Objects(enclosed, (0.0,) * int(enclosed.max())))
-    return None if found is None else found.objects
+    return search.find(Objects(enclosed, (0.0,) * int(enclosed.max())))
 
 
 @dataclass(frozen=True)
@@ -322,6 +340,18 @@ def _core(inside: np.ndarray) -> np.ndarray:
 
 def _filled(inside: np.ndarray) -> np.ndarray:
     return np.asarray(binary_fill_holes(inside))
+
+
+def _rival(trials: Iterable[Trial], best: Trial, number: int) -> Objects | None:
+    """Choose the best objects of those that explain the data about as well as the best, an object's outline another."""
+    outline = best.objects.number == number
+
+    def is_rival(trial: Trial) -> bool:
+        differs = (trial.objects.number == number) != outline
+        return trial.misfit <= ABOUT_AS_WELL * best.misfit and bool(differs.sum() > OTHER_OUTLINE * outline.sum())
+
+    rivals = [trial for trial in trials if is_rival(trial)]
+    return _best(rivals).objects if rivals else None
 
 
 def _best(trials: Iterable[Trial]) -> Trial:

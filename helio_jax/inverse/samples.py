@@ -4,6 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from helio_jax.errors import SceneError
+
+LEAST_SAMPLES = 2
+"""Standard deviations of fewer samples mean nothing."""
+
+
+def check_samples(n_samples: int) -> None:
+    """Refuse too few samples for standard deviations.
+
+    Raises:
+        SceneError: fewer than `LEAST_SAMPLES`.
+    """
+    if n_samples < LEAST_SAMPLES:
+        raise SceneError(f"n_samples is {n_samples}: standard deviations need {LEAST_SAMPLES} samples at least")
+
 
 def thinning(shape: tuple[int, ...], max_pixels: int) -> int:
     """Compute the least power of two by which to thin rows and columns of a raster (y, x) to at most `max_pixels`."""

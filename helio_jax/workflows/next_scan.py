@@ -23,7 +23,7 @@ from helio_jax.inverse.dwell_information import N_PROBES, DwellInformation, Regi
 from helio_jax.inverse.further_images import with_further_images
 from helio_jax.inverse.methods import warnings_of
 from helio_jax.inverse.posterior import MAX_PIXELS
-from helio_jax.inverse.samples import thinning
+from helio_jax.inverse.samples import check_samples, thinning
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import OF_ONE_SCAN, Micrographs, MicrographSet, MicrographStack
 from helio_jax.planning.dwell import Cost, DwellTimes, Groups, spend
@@ -214,14 +214,14 @@ def next_scan(
         change_s: time to change to another rotation [s].
         block: side of the squares of pixels that share a dwell time; default: at most 1024 squares per scan.
         settings: table [reconstruct].
-        n_samples: of each posterior from which standard deviations are taken.
+        n_samples: of each posterior from which standard deviations are taken, 2 at least.
         report: called before each iteration of the fit.
         workers: threads that trace.
         say: called with what is done.
 
     Raises:
         SceneError: an unknown dwell time, expected counts, aligned scans, a region without pixels, a time or block out
-            of range, a rotation that is scanned already.
+            of range, a rotation that is scanned already, too few samples.
         InputFileError, GuardError: as `hx.reconstruct_scans`; the scans cannot be added.
 
     Example:
@@ -236,6 +236,7 @@ def next_scan(
     for name, value in (("time to move", move_s), ("time to change the rotation", change_s)):
         if not (math.isfinite(value) and value >= 0.0):
             raise SceneError(f"the {name} must be a finite time >= 0 s, got {value:g}: correct it")
+    check_samples(n_samples)
     given = [micrographs] if isinstance(micrographs, (MicrographStack, MicrographSet)) else list(micrographs)
     present = tuple(map(_ready, add_by_orientation([s for one in given for s in one.stacks])))
     _check_rotations(present, rotations_deg)

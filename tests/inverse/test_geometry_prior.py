@@ -10,6 +10,7 @@ import pytest
 import helio_jax as hx
 from helio_jax.alignment.resample import check_joinable, joined_instrument
 from helio_jax.alignment.rigid import Rigid
+from helio_jax.campaign import CampaignLaw
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.forward.render import Corrections
 from helio_jax.geometry_prior import ROTATION_STD, GeometryPrior
@@ -37,6 +38,14 @@ def with_plate_error(instrument, std=(SHIFT, SHIFT, 20.0), correlation=0.5, **un
     )
     update = {"covariance": covariance, "uncertainty": Uncertainty(**uncertainty)}
     return instrument.model_copy(update=update)
+
+
+def test_a_moved_instrument_keeps_what_is_known_of_the_sample(bshem):
+    """Its law; what is known of the plate's errors is of the stated one, and goes."""
+    law = CampaignLaw(exponent=0.2, std=0.05)
+    moved = with_plate_error(bshem.model_copy(update={"law": law})).moved(np.zeros((3, 2)), 10.0)
+    assert moved.law == law and moved.covariance is None
+    assert moved.sample_distance == pytest.approx(bshem.sample_distance + 10.0)
 
 
 def test_shifted_plate_turns_all_apertures_together(bshem):

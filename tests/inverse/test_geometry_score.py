@@ -18,7 +18,6 @@ from helio_jax.inverse.geometry_change import LIKELY, largest_changes
 from helio_jax.inverse.geometry_score import (
     USUAL_DEG,
     _log_bayes,
-    is_geometry_fitted,
     score_geometry,
     usual_uncertainty,
 )
@@ -200,7 +199,7 @@ def test_further_images_keep_a_geometry_that_was_fitted(bshem):
     present = recorded(bshem, bshem.moved(aim, 0.0), 2).replace(dwell=1.0)
     stack = JoinedScans.at(MicrographSet((present,)), (here,), (0.0,), None).stack
     fit = explanations.explain(stack, ReconstructSettings(), lambda _: nothing_traced, None).fit
-    assert is_geometry_fitted(fit)
+    assert fit.is_geometry_fitted
 
     joint = _joint(stack, [present], [_like(present, 90.0)], (here,))
     seconds = np.ones((6, SIDE, SIDE))

@@ -49,8 +49,7 @@ def search(outline, level):
     wide = (np.hypot(X - 26, Y - 18) < 14.0).astype(int)
     unexplained = np.where(outline, 2.0 * LIMIT, 0.5 * LIMIT)
     found = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
-    best = found.find(Objects(wide, (0.0,)))
-    assert best is not None
+    (best,) = found.find(Objects(wide, (0.0,)))
     return best, relief
 
 
@@ -58,10 +57,29 @@ def search(outline, level):
 def test_outline_and_level_come_from_what_explains_the_images(level):
     """Pixels that the substrate explains go to it, the rest is raised or sunk as a whole, the relief kept."""
     found, relief = search(DISC, level)
-    assert np.sum((found.objects.number > 0) != DISC) <= 12
-    surface = found.objects.surface(relief)
+    assert np.sum((found.number > 0) != DISC) <= 12
+    surface = found.surface(relief)
     assert surface.height[18, 26] == pytest.approx(level, abs=8.0)
-    assert np.all(surface.slope_x[found.objects.number > 0] == 0.1) and np.all(surface.height[:3] == 0.0)
+    assert np.all(surface.slope_x[found.number > 0] == 0.1) and np.all(surface.height[:3] == 0.0)
+
+
+@pytest.mark.parametrize(("per_pixel", "n_found"), [(0.1, 2), (10.0, 1)])
+def test_an_outline_that_explains_about_as_well_is_found_too(per_pixel, n_found):
+    """Two outlines whose misfits differ by some per cent are both for fits to decide between; far worse ones are not.
+
+    Catches a search that takes the better one by a hair: the ball below came out 7 % too low on some machines.
+    """
+    wide = np.hypot(X - 26, Y - 18) < 14.0
+
+    def misfit(surface):
+        return 1000.0 + per_pixel * np.sum((surface.height != 0.0) != wide) + (surface.height[18, 26] - LEVEL) ** 2
+
+    relief = Surface(np.full(SHAPE, LEVEL), *np.zeros((2, *SHAPE)))
+    unexplained = np.where(DISC, 2.0 * LIMIT, 0.5 * LIMIT)
+    found = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
+    outlines = [objects.number > 0 for objects in found.find(Objects(wide.astype(int), (0.0,)))]
+    assert len(outlines) == n_found and np.array_equal(outlines[0], wide)
+    assert all(np.sum(outline != DISC) <= 12 for outline in outlines[1:])
 
 
 def test_no_second_object_where_the_first_leaves_far_more_than_no_substrate():
@@ -78,7 +96,7 @@ def test_no_second_object_where_the_first_leaves_far_more_than_no_substrate():
             lambda surface: np.full(SHAPE, 2.0 * LIMIT),
             said.append,
         )
-        assert (trial.find(Objects(outlines, (0.0, 0.0))) is None) == ends
+        assert (not trial.find(Objects(outlines, (0.0, 0.0)))) == ends
         assert len(said) == (1 if ends else 2)
 
 
@@ -93,7 +111,7 @@ def test_a_hopeless_object_is_not_refined():
     inside = (np.abs(X - 20) < 8) & (np.abs(Y - 20) < 8)
     unexplained = np.full(SHAPE, 2.0 * LIMIT)
     trial = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
-    assert trial.find(Objects(inside.astype(int), (0.0,))) is None
+    assert trial.find(Objects(inside.astype(int), (0.0,))) == []
     assert len(tried) == 2 + len(STARTS)
 
 
