@@ -113,6 +113,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   edges               edges of the raster: smooth, kink or jump
   rims                where a dome, steepest at its rim, meets a level surface
   strain              how far a fit moves the instrument from what is stated
+  growth              changes that grow from iteration to iteration, which corrections follow
   geometry_change     change of a geometry stated as exact that the data ask for
   geometry_score      whether they ask for one (Rao's score test)
   wider_readout       fit of gains or offsets that are far from what is stated

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.anchors import Anchors
@@ -83,46 +84,50 @@ class AnchorCheck:
         )
 
 
-def leave_out(leverage: np.ndarray, residual: np.ndarray, out: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Leave data out of a linear least-squares estimate.
+def by_anchors(known: np.ndarray, off: np.ndarray, used: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate sums of heights from all that is known of them beside their anchors, and from some of these.
+
+    Not by leaving anchors out of an estimate from all: where only anchors fix a level, what is known without them is
+    then lost to rounding.
 
     Args:
-        leverage: posterior covariance of what the data measure, in their standard deviations [datum, datum].
-        residual: (estimate - datum) / standard deviation [datum].
-        out: numbers of those that are left out.
+        known: covariance of the sums without anchors, in the anchors' standard deviations [anchor, anchor].
+        off: (estimate without anchors - anchor) / standard deviation [anchor].
+        used: numbers of those that are used.
 
     Returns:
-        Leverage and residual without them.
+        Covariance and (estimate - anchor) / standard deviation with those.
 
-    Source: Cook and Weisberg, Residuals and Influence in Regression (1982), sec. 2.2.
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), algorithm 2.1.
     """
-    if not out:
-        return leverage, residual
-    by = leverage[:, out] @ np.linalg.inv(np.eye(len(out)) - leverage[np.ix_(out, out)])
-    return leverage + by @ leverage[out], residual + by @ residual[out]
+    if not used:
+        return known, off
+    factor = cholesky(known[np.ix_(used, used)] + np.eye(len(used)), lower=True)
+    share = solve_triangular(factor, known[used], lower=True)
+    return known - share.T @ share, off - share.T @ solve_triangular(factor, off[used], lower=True)
 
 
-def pulls_of(leverage: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def pulls_of(known: np.ndarray, off: np.ndarray) -> np.ndarray:
     """Compare every anchor with all else; those that contradict it most count no more for the others.
 
     Args:
-        leverage, residual: as in `leave_out`.
+        known, off: as in `by_anchors`.
 
     Returns:
         Estimate without the anchor minus the anchor, standard deviation of that estimate, and pull, all in standard
         deviations of the anchors [3, anchor].
     """
-    n, wrong = len(residual), []
+    n, wrong = len(off), []
     while True:
         found = np.zeros((3, n))
         for i in range(n):
-            rest, off = leave_out(leverage, residual, [*(k for k in wrong if k != i), i])
+            rest, left = by_anchors(known, off, [k for k in range(n) if k != i and k not in wrong])
             std = np.sqrt(max(rest[i, i], 0.0))
-            found[:, i] = off[i], std, -off[i] / np.hypot(1.0, std)
-        left = [i for i in range(n) if i not in wrong and abs(found[2, i]) > LIMIT]
-        if not left:
+            found[:, i] = left[i], std, -left[i] / np.hypot(1.0, std)
+        worse = [i for i in range(n) if i not in wrong and abs(found[2, i]) > LIMIT]
+        if not worse:
             return found
-        wrong.append(max(left, key=lambda i: abs(found[2, i])))
+        wrong.append(max(worse, key=lambda i: abs(found[2, i])))
 
 
 class _Known(NamedTuple):
@@ -225,7 +230,7 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     inverse = np.linalg.inv(known + np.eye(n))
     off = weight @ fit.surface.height.ravel() - anchors.value
     of_all = inverse @ off
-    pulls = pulls_of(known - known @ inverse @ known, of_all)
+    pulls = pulls_of(known, off)
     is_wrong = np.abs(pulls[2]) > LIMIT
     is_of_few = given.is_measured & ~are_coherent(anchors.weight, surface[:, 0])
     is_used = ~(is_wrong & given.is_measured) & ~is_of_few

@@ -5,7 +5,7 @@ Every iteration: predict multiple scattering and masked aperture parts on the cu
 robust weights, then a few Gauss-Newton steps (`steps.step`). All of that is constant during a step.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from helio_jax.inverse.convergence import contraction_of, extrapolation, remaini
 from helio_jax.inverse.correlated_errors import EdgeError, Errors, ModelError
 from helio_jax.inverse.edges import AxisEdges
 from helio_jax.inverse.geometry_change import GeometryScore
+from helio_jax.inverse.growth import Growth
 from helio_jax.inverse.noise_bias import noise_bias, subtract_bias
 from helio_jax.inverse.occlusion import find_occlusion_edges
 from helio_jax.inverse.parameters import HELD, Parameters
@@ -33,7 +34,7 @@ from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Unknowns, data_by_incidence
 from helio_jax.inverse.samples import thinning
 from helio_jax.inverse.state import FitState, Predict, between, predict_corrections, update_corrections
-from helio_jax.inverse.steps import edges_of, expected, freeze, levelled, model_share, pixel_terms, step
+from helio_jax.inverse.steps import edges_of, freeze, levelled, model_share, pixel_terms, step, with_residuals
 from helio_jax.inverse.verdict import residuals_of_state
 from helio_jax.robust import cauchy_weight
 
@@ -254,7 +255,8 @@ def fit_heights(
     """Fit heights, slopes, gains, offsets and a smooth albedo to the micrographs, without error bars.
 
     Where changes alternate, the next iteration starts between the last two surfaces (relaxed by `extrapolation`), or
-    masks and multiple scattering that overshoot would swing for ever.
+    masks and multiple scattering that overshoot would swing for ever. Where they keep their sign and grow, or
+    hardly fall, masks and multiple scattering follow them from then on (`growth`).
 
     Interrupted from the keyboard after the first iteration, it returns what the last whole one ended in. Where a solve
     ends in a surface that cannot be traced, the step is halved; where that does not help, the one before it is kept.
@@ -275,6 +277,7 @@ def fit_heights(
     last_start, last_change, extrapolated = start.height, np.zeros(start.height.shape), 1.0
     is_interrupted, is_traceable = False, True
     relaxed: float | None = None
+    growth = Growth(problem)
     said, before = "start", state
     n_fixed = 0 if problem.is_instrument_unknown else s.fixed_rounds
     for number in range(s.max_rounds):
@@ -284,7 +287,8 @@ def fit_heights(
             before, relaxed = state, None
             if report:
                 report(number, s.max_rounds, said)
-            state = before = reached = _updated(problem, state, reached, predict)
+            growth, state = growth.checked(_updated(problem, state, reached, predict, growth.changes))
+            before = reached = state
             occluded = _occlusion_edges(problem, state) if number == n_fixed else None
             stages = list(zip(s.robust_limits, s.jump_limits, strict=True))
             for limit, cut in stages if number == 0 else stages[-1:] * s.reweightings:
@@ -311,6 +315,8 @@ def fit_heights(
             break
         if n_fixed < number < s.max_rounds - 1 and 0.0 < extrapolated < ALTERNATING:
             relaxed = max(extrapolated, LEAST_RELAXATION)
+        if n_fixed < number < s.max_rounds - 1:
+            growth = growth.following(before.surface, state.surface, extrapolated)
     undone = 0.0 if is_traceable else 1.0  # the last change is not part of the result
     remaining = (remaining_error(changes, extrapolated) + undone) * last_change
     return Fit(
@@ -326,19 +332,16 @@ def fit_heights(
     )
 
 
-def _updated(problem: FitProblem, state: FitState, reached: FitState | None, predict: Predict) -> FitState:
-    """Predict corrections at a state, or at one nearer to the surface that an iteration `reached` before it."""
+def _updated(
+    problem: FitProblem, state: FitState, reached: FitState | None, predict: Predict, growing: Sequence[Surface]
+) -> FitState:
+    """Predict corrections at a state, or at one nearer to the surface that an iteration `reached` before it; they
+    follow `growing` changes."""
 
     def at(surface: Surface) -> FitState:
-        return update_corrections(problem, replace(state, surface=surface), predict)
+        return update_corrections(problem, replace(state, surface=surface), predict, growing)
 
     return at(state.surface) if reached is None else with_backtracking(at, state.surface, reached.surface)[0]
-
-
-def with_residuals(problem: FitProblem, state: FitState) -> FitState:
-    """Compute the residuals of a state anew, its corrections held."""
-    residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
-    return replace(state, residuals=residuals)
 
 
 def interrupted(fit: Fit, when: str) -> Fit:

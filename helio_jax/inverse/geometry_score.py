@@ -22,6 +22,7 @@ from helio_jax.inverse.instrument_report import describe_instrument, plain_name,
 from helio_jax.inverse.parameters import Parameters
 from helio_jax.inverse.posterior import Marginal
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Unknowns, residuals, residuals_at, surface_of
 from helio_jax.inverse.samples import on_raster
 from helio_jax.inverse.state import FitState, set_corrections
@@ -123,13 +124,15 @@ def _moved(parameters: Parameters, change: np.ndarray) -> Parameters:
 def surface_misfit(fit: Fit) -> float:
     """Compute half the sum of the squared residuals of a fit's last solve, the instrument's pulls left out.
 
-    Those of the data, and of what holds the surface together: a wrong geometry shows in slopes that no surface has.
+    Those of the data, limited as elsewhere, and of what holds the surface together: a wrong geometry shows in slopes
+    that no surface has.
     """
     s = fit.problem.settings
     unknowns, fixed = freeze(fit.problem, fit.state, s.robust_limits[-1], s.jump_limits[-1])
     with jax.enable_x64(True):
         found = residuals(unknowns, fixed)
-        return 0.5 * float(sum(np.sum(np.square(r)) for name, r in found.items() if name not in INSTRUMENT))
+        of_surface = sum(np.sum(np.square(r)) for name, r in found.items() if name not in ("data", *INSTRUMENT))
+    return half_chi_square(fit.residuals) + 0.5 * float(of_surface)
 
 
 def _with_geometry(fit: Fit, free: FitProblem) -> FitState:

@@ -301,6 +301,11 @@ class FitProblem:
         return bool(p.distance.size or p.aim.size or p.drift.shape[1])
 
     @property
+    def follows_relief(self) -> bool:
+        """Whether corrections follow level, scale and tilt of all heights, which no border holds."""
+        return self.is_level_free or self.is_level_held
+
+    @property
     def is_biased_by_noise(self) -> bool:
         """Whether the noise of the slopes moves a combination of heights and instrument by its error bar.
 

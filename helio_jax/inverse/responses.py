@@ -5,8 +5,10 @@ the priors, as the level of a plateau or, with a free border, level, scale and t
 the corrections would run away along it, or rest where the misfit is not least (relief came out 8 % too flat on
 pyramids). So the corrections follow these changes to first order: masks by the derivative of the horizon march,
 multiple scattering by that of the radiosity model. The substrate around a free border moves with its lowest part.
+Changes of the heights that grow, or hardly fall, from iteration to iteration are followed, too (`growth`).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -130,10 +132,11 @@ def relief_responses(
     optics: Optics,
     raster: Raster,
     has_enough_images: np.ndarray,
-    distance: float,
+    distance: float | None,
     law: Law | None = None,
+    growing: Sequence[Surface] = (),
 ) -> tuple[Response, ...]:
-    """Compute how masks and multiple scattering follow level, scale and tilt of all heights, at albedo 1.
+    """Compute how masks and multiple scattering follow changes that many heights have in common, at albedo 1.
 
     That of multiple scattering is by the cosine law.
 
@@ -142,10 +145,17 @@ def relief_responses(
         normals: unit normals for which multiple scattering was predicted, without the noise of the slopes [y, x, 3].
         optics, raster: of the scan.
         has_enough_images: where the data determine the surface [y, x].
-        distance: of the sample from the plate, the scale of level changes, um.
+        distance: of the sample from the plate, the scale of level changes, um: level, scale and tilt of all heights
+            count, and the substrate around moves with the lowest part; None: they are held by a flat border.
         law: of the single scattering; None: the cosine law.
+        growing: further changes of the surface.
     """
-    changes = _relief_changes(surface, raster, has_enough_images, distance)
+
+    def changes_of(s: Surface) -> list[Surface]:
+        whole = [] if distance is None else _relief_changes(s, raster, has_enough_images, distance)
+        return [*whole, *growing]
+
+    changes = changes_of(surface)
     weights = np.zeros((len(changes), *has_enough_images.shape))
     heights = np.stack([change.height[has_enough_images] for change in changes], 1)
     weights[:, has_enough_images] = np.linalg.pinv(heights)
@@ -155,18 +165,21 @@ def relief_responses(
     shift = optics.beam_shift
     smooth = Surface(surface.height, *slopes_of_normal(normals, shift)[:2])
     coarse, coarse_raster = jax.tree.map(lambda f: np.asarray(f)[thin], smooth), raster.thinned(stride)
-    is_substrate = substrate_mask(coarse.height)
-    level = np.mean(coarse.height[is_substrate])
+    is_substrate = substrate_mask(coarse.height) & (distance is not None)
+
+    def level_of(height: np.ndarray) -> Any:
+        return np.mean(height, where=is_substrate) if is_substrate.any() else np.zeros(())
+
+    level = level_of(coarse.height)
     with_level = _with_substrate_at(optics, level)
     plan = plan_radiosity(coarse.height - level, coarse.normals(shift), with_level, coarse_raster)
     out, signal = [], substrate_signal(optics)
-    smooth_changes = _relief_changes(smooth, raster, has_enough_images, distance)
-    for i, (change, smooth_change) in enumerate(zip(changes, smooth_changes, strict=True)):
+    for i, (change, smooth_change) in enumerate(zip(changes, changes_of(smooth), strict=True)):
         with jax.enable_x64(True):
             at, along = cast((surface, change), jnp.float64)
             masked = np.asarray(_masked_change(at, along, optics, raster, law))
             thinned = jax.tree.map(lambda f: f[thin], smooth_change)
-            levels = jnp.asarray(level), jnp.asarray(np.mean(thinned.height[is_substrate]))
+            levels = jnp.asarray(level), jnp.asarray(level_of(thinned.height))
             at, along = cast((coarse, thinned), jnp.float64)
             value, slope = _multiple_change(at, along, *levels, optics, coarse_raster, plan)
         sharp, sharp_change = (jax.tree.map(lambda f: np.asarray(f)[thin], s) for s in (surface, change))
@@ -174,6 +187,15 @@ def relief_responses(
         own = -normal_slope(np.asarray(value), coarse.normals(shift)[..., 2], signal) * vertical
         out.append(Response(weights[i], masked + _upsampled(np.asarray(slope) - own, masked.shape, stride)))
     return tuple(out)
+
+
+def without_levels(change: Surface, region: np.ndarray) -> Surface:
+    """Take the mean change of every plateau from a change of a surface; `region`: number of every pixel [y, x]."""
+    height = np.array(change.height)
+    for number in np.unique(region[region > 0]):
+        inside = region == number
+        height[inside] -= height[inside].mean()
+    return Surface(height, change.slope_x, change.slope_y)
 
 
 def _relief_changes(surface: Surface, raster: Raster, has_enough_images: np.ndarray, distance: float) -> list[Surface]:

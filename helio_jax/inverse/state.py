@@ -4,7 +4,7 @@ Masks and multiple scattering are predicted on the surface of an outer iteration
 but follow, to first order, the geometry, the own normal, and common changes of the heights (`responses`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,13 @@ from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
 from helio_jax.inverse.parameters import Parameters, moved_optics
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.responses import Response, normal_slope, region_responses, relief_responses
+from helio_jax.inverse.responses import (
+    Response,
+    normal_slope,
+    region_responses,
+    relief_responses,
+    without_levels,
+)
 from helio_jax.inverse.settings import RefineSettings
 
 LAW_STEP = 0.5
@@ -200,14 +206,16 @@ def _predicted(problem: FitProblem, state: FitState, predict: Predict, p: Parame
     return predict(surface.height, surface.normals(problem.shift), *instrument, **known)
 
 
-def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -> FitState:
+def update_corrections(
+    problem: FitProblem, state: FitState, predict: Predict, growing: Sequence[Surface] = ()
+) -> FitState:
     """Predict masks and multiple scattering on the current surface, and how they follow common changes of heights and
-    the law.
+    the law; `growing`: further changes of the surface that they follow.
 
     Multiple scattering that did not follow the law would drive it away: a narrower law has less of it, and what is then
     missing the next solve would take for a still narrower one.
     """
-    state = with_responses(problem, predict_corrections(problem, state, predict))
+    state = with_responses(problem, predict_corrections(problem, state, predict), growing)
     p, base = state.parameters, np.mean(state.held.corrections.multiple)
     rate = np.zeros(p.law.size)
     for i in range(0 if problem.is_law_held or base <= 0.0 else rate.size):
@@ -217,16 +225,18 @@ def update_corrections(problem: FitProblem, state: FitState, predict: Predict) -
     return replace(state, held=replace(state.held, law_rate=rate))
 
 
-def with_responses(problem: FitProblem, state: FitState) -> FitState:
-    """Compute how the corrections follow the levels of plateaus and, with a free border, changes of all heights."""
+def with_responses(problem: FitProblem, state: FitState, growing: Sequence[Surface] = ()) -> FitState:
+    """Compute how the corrections follow the levels of plateaus, with a free border changes of all heights, and
+    `growing` changes of the surface."""
     surface, raster, law = state.held.surface, problem.raster, problem.law_at(state.parameters)
     optics = moved_optics(problem.optics, state.held.moved)
     responses = region_responses(surface, optics, raster, problem.region, law)
-    if problem.is_level_free or problem.is_level_held:
+    if problem.follows_relief or growing:
         smooth = state.held.corrections.normals
         normals = surface.normals(problem.shift) if smooth is None else smooth
-        known = problem.has_enough_images, float(problem.optics.sample_distance)
-        responses += relief_responses(surface, normals, optics, raster, *known, law)
+        known = problem.has_enough_images, float(problem.optics.sample_distance) if problem.follows_relief else None
+        growing = [without_levels(change, problem.region) for change in growing]
+        responses += relief_responses(surface, normals, optics, raster, *known, law, growing)
     albedo = problem.albedo_at(state.parameters)  # of the own pixel, which scatters first
     responses = tuple(r._replace(change=albedo * r.change) for r in responses)
     return replace(state, held=replace(state.held, responses=responses))

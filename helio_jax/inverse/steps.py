@@ -310,6 +310,12 @@ def expected(problem: FitProblem, state: FitState, *, is_noisy: bool) -> np.ndar
         return np.where(problem.is_observed, np.asarray(_expected(unknowns, fixed)), 0.0)
 
 
+def with_residuals(problem: FitProblem, state: FitState) -> FitState:
+    """Compute the residuals of a state anew, its corrections held."""
+    residuals = (expected(problem, state, is_noisy=True) - problem.data) / state.held.sigma
+    return replace(state, residuals=residuals)
+
+
 def levelled(problem: FitProblem, state: FitState) -> Surface:
     """Compute the surface above the substrate, which may be tilted."""
     s, tilt = state.surface, problem.tilt_std * state.parameters.tilt

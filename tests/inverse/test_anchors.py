@@ -13,7 +13,16 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface
 from helio_jax.instrument import Uncertainty
 from helio_jax.inverse.anchor_settings import AnchorSettings
-from helio_jax.inverse.anchoring import LIMIT, MEASURED, _Known, _moved, are_coherent, leave_out, pulls_of, with_anchors
+from helio_jax.inverse.anchoring import (
+    LIMIT,
+    MEASURED,
+    _Known,
+    _moved,
+    are_coherent,
+    by_anchors,
+    pulls_of,
+    with_anchors,
+)
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.explanations import explain
 from helio_jax.inverse.fit import derivative_of_sums, with_posterior
@@ -142,20 +151,36 @@ def test_a_pixel_of_its_own_takes_up_no_level():
     assert np.array_equal(found.value, level.value)
 
 
-def test_leaving_out_is_fitting_without():
-    """Estimates without some data by the closed form, and by least squares without their rows."""
+def test_estimates_by_anchors_are_those_of_least_squares():
+    """Sums by data and some of their anchors, by the closed form and by least squares with the anchors' rows."""
     rng = np.random.default_rng(5)
     rows, data = rng.standard_normal((12, 4)), rng.standard_normal(12)
-    own, out = [8, 9, 10, 11], [0, 2]
+    own = [8, 9, 10, 11]
 
     def estimate(kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
         fitted = np.linalg.lstsq(rows[kept], data[kept], rcond=None)[0]
         return rows[own] @ np.linalg.inv(rows[kept].T @ rows[kept]) @ rows[own].T, rows[own] @ fitted - data[own]
 
-    full = estimate(list(range(12)))
-    wanted = estimate([i for i in range(12) if i not in (own[0], own[2])])
-    for found, value in zip(leave_out(*full, out), wanted, strict=True):
-        np.testing.assert_allclose(found, value, rtol=1e-9)
+    known = estimate(list(range(8)))
+    for used in ([], [1], [1, 3], [0, 1, 2, 3]):
+        wanted = estimate([*range(8), *(own[i] for i in used)])
+        for found, value in zip(by_anchors(*known, used), wanted, strict=True):
+            np.testing.assert_allclose(found, value, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("level_std", [1e3, 1e5])
+def test_a_right_anchor_of_a_level_that_nothing_else_fixes_agrees(level_std):
+    """Two right anchors of one level, and a third that is 20 standard deviations off; the level is free without them.
+
+    Without the wrong one, which is named, each right one tells the other's height to sqrt(1 + 0.5^2 * 2) of its own
+    standard deviation. Rejects estimates from all anchors out of which some are taken: they are lost to rounding.
+    """
+    known = level_std**2 + 0.25 * np.eye(3)
+    off = 0.7 * level_std + np.array([0.5, -0.5, 20.0])
+    found = pulls_of(known, off)
+    np.testing.assert_allclose(found[1, :2], np.sqrt(1.5), rtol=1e-3)
+    np.testing.assert_allclose(found[2, :2], [-1.0 / np.sqrt(2.5), 1.0 / np.sqrt(2.5)], rtol=1e-3)
+    assert abs(found[2, 2]) > LIMIT
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
@@ -171,8 +196,7 @@ def test_only_the_wrong_anchor_is_named(share):
         weight = share / (1.0 - share)  # of the data, the anchors' being 1
         off = rng.standard_normal(4) + [0, 0, 8.0 * math.hypot(1.0, 1.0 / math.sqrt(3.0 + weight)), 0]
         data = rng.standard_normal() / math.sqrt(weight)
-        estimate = (off.sum() + weight * data) / (4.0 + weight)
-        pull = pulls_of(np.full((4, 4), 1.0 / (4.0 + weight)), estimate - off)[2]
+        pull = pulls_of(np.full((4, 4), 1.0 / weight), data - off)[2]
         named += np.abs(pull) > LIMIT
     assert named[2] == 200 and named.sum() - 200 <= 4
 

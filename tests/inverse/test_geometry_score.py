@@ -19,6 +19,7 @@ from helio_jax.inverse.geometry_score import (
     USUAL_DEG,
     _log_bayes,
     score_geometry,
+    surface_misfit,
     usual_uncertainty,
 )
 from helio_jax.inverse.linear import signal_of
@@ -184,6 +185,14 @@ def test_error_bars_hold_a_geometry_that_is_not_fitted(bshem, monkeypatch):
     assert any("no fit with an uncertain geometry was kept" in w for w in wrong.warnings)
     error = np.abs(wrong.height - right.height)[wrong.is_valid]
     assert np.mean(error < 2.0 * wrong.height_std[wrong.is_valid]) > 0.9
+
+
+def test_misfit_grows_with_data_that_are_far_off(bshem):
+    """A tenth of the data farther and farther off: each fit explains less. Rejects squares of weighted residuals."""
+    fit = fitted(bshem, bshem, 0)
+    off = np.random.default_rng(3).random(fit.residuals.shape) < 0.1
+    misfits = [surface_misfit(replace(fit, residuals=np.where(off, k, fit.residuals))) for k in (0, 4, 8, 16)]
+    assert misfits[0] < misfits[1] < misfits[2] <= misfits[3]
 
 
 def test_further_images_keep_a_geometry_that_was_fitted(bshem):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,14 +14,16 @@ from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.readout import ScanOrder
 from helio_jax.forward.render import Corrections, radiosity_corrections, single_scattering
 from helio_jax.forward.surface import Surface, slopes_of_normal
-from helio_jax.inverse import fit
+from helio_jax.inverse import fit, growth
+from helio_jax.inverse import state as state_module
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.convergence import extrapolation, remaining_error
 from helio_jax.inverse.fit import fit_heights, with_posterior, with_residuals, without_noise_bias
 from helio_jax.inverse.noise_bias import noise_bias
 from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.responses import Response
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
-from helio_jax.inverse.state import FitState, set_corrections, update_corrections
+from helio_jax.inverse.state import FitState, set_corrections, update_corrections, with_responses
 from helio_jax.inverse.steps import expected, step
 from helio_jax.workflows import pipeline
 from tests.inverse.test_reconstruct import bump_stack
@@ -228,6 +231,135 @@ def test_predictions_that_overshoot_come_to_rest(bshem, monkeypatch, is_relaxed)
         assert found.surface.height.max() == pytest.approx(100.0, rel=0.05)
     else:
         assert found.changes[-1] > 4.0
+
+
+def skew_bump():
+    """Return a change of the surface of a bump that skews it."""
+    surface, (x, _) = bump()
+    along_x = (surface.height + x * surface.slope_x) / 150.0
+    return Surface(x * surface.height / 150.0, along_x, x * surface.slope_y / 150.0)
+
+
+def test_corrections_follow_growing_changes(bshem):
+    """With a flat border: a taller and a skew bump at once; the data expected are those with new corrections to 10 %.
+
+    Catches a change that is missing or of the wrong size, and a substrate that moves, too.
+    """
+    surface, _ = bump()
+    signal, optics, raster = np.asarray(signal_of(bshem, surface)), Optics.of(bshem), Raster.regular(SHAPE, PITCH)
+    problem = FitProblem.of(signal, (0.003 * signal) ** 2, bshem, raster, surface, ReconstructSettings())
+    plan = plan_radiosity(surface.height, surface.normals(problem.shift), optics, raster)
+
+    def predict(height, normals):
+        slopes = slopes_of_normal(normals, problem.shift)[:2]
+        return radiosity_corrections(Surface(height, *slopes), optics, raster, plan)
+
+    skew = skew_bump()
+    changed = jax.tree.map(lambda s, c: s + 1e-3 * s - 1.5e-3 * c, surface, skew)
+    state = FitState.at(problem, surface)
+    state = set_corrections(problem, state, predict(surface.height, surface.normals(problem.shift)), surface)
+    held = data_of(problem, state, changed)
+    anew = predict(changed.height, changed.normals(problem.shift))
+    anew = data_of(problem, set_corrections(problem, state, anew, changed), changed)
+    followed = data_of(problem, update_corrections(problem, state, predict, [surface, skew]), changed)
+    missing = np.sqrt(np.mean((held - anew) ** 2))
+    assert missing > 1e-5 * anew.mean()
+    assert np.sqrt(np.mean((followed - anew) ** 2)) < 0.1 * missing
+
+
+def test_growing_changes_leave_the_levels_of_plateaus(bshem):
+    """Each counts as one of itself, none of the other; a plateau's level, which has its own response, is none of them.
+
+    Catches a level that is counted twice.
+    """
+    surface, (x, y) = bump()
+    signal = np.asarray(signal_of(bshem, surface))
+    plateau = (np.hypot(x, y) < 100.0).astype(int)
+    raster, known = Raster.regular(SHAPE, PITCH), (surface, ReconstructSettings())
+    problem = FitProblem.of(signal, (0.003 * signal) ** 2, bshem, raster, *known, region=plateau)
+    growing = surface, skew_bump()
+    _, *found = with_responses(problem, FitState.at(problem, surface), growing).held.responses
+    weights = np.stack([response.weights for response in found])
+    assert np.einsum("iyx,yx", weights, plateau) == pytest.approx(0.0, abs=1e-12)
+    amplitudes = np.einsum("iyx,kyx->ik", weights, np.stack([change.height for change in growing]))
+    np.testing.assert_allclose(amplitudes, np.eye(2), atol=1e-9)
+
+
+@pytest.mark.parametrize("is_followed", [True, False])
+def test_changes_that_grow_are_followed(bshem, monkeypatch, is_followed):
+    """Predictions that lack 1.4 times what an error of the surface adds: each iteration makes that error larger.
+
+    From a bump 3 % too low: followed, the changes fall in the end, the bump 5 % too low by the prior of smooth
+    surfaces, to which such data mean little. Not followed, they grow to the end, and the bump is 30 % too low.
+    """
+    surface, _ = bump()
+    truth = np.asarray(signal_of(bshem, surface))
+
+    def lacking(at):
+        return 1.4 * (truth - np.asarray(signal_of(bshem, at)))
+
+    def predict(height, normals, **known):
+        at = Surface(height, *slopes_of_normal(normals, bshem.beam_shift)[:2])
+        return Corrections(Corrections.none(truth.shape).masked, lacking(at))
+
+    def responses(at, *args):
+        changes = args[-1]
+        weights = np.linalg.pinv(np.stack([c.height.ravel() for c in changes], 1)).reshape(-1, *SHAPE)
+        moved = (jax.tree.map(lambda s, c: s + 1e-3 * c, at, change) for change in changes)
+        return tuple(Response(w, 1e3 * (lacking(m) - lacking(at))) for w, m in zip(weights, moved, strict=True))
+
+    monkeypatch.setattr(state_module, "relief_responses", responses)
+    if not is_followed:
+        monkeypatch.setattr(growth, "MOST_FOLLOWED", 0)
+    start = jax.tree.map(lambda field: 0.97 * field, surface)
+    settings = ReconstructSettings(refine=RefineSettings(samples=0, bias_pairs=0, tolerance_um=0.01))
+    problem = FitProblem.of(truth, 1e-4 * truth**2, bshem, Raster.regular(SHAPE, PITCH), start, settings)
+    found = fit_heights(problem, start, predict)
+    off = abs(found.surface.height.max() - 100.0)
+    if is_followed:
+        assert off < 7.0
+        assert found.changes[-1] < 0.6 * max(found.changes)
+    else:
+        assert off > 20.0
+        assert found.changes[-1] == max(found.changes)
+
+
+def test_changes_that_lead_away_from_the_data_are_given_up(bshem):
+    """A start that explains the data worse by more than `GAIN`: the fit returns to the best one, without the changes.
+
+    Catches a return to corrections that still follow them: the next solve would lead away as before.
+    """
+    surface, _ = bump()
+    truth = np.asarray(signal_of(bshem, surface))
+    problem = FitProblem.of(truth, 1e-4 * truth**2, bshem, Raster.regular(SHAPE, PITCH), surface, ReconstructSettings())
+    followed = growth.Growth(problem).following(surface, skew_bump(), -1.0)
+    states = []
+    for share in (0.98, 0.99, 0.9):
+        at = jax.tree.map(lambda field, share=share: share * field, surface)
+        states.append(update_corrections(problem, FitState.at(problem, at), nothing_more, followed.changes))
+    for state in states[:2]:
+        followed, kept = followed.checked(state)
+        assert kept is state and len(state.held.responses) == 1 and not followed.is_given_up
+    given_up, state = followed.checked(states[2])
+    assert given_up.is_given_up and given_up.changes == () == state.held.responses
+    assert state.surface is states[1].surface
+    assert given_up.following(surface, skew_bump(), -1.0).changes == ()
+
+
+def test_which_changes_are_followed(bshem):
+    """Those that grow (below 0) or hardly fall (above 3), not those that halve or alternate; the last three of them.
+
+    With a free border none: together with level, scale and tilt of the relief, which are followed there, they made the
+    level of a noisy bump swing by 200 um.
+    """
+    surface, _ = bump()
+    free = follower(bshem)[0]
+    assert not growth.Growth(free).following(surface, skew_bump(), -1.0).changes
+    known = free.signal, free.variance, bshem, free.raster, surface
+    followed = growth.Growth(FitProblem.of(*known, ReconstructSettings()))
+    for extrapolated, n in ((2.0, 0), (0.6, 0), (-1.0, 1), (1.0, 1), (5.0, 2), (-0.1, 3), (np.inf, 3)):
+        followed = followed.following(surface, skew_bump(), extrapolated)
+        assert len(followed.changes) == n
 
 
 def test_interrupted_after_a_relaxed_iteration(bshem, monkeypatch):
