@@ -112,6 +112,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   integrate_sylvester integration after Harker and O'Leary
   edges               edges of the raster: smooth, kink or jump
   rims                where a dome, steepest at its rim, meets a level surface
+  border_level        level of the signal on a flat border: starts where it is off
   strain              how far a fit moves the instrument from what is stated
   growth              changes that grow from iteration to iteration, which corrections follow
   geometry_change     change of a geometry stated as exact that the data ask for

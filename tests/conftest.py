@@ -31,6 +31,19 @@ FAST = {
     ),
 }
 """Modules tests/FOLDER/test_NAME.py whose tests, but for slow ones, are marked `fast`; so is test_architecture.py."""
+LONG = {
+    "inverse/test_cut_mesa.py": "",
+    "inverse/test_discrepancy.py": "test_error_bars_hold_where_the_model_lacks_something",
+    "inverse/test_error_bars.py": "test_errors_reach_the_cramer_rao_bound",
+    "inverse/test_floating_step.py": "",
+    "inverse/test_objects.py": "test_a_ball_with_vertical_sides_is_as_high_as_it_is",
+    "unit/test_comparison.py": "test_explain_names_the_effect",
+    "unit/test_conventions.py": "test_two_images_do_where_the_albedo_is_known",
+    "unit/test_known_shape.py": "",
+    "unit/test_mask_directions.py": "",
+}
+"""Tests that take a minute or more each on one core, by module and name ("": all of the module). They are marked `long`
+and left out unless asked for: `pytest -m long`, before a change of what they test and before a release."""
 QUICK_XLA = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 """XLA's plain code generator, without optimisation: it compiles five times faster. The same programs to rounding, which
 tests/inverse/test_frozen.py pins; one test there and the notebooks of the site run what users run. `XLA_FLAGS= pytest`:
@@ -54,11 +67,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `pytest -m fast` runs: modules of every stage, about 80 s of CPU time in all."""
+    """Mark what `pytest -m fast` runs, modules of every stage, about 80 s of CPU time in all; and what is `LONG`."""
     fast = {f"{folder}/test_{name}.py" for folder, names in FAST.items() for name in names}
     for item in items:
         place = item.path.relative_to(Path(__file__).parent).as_posix()
-        if (place in fast or place == "test_architecture.py") and not item.get_closest_marker("slow"):
+        if place in LONG and item.name.startswith(LONG[place]):
+            item.add_marker(pytest.mark.long)
+        elif (place in fast or place == "test_architecture.py") and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.fast)
 
 

@@ -19,7 +19,7 @@ from helio_jax.arrays import pitch
 from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
 from helio_jax.detector import MAX_NAME
 from helio_jax.errors import GuardError, InputFileError
-from helio_jax.geometry_prior import errors_in_common
+from helio_jax.geometry_prior import GeometryPrior, errors_in_common
 from helio_jax.instrument import MAX_DETECTORS, Detector, Instrument, Uncertainty
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
@@ -27,6 +27,8 @@ MAX_PIXELS = 4_000_000
 """Largest common raster."""
 LAWS_DIFFER = 3.0
 """Difference of two scattering laws from which on they are not of one sample [standard deviations]."""
+SAME_ERRORS = 0.02
+"""Tables [covariance] agree to this share of the variances: they are rounded."""
 SAME_PLACE = 0.01
 """Apertures nearer to one another are the same [um]."""
 _MARCH = 0.5
@@ -193,16 +195,21 @@ def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:
 def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
     """Refuse scans by one plate that state different errors of it; raises as `check_joinable`."""
     instruments = [s.instrument for s in stacks]
-    for number, (stack, (first, _)) in enumerate(zip(stacks, _plates(instruments), strict=True)):
-        for what, a, b in (
-            ("[uncertainty]", instruments[first].uncertainty, instruments[number].uncertainty),
-            ("[covariance]", instruments[first].covariance, instruments[number].covariance),
+    priors = [GeometryPrior.of(instrument).covariance for instrument in instruments]
+    for number, (stack, (first, apertures)) in enumerate(zip(stacks, _plates(instruments), strict=True)):
+        of_part = [0, *(1 + 2 * a + k for a in apertures for k in (0, 1))]
+        whole, own = priors[first][np.ix_(of_part, of_part)], priors[number]
+        unit = np.sqrt(np.outer(np.diag(whole), np.diag(whole)))
+        for what, is_same in (
+            ("[uncertainty]", instruments[first].uncertainty == instruments[number].uncertainty),
+            ("[covariance]", bool(np.all(np.abs(whole - own) <= SAME_ERRORS * unit))),
         ):
-            if a != b:
+            if not is_same:
                 raise InputFileError(
                     f"{stack.name!r} and {stacks[first].name!r} are scans by one pinhole plate, whose errors they "
                     f"share, but their tables {what} differ: give the tables [uncertainty] and [covariance] of one of "
-                    "their instrument files to both, and import them anew"
+                    "their instrument files to both (where one has fewer detectors: without the rows and columns of "
+                    "the others), and import them anew"
                 )
 
 

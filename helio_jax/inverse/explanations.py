@@ -65,13 +65,14 @@ from helio_jax.inverse.shadow_steps import find_shadow_step
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
-from helio_jax.inverse.strain import is_strained, strain_improvement
+from helio_jax.inverse.strain import instrument_pulls, is_strained, strain_improvement
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
 from helio_jax.inverse.wider_readout import (
     READOUT,
     Widths,
     evidence,
     fit_wider_readout,
+    heavy_tailed_penalty,
     instrument_improvement,
     widths,
     with_widths,
@@ -97,6 +98,8 @@ FREE_TRIED = "while free gains and offsets were tried"
 FEW_DETECTORS = 3
 """A fitted geometry may be less likely than the stated one by `GAIN` with up to so many detectors, with more in
 proportion: a plate that is turned moves all apertures."""
+UNDECIDED = 0.5 * GAIN
+"""What explains data and instrument by less than this worse may be true as well [half chi-square]."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -144,10 +147,10 @@ def explain(
     """Fit the heights, and other explanations where the data or what is known of the instrument contradict the fit.
 
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
-    instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in few as
-    they did before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), objects also
-    in many more: they have no further unknowns that could explain something else, and contradicted pixels around their
-    outlines. Interrupted after the first fit, it returns the best of those that were compared. Arguments as
+    instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in as few
+    as before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), objects in any
+    number: they have no further unknowns that could explain something else, and are contradicted around their outlines.
+    Interrupted after the first fit, it returns the best of those that were compared. Arguments as
     `reconstruct_stack`.
     """
     stack = with_level_of_law(stack, settings.refine)
@@ -161,6 +164,7 @@ def explain(
     others.insert(0 if is_albedo_likely else len(others), fits.from_albedo_patches)
     others.append(fits.from_wider_readout)
     residuals: np.ndarray | None = None
+    readout: Fit | None = None
     for other in others:
         if best.fit.is_interrupted:
             break
@@ -179,15 +183,16 @@ def explain(
             found = other(best, residuals)
             if found is None:
                 continue
+            if other == fits.from_wider_readout:
+                readout = found.fit
             if found.fit.is_interrupted:  # whichever is kept
                 best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
             rest = fits.residuals(found.fit)
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
-            if other == fits.from_objects:  # it has no further unknowns
-                most = math.inf
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
                 most = max(most, MORE_CONTRADICTED * share)
-            is_less = fits.contradicted(rest, right).mean() < most
+            # objects have no further unknowns that could explain something else
+            is_less = other == fits.from_objects or fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
                 gained += instrument_improvement(best.fit, found.fit)
@@ -197,7 +202,7 @@ def explain(
             fits.say(f"another explanation is given up: {e}")
         except KeyboardInterrupt:
             best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-    best = fits.with_likely_geometry(best)
+    best = fits.with_likely_geometry(best, readout)
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
     return best._replace(fit=fit, steps=fits.steps)
 
@@ -532,19 +537,30 @@ class _Fits:
             lambda surface: self.misfit(surface, none),
             self.say,
         )
-        fits: list[tuple[float, Fit, np.ndarray]] = []
+        fits: list[tuple[float, Explanation]] = []
         for objects in found:
-            start = self.promising(objects.surface(surface), best)
-            if start is None or (fits and fits[-1][1].is_interrupted):
-                continue
-            fit = self.fitted(start, smoothed, none, objects.number)
-            fits.append((self.traced_misfit(fit), fit, objects.number))
-        if not fits:
-            return None
-        _, fit, number = min(fits, key=lambda one: one[0])
-        if fits[-1][1].is_interrupted:  # whichever is better
-            fit = interrupted(fit, OTHER_TRIED)
-        return Explanation(fit, np.zeros(self.stack.shape[1:], bool), number, "objects on")
+            try:
+                start = self.promising(objects.surface(surface), best)
+                if start is not None:
+                    fit = self.fitted(start, smoothed, none, objects.number)
+                    is_undecided = np.zeros(self.stack.shape[1:], bool)
+                    explained = Explanation(fit, is_undecided, objects.number, "objects on")
+                    fits.append((self.traced_misfit(fit), explained))
+                    if fit.is_interrupted:
+                        break
+            except PredictionError as e:
+                self.say(f"these outlines are given up: {e}")
+            except KeyboardInterrupt:
+                if not fits:
+                    raise
+                return self._best_of(fits, is_interrupted=True)
+        return self._best_of(fits, any(one.fit.is_interrupted for _, one in fits)) if fits else None
+
+    @staticmethod
+    def _best_of(fits: list[tuple[float, Explanation]], is_interrupted: bool) -> Explanation:
+        """Return the explanation with the least misfit, marked where the search for it was interrupted."""
+        best = min(fits, key=lambda one: one[0])[1]
+        return best._replace(fit=interrupted(best.fit, OTHER_TRIED)) if is_interrupted else best
 
     def from_pits(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit from pits with flat floors in a flat substrate; None where there are none."""
@@ -598,7 +614,7 @@ class _Fits:
         return best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
-        """Fit gains or offsets that are not what is stated; None where nothing speaks for that.
+        """Fit gains or offsets that are not what is stated; None where no such fit explains more.
 
         With patches of other albedos and without: they may stand for what wrong gains and offsets do, and have to
         explain more by `GAIN` than the fit without them.
@@ -615,19 +631,26 @@ class _Fits:
             found = fit_wider_readout(best.fit, start, fitted, self.say)
             if found is None:
                 continue
-            if evidence(fit, found) > GAIN:
+            if evidence(fit, found) > (0.0 if fit is best.fit else GAIN):
                 fit = found
             if found.is_interrupted:
                 fit = interrupted(fit, OTHER_TRIED)
                 break
         return None if fit is best.fit else best._replace(fit=fit)
 
-    def with_likely_geometry(self, best: Explanation) -> Explanation:
+    def with_likely_geometry(self, best: Explanation, readout: Fit | None) -> Explanation:
         """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
 
         So they may where gains and offsets are not what is stated: that can stand for a wrong geometry, and so can
-        patches of other albedos, which have to explain more by `GAIN` than the fit without them. Returns the best
-        explanation so far where it is interrupted or nothing can be predicted.
+        patches of other albedos, which have to explain more by `GAIN` than the fit without them. The other way round,
+        a geometry can stand for background that was not subtracted: fits of gains and offsets that are not as stated,
+        alone and with the geometry, are its rivals. Where one explains nearly as much as the one that is kept
+        (`UNDECIDED`), the error bars contain their difference. Returns the best explanation so far where it is
+        interrupted or nothing can be predicted.
+
+        Args:
+            best: the explanation.
+            readout: fit with wider priors of gains and offsets, kept or not; None: none was made.
         """
         fit = best.fit
         if fit.is_interrupted or not has_converged(fit.changes, self.settings.refine.tolerance_um):
@@ -640,14 +663,31 @@ class _Fits:
                 best = best._replace(fit=replace(fit, geometry_score=score))
             self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
             patches, none = fit.problem.patches, AlbedoPatches.none(self.stack.shape[1:])
-            residuals, gained, least = self.residuals(fit), 0.0, LIKELY
+            residuals, found = self.residuals(fit), [(total_misfit(fit), fit)]
+            right = self.right_chi_square(residuals)
+            most = max(MIN_CONTRADICTED, MORE_CONTRADICTED * float(self.contradicted(residuals, right).mean()))
+            chosen = found[0]
             for known in (none, patches) if patches.objects else (none,):
-                found = self._with_geometry(fit, score, known)
-                if found.is_interrupted:
+                other = self._with_geometry(fit, score, known)
+                if other.is_interrupted:
                     return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-                more = self.gained_by_geometry(fit, residuals, found)
-                if more > gained + least:
-                    best, gained, least = best._replace(fit=replace(found, geometry_score=score)), more, GAIN
+                if self._is_allowed(other, right, most):
+                    found.append((total_misfit(other), replace(other, geometry_score=score)))
+                    chosen = found[-1] if found[-1][0] < chosen[0] - LIKELY else chosen
+            if chosen is found[0]:
+                return best
+            if readout is not None:
+                both = self._with_geometry_and(readout, fit, chosen[1].problem.patches)
+                if both.is_interrupted:
+                    return best._replace(fit=interrupted(chosen[1], OTHER_TRIED))
+                for other, least in ((readout, 0.0), (replace(both, geometry_score=score), LIKELY)):
+                    if self._is_allowed(other, right, most):
+                        found.append((total_misfit(other), other))
+                        chosen = found[-1] if found[-1][0] < chosen[0] - least else chosen
+            rivals = [one for one in found[1:] if one is not chosen and one[0] < chosen[0] + UNDECIDED]
+            changes = [other.surface.height - chosen[1].surface.height for _, other in rivals]
+            change = max(changes, key=lambda c: float(np.mean(c**2)), default=None)
+            best = best._replace(fit=replace(chosen[1], rival_change=change))
         except PredictionError as e:
             self.say(f"another geometry is given up: {e}")
         except KeyboardInterrupt:
@@ -663,26 +703,42 @@ class _Fits:
         start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
         return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
 
-    def gained_by_geometry(self, fit: Fit, residuals: np.ndarray, found: Fit) -> float:
-        """Compute by how much a fit of the geometry explains data, surface and instrument better than one without.
+    def _with_geometry_and(self, readout: Fit, fit: Fit, patches: AlbedoPatches) -> Fit:
+        """Fit with an uncertain geometry and wider priors of gains and offsets, from a fit with these priors."""
+        problem, surface, settings = readout.problem, readout.state.surface, with_widths(self.settings, widths(readout))
+        known = patches, problem.region, problem.anchors, settings, usual_uncertainty(fit.problem)
+        posed, before = self.pose(surface, *known), readout.parameters
+        start = posed.start_parameters().replaced(log_gain=before.log_gain, offset=before.offset)
+        found = self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
+        return replace(found, prior_widths=widths(readout))
 
-        In half chi-square; 0 where the instrument alone is too unlikely (`GAIN`, `FEW_DETECTORS`), or the
-        data, traced, contradict it in more pixels (`MORE_CONTRADICTED`).
+    def _is_allowed(self, fit: Fit, right: float, most: float) -> bool:
+        """Whether another instrument may explain the data: its geometry is not too unlikely (`GAIN`, `FEW_DETECTORS`),
+        and the data, traced, contradict the fit in few pixels.
 
         Args:
-            residuals: traced ones of the fit without [detector, y, x].
+            fit: of that instrument.
+            right: chi-square of a right fit.
+            most: share of the pixels that may be contradicted.
         """
-        of_instrument, right = instrument_improvement(fit, found), self.right_chi_square(residuals)
-        before, after = (self.contradicted(r, right).mean() for r in (residuals, self.residuals(found)))
         worst = GAIN * max(1.0, len(fit.problem.signal) / FEW_DETECTORS)
-        if of_instrument < -worst or after > max(MIN_CONTRADICTED, MORE_CONTRADICTED * before):
-            return 0.0
-        return surface_misfit(fit) - surface_misfit(found) + of_instrument
+        is_likely = 0.5 * float(np.sum(instrument_pulls(fit.parameters, READOUT) ** 2)) <= worst
+        return is_likely and bool(self.contradicted(self.residuals(fit), right).mean() <= most)
 
     def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
         """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""
         fit = self.fitted(surface, smoothed, *known, with_widths(self.settings, wider))
         return replace(fit, prior_widths=wider)
+
+
+def total_misfit(fit: Fit) -> float:
+    """Compute half the chi-square of data, surface and instrument, gains and offsets by the heavy-tailed prior.
+
+    Patches of other albedos count as `GAIN`.
+    """
+    of_geometry = 0.5 * float(np.sum(instrument_pulls(fit.parameters, READOUT) ** 2))
+    of_readout = heavy_tailed_penalty(fit.parameters, widths(fit))
+    return surface_misfit(fit) + of_geometry + of_readout + (GAIN if fit.problem.patches.objects else 0.0)
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:

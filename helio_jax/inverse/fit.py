@@ -80,6 +80,8 @@ class Fit:
         prior_widths: standard deviations of the priors of gains and offsets over those stated, by the names of the
             parameters; empty: as stated.
         geometry_score: what the data say of a geometry that is stated as exact, where another one is likely.
+        rival_change: by how much another instrument that explains the data about as well changes the heights [y, x],
+            um; None: no other one was fitted, or none does.
     """
 
     problem: FitProblem
@@ -105,6 +107,7 @@ class Fit:
     is_bias_subtracted: bool = False
     prior_widths: Mapping[str, float] = field(default_factory=dict)
     geometry_score: GeometryScore | None = None
+    rival_change: np.ndarray | None = None
 
     @property
     def is_geometry_fitted(self) -> bool:
@@ -366,7 +369,8 @@ def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
 def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     """Compute the error bars of a fit, if it was not interrupted and its settings ask for them; `sums`: see above.
 
-    Where the data ask for another geometry, and none is fitted, they hold what it would change of the heights.
+    Where the data ask for another geometry, and none is fitted, they hold what it would change of the heights; and what
+    another instrument does that explains the data about as well.
     """
     n_samples = fit.problem.settings.samples
     if fit.is_interrupted or not n_samples:
@@ -374,6 +378,8 @@ def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
     if fit.geometry_score is not None and not fit.is_geometry_fitted:
         posterior = posterior.with_common_mode(fit.geometry_score.height_change)
+    if fit.rival_change is not None:
+        posterior = posterior.with_common_mode(fit.rival_change)
     return replace(fit, posterior=posterior)
 
 

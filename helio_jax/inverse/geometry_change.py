@@ -24,7 +24,7 @@ class GeometryScore:
             stated one; above 0 where the data ask for another one.
         values: name -> (change that the data ask for, its standard deviation, unit).
         parameters: of a fit with that uncertain geometry, to first order.
-        height_change: of the same fit, um [y, x].
+        height_change: of the same fit, above the substrate, um [y, x].
     """
 
     log_bayes: float

@@ -20,7 +20,7 @@ from helio_jax.inverse.fit import Fit, linearised_at
 from helio_jax.inverse.geometry_change import GeometryScore, largest_changes
 from helio_jax.inverse.instrument_report import describe_instrument, plain_name, units_of
 from helio_jax.inverse.parameters import Parameters
-from helio_jax.inverse.posterior import Marginal
+from helio_jax.inverse.posterior import Marginal, tilts_of
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.quality import half_chi_square
 from helio_jax.inverse.residuals import FixedTerms, Unknowns, residuals, residuals_at, surface_of
@@ -42,8 +42,7 @@ FITTED = (
 """Warning of a fit whose geometry was fitted for what the data say of it."""
 DOUBTFUL = (
     "the micrographs may ask for another geometry than the instrument file states as exact: {named}; no fit with an "
-    "uncertain geometry was kept, but the error bars hold what it would change: calibrate the instrument (helio "
-    "calibrate) or state its [uncertainty]"
+    "uncertain geometry was kept{held}: calibrate the instrument (helio calibrate) or state its [uncertainty]"
 )
 """Warning of a fit of which the data say so, and whose geometry is as stated."""
 
@@ -54,7 +53,8 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     if score is None:
         return ()
     if not fit.is_geometry_fitted:
-        return (DOUBTFUL.format(named=largest_changes(score.values)),)
+        held = "" if fit.posterior is None else ", but the error bars hold what it would change"
+        return (DOUBTFUL.format(named=largest_changes(score.values), held=held),)
     if fit.posterior is None:
         return (
             FITTED.format(named=f"{largest_changes(score.values)}, expected before the fit, which has no error bars"),
@@ -101,6 +101,9 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
     log_bayes = _log_bayes(estimate[own], found.covariance[np.ix_(own, own)], spread)
     matrix, units = units_of(free, names)
     matrix = matrix[np.ix_(own, own)]
+    height_change = on_raster(surface[::3].reshape(at.linear.shape), p.raster.shape, at.stride)
+    tilts = tilts_of(names)
+    height_change -= np.tensordot(estimate[tilts], (free.priors.tilt * free.position)[: len(tilts)], 1)
     changes, std = matrix @ estimate[own], np.sqrt(np.diag(matrix @ spread @ matrix.T))
     shown = (plain_name(names[i], fit.instrument.detector_names) for i in np.flatnonzero(own))
     values = zip(changes.tolist(), std.tolist(), np.array(units)[own].tolist(), strict=True)
@@ -108,7 +111,7 @@ def score_geometry(fit: Fit) -> GeometryScore | None:
         log_bayes,
         dict(zip(shown, values, strict=True)),
         _moved(state.parameters, estimate),
-        on_raster(surface[::3].reshape(at.linear.shape), p.raster.shape, at.stride),
+        height_change,
     )
 
 

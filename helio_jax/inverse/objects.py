@@ -125,8 +125,8 @@ class ObjectSearch:
         (`ABOUT_AS_WELL`) that fits tell apart.
 
         Returns:
-            The best objects and, where some have a rival outline, those with all rivals; none where a flat substrate
-            explains too little (`MOST_MISFIT`).
+            The best objects and, where some have a rival outline, those with the rivals that together explain the data
+            about as well; none where a flat substrate explains too little (`MOST_MISFIT`).
         """
         best, n = self._tried(objects), len(objects.shift)
         rivals: dict[int, Objects] = {}
@@ -146,15 +146,17 @@ class ObjectSearch:
                 best = _best(tried)
             tried.append(self._peeled(best, number))
             best = _best(tried)
-            if best.misfit > limit:
+            if not best.misfit <= limit < np.inf:
                 return []
             rival = _rival(tried, best, number)
             if rival is not None:
                 rivals[number] = rival
-        found = best.objects
+        found = best
         for number, rival in rivals.items():
-            found = found.outlined(number, rival.number == number).shifted(number, rival.shift[number - 1])
-        return [best.objects, found] if rivals else [best.objects]
+            outlined = found.objects.outlined(number, rival.number == number)
+            other = self._tried(outlined.shifted(number, rival.shift[number - 1]))
+            found = other if other.misfit <= ABOUT_AS_WELL * best.misfit else found
+        return [best.objects] if found is best else [best.objects, found.objects]
 
     def _tried(self, objects: Objects) -> Trial:
         return Trial(objects, self.misfit(objects.surface(self.relief)))

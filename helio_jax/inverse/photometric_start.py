@@ -2,7 +2,8 @@
 
 With gains and albedo as stated, two slopes are solved from all images of a pixel, again on every solution. Where they
 are not known well, what they do to the signal becomes relief: about the measured sphere A a moat of 280 um. Then the
-solution with an albedo of its own in every pixel (`albedo_search`) is a start, too.
+solution with an albedo of its own in every pixel (`albedo_search`) is a start, too. Where the level of a flat border
+shows that they are off, the signals are divided by that level first.
 """
 
 import numpy as np
@@ -13,6 +14,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.backtracking import with_backtracking
+from helio_jax.inverse.border_level import border_levels
 from helio_jax.inverse.integrate import integrate_slopes
 from helio_jax.inverse.linear import PhotometricSolution, signal_of, solve_known_albedo
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
@@ -21,9 +23,16 @@ from helio_jax.inverse.state import Predict, multiple_in_normal, prediction_std
 from helio_jax.micrograph import MicrographStack
 
 
+def _levelled(stack, settings, patches: AlbedoPatches) -> tuple[np.ndarray, np.ndarray]:
+    """Return signal and variance [detector, y, x] that have the right level on a flat border (`border_levels`)."""
+    signal, variance = signal_of(stack)
+    level = border_levels(signal / patches.albedo, Optics.of(stack.instrument), settings)[:, None, None]
+    return signal / level, variance / level**2
+
+
 def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
     """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
-    signal, variance = (f / patches.albedo**n for n, f in enumerate(signal_of(stack), 1))
+    signal, variance = (f / patches.albedo**n for n, f in enumerate(_levelled(stack, settings, patches), 1))
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     corrections = predict(surface.height, normals, **patches.known)
     sigma = prediction_std(corrections, normals, settings.refine)
@@ -42,7 +51,8 @@ def start_of_known_albedo(
 ) -> tuple[Surface, Surface]:
     """Find the photometric solution of known gains and albedo, and a smoother one."""
     optics, raster, shift = Optics.of(stack.instrument), Raster.of(stack), stack.instrument.beam_shift
-    height, solution = solve_nearfield(*signal_of(stack), optics, raster, settings, settings.rounds)
+    levelled = _levelled(stack, settings, patches)
+    height, solution = solve_nearfield(*levelled, optics, raster, settings, settings.rounds)
 
     def correct(surface: Surface) -> Surface:
         return _corrected(stack, settings, patches, surface, surface.normals(shift), predict)

@@ -21,6 +21,7 @@ from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
+from helio_jax.inverse.border_level import border_levels
 from helio_jax.inverse.law_prior import check_law, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.parameters import LawPrior, Parameters, Priors, law_of, moves_of, smooth_albedo
@@ -262,9 +263,15 @@ class FitProblem:
         return Parameters(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def start_parameters(self) -> Parameters:
-        """Make the parameters that a fit starts from: prior means, and the albedos of the patches as found."""
-        means, found = self.prior_means(), self.patches.log_albedo
-        return means.replaced(patch=np.pad(found, (0, means.patch.size - found.size)) / self.settings.patch_albedo_std)
+        """Make the parameters that a fit starts from: prior means, and the albedos of the patches as found.
+
+        Where the level of a flat border is off, gains and offsets share what explains it, by their priors.
+        """
+        means, found, s = self.prior_means(), self.patches.log_albedo, self.settings
+        patch = np.pad(found, (0, means.patch.size - found.size)) / s.patch_albedo_std
+        level = border_levels(self.signal / self.patches.albedo, self.optics, self.reconstruct_settings, self.law_prior)
+        offset = (level - 1.0) * s.offset_std**2 / (s.offset_std**2 + s.gain_std**2)
+        return means.replaced(patch=patch, log_gain=np.log(level - offset) / s.gain_std, offset=offset / s.offset_std)
 
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""

@@ -190,9 +190,17 @@ def relief_responses(
 
 
 def without_levels(change: Surface, region: np.ndarray) -> Surface:
-    """Take the mean change of every plateau from a change of a surface; `region`: number of every pixel [y, x]."""
+    """Subtract the mean change of each plateau, and of the region around them, from a change of a surface.
+
+    What follows a plateau's level above that region (`region_responses`) follows nothing of the rest. Without plateaus
+    nothing is subtracted.
+
+    Args:
+        change: of the surface.
+        region: number of the plateau of every pixel, 0: around them [y, x].
+    """
     height = np.array(change.height)
-    for number in np.unique(region[region > 0]):
+    for number in np.unique(region) if region.any() else ():
         inside = region == number
         height[inside] -= height[inside].mean()
     return Surface(height, change.slope_x, change.slope_y)

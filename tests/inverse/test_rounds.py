@@ -18,13 +18,13 @@ from helio_jax.inverse import fit, growth
 from helio_jax.inverse import state as state_module
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.convergence import extrapolation, remaining_error
-from helio_jax.inverse.fit import fit_heights, with_posterior, with_residuals, without_noise_bias
+from helio_jax.inverse.fit import fit_heights, with_posterior, without_noise_bias
 from helio_jax.inverse.noise_bias import noise_bias
 from helio_jax.inverse.problem import FitProblem
-from helio_jax.inverse.responses import Response
+from helio_jax.inverse.responses import Response, without_levels
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.inverse.state import FitState, set_corrections, update_corrections, with_responses
-from helio_jax.inverse.steps import expected, step
+from helio_jax.inverse.steps import expected, step, with_residuals
 from helio_jax.workflows import pipeline
 from tests.inverse.test_reconstruct import bump_stack
 
@@ -278,9 +278,12 @@ def test_growing_changes_leave_the_levels_of_plateaus(bshem):
     raster, known = Raster.regular(SHAPE, PITCH), (surface, ReconstructSettings())
     problem = FitProblem.of(signal, (0.003 * signal) ** 2, bshem, raster, *known, region=plateau)
     growing = surface, skew_bump()
-    _, *found = with_responses(problem, FitState.at(problem, surface), growing).held.responses
+    level, *found = with_responses(problem, FitState.at(problem, surface), growing).held.responses
+    for change in growing:  # what is left moves no plateau against what surrounds it
+        assert np.sum(level.weights * without_levels(change, plateau).height) == pytest.approx(0.0, abs=1e-9)
     weights = np.stack([response.weights for response in found])
     assert np.einsum("iyx,yx", weights, plateau) == pytest.approx(0.0, abs=1e-12)
+    assert np.einsum("iyx,yx", weights, 1 - plateau) == pytest.approx(0.0, abs=1e-9)
     amplitudes = np.einsum("iyx,kyx->ik", weights, np.stack([change.height for change in growing]))
     np.testing.assert_allclose(amplitudes, np.eye(2), atol=1e-9)
 

@@ -1,0 +1,60 @@
+"""The level of a flat border's signal, and the starts of fits where it is off."""
+
+import numpy as np
+import pytest
+
+from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.laws import PowerLaw, level_ratio
+from helio_jax.forward.optics import Optics, Raster
+from helio_jax.forward.surface import Surface
+from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.border_level import MOST, OFF, border_levels
+from helio_jax.inverse.parameters import LawPrior
+from helio_jax.inverse.problem import FitProblem
+from helio_jax.inverse.settings import ReconstructSettings
+
+SHAPE = 21, 31
+
+
+def signal_of(bshem, levels):
+    """Return the signal of a level substrate times a level [detector, y, x], something else in the middle."""
+    signal = np.ones((3, *SHAPE)) * (substrate_signal(Optics.of(bshem)) * np.array(levels))[:, None, None]
+    signal[:, 5:15, 5:25] *= 0.3
+    return signal
+
+
+def test_levels_are_those_of_the_border(bshem):
+    """Medians over the substrate's signal, whatever is in the middle; without data there 1; limited; a law's own."""
+    optics, settings = Optics.of(bshem), ReconstructSettings()
+    signal = signal_of(bshem, (1.0, 1.2, 0.9))
+    np.testing.assert_allclose(border_levels(signal, optics, settings), (1.0, 1.2, 0.9))
+    signal[1] = np.nan
+    signal[2] *= -1.0
+    np.testing.assert_allclose(border_levels(signal, optics, settings), (1.0, 1.0, 1.0 / MOST))
+    law = LawPrior(PowerLaw(0.5), PowerLaw(0.1))
+    by_law = signal_of(bshem, level_ratio(law.mean, optics) * np.array((1.0, 1.2, 0.9)))
+    np.testing.assert_allclose(border_levels(by_law, optics, settings, law), (1.0, 1.2, 0.9), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("border", "off"), [("flat", 0.9 * OFF), ("free", 0.3)])
+def test_levels_that_may_be_the_samples_count_as_right(bshem, border, off):
+    """All within some per cent, as multiple scattering; or a border that is not the substrate."""
+    settings = ReconstructSettings().changed(border=border)
+    found = border_levels(signal_of(bshem, (1.0, 1.0 + off, 1.0 - off)), Optics.of(bshem), settings)
+    assert np.array_equal(found, np.ones(3))
+
+
+def test_a_fit_starts_where_the_border_is_explained(bshem):
+    """Gain and offset share the level in proportion to their variances; a dark substrate that is a patch needs none."""
+    settings, flat = ReconstructSettings(), Surface(*np.zeros((3, *SHAPE)))
+    signal = signal_of(bshem, (1.0, 1.2, 0.8))
+    known = bshem, Raster.regular(SHAPE, 40.0), flat, settings
+    problem = FitProblem.of(signal, (0.01 * signal) ** 2, *known)
+    start, s = problem.start_parameters(), settings.refine
+    gain, offset = np.exp(s.gain_std * start.log_gain), s.offset_std * start.offset
+    np.testing.assert_allclose(gain + offset, (1.0, 1.2, 0.8))
+    np.testing.assert_allclose(offset / (gain + offset - 1.0)[1], (0.0, 0.2, -0.2), atol=1e-9)
+    dark = AlbedoPatches(np.ones(SHAPE, int), np.log([0.7]), True)
+    signal = signal_of(bshem, (0.7,) * 3)
+    problem = FitProblem.of(signal, (0.01 * signal) ** 2, *known, patches=dark)
+    assert not problem.start_parameters().log_gain.any()
