@@ -90,6 +90,8 @@ LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MORE_CONTRADICTED = 1.05
 """Gains and offsets that are not as stated may be contradicted in up to so many times as many pixels."""
+AROUND_OUTLINES = 1.25
+"""Objects may be contradicted in up to so many times as many pixels: their outlines are known to a pixel only."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
 OTHER_TRIED = "while another explanation was tried"
@@ -148,10 +150,9 @@ def explain(
 
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in as few
-    as before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), objects in any
-    number: they have no further unknowns that could explain something else, and are contradicted around their outlines.
-    Interrupted after the first fit, it returns the best of those that were compared. Arguments as
-    `reconstruct_stack`.
+    as before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), and objects, which
+    are contradicted around their outlines (`AROUND_OUTLINES`). Interrupted after the first fit, it returns the best of
+    those that were compared. Arguments as `reconstruct_stack`.
     """
     stack = with_level_of_law(stack, settings.refine)
     fits = _Fits(stack, settings, make_predict, report, start)
@@ -191,8 +192,9 @@ def explain(
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
                 most = max(most, MORE_CONTRADICTED * share)
-            # objects have no further unknowns that could explain something else
-            is_less = other == fits.from_objects or fits.contradicted(rest, right).mean() < most
+            if other == fits.from_objects:  # without further unknowns that could explain something else
+                most = AROUND_OUTLINES * share
+            is_less = fits.contradicted(rest, right).mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
                 gained += instrument_improvement(best.fit, found.fit)
@@ -332,7 +334,7 @@ class _Fits:
     def residuals_on(self, surface: Surface, patches: AlbedoPatches) -> np.ndarray:
         """Compute the residuals of a surface, nothing fitted [detector, y, x]."""
         problem = self.pose(surface, patches)
-        return residuals_of_state(problem, FitState.at(problem, surface), self.predict_trial)
+        return residuals_of_state(problem, FitState.starting(problem, surface), self.predict_trial)
 
     def short_fit(self, surface: Surface, patches: AlbedoPatches) -> tuple[float, Surface]:
         """Compute the misfit (`misfit`) after a short fit from a surface, and the surface fitted."""

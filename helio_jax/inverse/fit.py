@@ -228,7 +228,7 @@ def misfit_of(problem: FitProblem, state: FitState, predict: Predict) -> float:
 
 
 def short_fit(problem: FitProblem, surface: Surface, predict: Predict) -> tuple[float, Surface]:
-    """Fit a surface's relief to the data in a few steps, the instrument at its prior means.
+    """Fit a surface's relief to the data in a few steps, the instrument as at the start of a fit.
 
     Returns:
         The misfit of what comes out (`misfit_of`), and its surface.
@@ -236,7 +236,7 @@ def short_fit(problem: FitProblem, surface: Surface, predict: Predict) -> tuple[
     Raises:
         PredictionError: nothing can be predicted of a surface.
     """
-    s, state = problem.settings, predict_corrections(problem, FitState.at(problem, surface), predict)
+    s, state = problem.settings, predict_corrections(problem, FitState.starting(problem, surface), predict)
     for _ in range(s.reweightings):
         state, _ = step(problem, state, s.robust_limits[-1], s.jump_limits[-1], False)
     return misfit_of(problem, state, predict), state.surface
@@ -273,7 +273,7 @@ def fit_heights(
 
     Source: own derivation; Gauss-Newton of optimistix; robust weights (Geman and McClure, 1987).
     """
-    s, state = problem.settings, FitState.at(problem, start, parameters)
+    s, state = problem.settings, FitState.starting(problem, start, parameters)
     changes: list[float] = []
     reached: FitState | None = None
     solved = state

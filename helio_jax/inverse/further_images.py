@@ -138,7 +138,7 @@ def _extended(problem: FitProblem, parameters: Parameters, alike: np.ndarray | N
     `alike`: number of the image whose aperture each further one has, which keeps the direction that was fitted; None:
     prior means.
     """
-    start = problem.start_parameters()
+    start = problem.stated_parameters()
     values = {}
     for name in NAMES:
         old, new = np.asarray(getattr(parameters, name)), np.array(getattr(start, name), float)

@@ -262,16 +262,21 @@ class FitProblem:
         }
         return Parameters(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
-    def start_parameters(self) -> Parameters:
-        """Make the parameters that a fit starts from: prior means, and the albedos of the patches as found.
+    def stated_parameters(self) -> Parameters:
+        """Make the parameters of what is stated: prior means, and the albedos of the patches as found."""
+        means, found = self.prior_means(), self.patches.log_albedo
+        return means.replaced(patch=np.pad(found, (0, means.patch.size - found.size)) / self.settings.patch_albedo_std)
 
-        Where the level of a flat border is off, gains and offsets share what explains it, by their priors.
+    def start_parameters(self) -> Parameters:
+        """Make the parameters that fits and searches start from: as stated, or gains and offsets by the border.
+
+        Where the level of a flat border is off, they share what explains it, by their priors.
         """
-        means, found, s = self.prior_means(), self.patches.log_albedo, self.settings
-        patch = np.pad(found, (0, means.patch.size - found.size)) / s.patch_albedo_std
+        s = self.settings
         level = border_levels(self.signal / self.patches.albedo, self.optics, self.reconstruct_settings, self.law_prior)
         offset = (level - 1.0) * s.offset_std**2 / (s.offset_std**2 + s.gain_std**2)
-        return means.replaced(patch=patch, log_gain=np.log(level - offset) / s.gain_std, offset=offset / s.offset_std)
+        log_gain = np.log(level - offset) / s.gain_std
+        return self.stated_parameters().replaced(log_gain=log_gain, offset=offset / s.offset_std)
 
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""

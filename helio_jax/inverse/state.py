@@ -86,11 +86,16 @@ class FitState:
 
     @classmethod
     def at(cls, problem: FitProblem, start: Surface, parameters: Parameters | None = None) -> "FitState":
-        """Start at a surface, without corrections; default of `parameters`: `FitProblem.start_parameters`."""
+        """Start at a surface, without corrections; default of `parameters`: as stated."""
         surface = Surface(*(np.asarray(f) for f in (start.height, start.slope_x, start.slope_y)))
-        parameters = problem.start_parameters() if parameters is None else parameters
+        parameters = problem.stated_parameters() if parameters is None else parameters
         held = _held(problem, Corrections.none(problem.signal.shape), surface, parameters)
         return cls(surface, parameters, np.zeros(problem.signal.shape), held)
+
+    @classmethod
+    def starting(cls, problem: FitProblem, start: Surface, parameters: Parameters | None = None) -> "FitState":
+        """Start a fit or a search at a surface; default of `parameters`: `FitProblem.start_parameters`."""
+        return cls.at(problem, start, problem.start_parameters() if parameters is None else parameters)
 
     def thinned(self, problem: FitProblem, stride: int) -> "FitState":
         """Keep every `stride`-th row and column, for `problem`, which is thinned."""

@@ -307,10 +307,12 @@ def test_optimised_program_gives_the_same(tmp_path):
 def test_one_compilation_serves_every_geometry(stored):
     """A fit of the same raster with the plate 100 um farther away compiles nothing.
 
-    Catches a geometry that is a constant of the compiled functions: every measurement waits for XLA then. Without pits
-    and objects, which are looked for only where the data contradict a fit, as they do with the wrong distance.
+    Catches a geometry that is a constant of the compiled functions: every measurement waits for XLA then. Without pits,
+    objects, patches and a fit of the geometry, which are tried only where the data ask for them, as they do with the
+    wrong distance.
     """
-    stack, case = micrographs(stored, "sphere"), Case("sphere", refine={"objects": False})
+    plain = {"objects": False, "geometry": False, "albedo_patches": False}
+    stack, case = micrographs(stored, "sphere"), Case("sphere", refine=plain)
     farther = stack.instrument.at_distance(stack.instrument.sample_distance + 100.0)
     reconstruct(stack, case)
     with compilations.counted() as found:
