@@ -678,10 +678,11 @@ class _Fits:
                     chosen = found[-1] if found[-1][0] < chosen[0] - LIKELY else chosen
             if chosen is found[0]:
                 return best
+            best = best._replace(fit=chosen[1])  # kept where a rival of it is interrupted or cannot be predicted
             if readout is not None:
                 both = self._with_geometry_and(readout, fit, chosen[1].problem.patches)
                 if both.is_interrupted:
-                    return best._replace(fit=interrupted(chosen[1], OTHER_TRIED))
+                    return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
                 for other, least in ((readout, 0.0), (replace(both, geometry_score=score), LIKELY)):
                     if self._is_allowed(other, right, most):
                         found.append((total_misfit(other), other))
