@@ -12,8 +12,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.fft import idctn
 
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.laws import Law
-from helio_jax.forward.optics import Optics
+from helio_jax.forward.optics import Optics, in_own_precision
 from helio_jax.forward.readout import Readout
 
 
@@ -171,7 +172,13 @@ def moves_of(parameters: Parameters, priors: Priors, n_detectors: int) -> jax.Ar
 
 def moved_optics(optics: Optics, moves: Any) -> Optics:
     """Move a stated geometry by distance, polar angle and azimuth [move, detector]; no moves: as stated."""
-    return optics if not len(moves) else optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
+    return optics if not len(moves) else _moved(optics, moves)
+
+
+@in_own_precision
+@compiled
+def _moved(optics: Optics, moves: Any) -> Optics:
+    return optics.moved(distance=moves[0, 0], polar=moves[1], azimuth=moves[2])
 
 
 def law_of(parameters: Parameters, priors: Priors) -> Law | None:

@@ -20,9 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, label
-from scipy.special import logsumexp, softmax
+from scipy.special import softmax
 
 from helio_jax.forward.surface import Surface
+from helio_jax.kernel import kernel
 
 OFFSETS = np.r_[np.arange(0.0, 1.5, 0.05), np.arange(1.5, 3.0, 0.1), 3.0, 3.5, 4.0, 5.0, 100.0, 100.0] ** 2
 """Values of r that are compared, in pixels; the rise in an edge goes with the root of r, whose steps are finer than its
@@ -165,50 +166,65 @@ def rises(slope: np.ndarray, std: np.ndarray, crest: np.ndarray, typical: np.nda
 
     Source: own derivation, tests/inverse/test_rims.py.
     """
-    d = ((np.arange(N_DISTANCES) + 0.5) / N_DISTANCES)[:, None]
     ahead = np.arange(slope.shape[1])
-    per_offset = []
-    for number, r in enumerate(OFFSETS):
-        length = crest[:, None, None] + d
-        offset = r * typical[:, None, None] / length
-        profile = _Profile(offset, np.full_like(length, FAR) if number == len(OFFSETS) - 1 else length)
-        at = profile.slope(d + ahead)
-        inverse = np.where((ahead < 2) | (ahead < NEAR_CREST * crest[:, None]), 1.0 / std, 0.0)[:, None]
-        information = np.sum((inverse * at) ** 2, 2)
-        c = np.sum(inverse**2 * at * slope[:, None], 2) / information
-        chi_square = np.sum((inverse * (slope[:, None] - c[..., None] * at)) ** 2, 2)
-        log_weight = -0.5 * (chi_square + np.log(information)) - np.log(np.abs(c) + 1e-12)
-        weight = softmax(log_weight, axis=1)
-        to_rim, to_first, to_second = (profile.rise(t)[..., 0] for t in (0.0 * d, d, 1.0 + d))
-        moments = []
-        for rise in (to_first - to_rim, to_second - to_first):
-            mean = np.sum(weight * c * rise, axis=1)
-            variance = np.sum(weight * ((c * rise - mean[:, None]) ** 2 + rise**2 / information), axis=1)
-            moments += [mean, variance]
-        per_offset.append((*moments, logsumexp(log_weight, axis=1) - np.log(N_DISTANCES)))
-    return RimEdges(*(np.array(part) for part in zip(*per_offset, strict=True)))
+    inverse = np.where((ahead < 2) | (ahead < NEAR_CREST * crest[:, None]), 1.0 / std, 0.0)
+    found = np.empty((5, len(OFFSETS), len(slope)))
+    _compare(slope, inverse, crest, typical, OFFSETS, N_DISTANCES, found)
+    return RimEdges(*found)
 
 
-class _Profile(NamedTuple):
-    """Section of a dome, by the distance t from its rim, for c = 1.
+@kernel
+def _compare(slope, inverse, crest, typical, offsets, n_distances, found):
+    """Compute the attributes of `RimEdges` [5, offset, edge]; `inverse` of the standard deviations [edge, pixel]."""
+    last = offsets.shape[0] - 1
+    log_weight, scale, in_edge, in_next, spread = np.empty((5, n_distances))
+    for i in range(slope.shape[0]):
+        for number in range(offsets.shape[0]):
+            for n in range(n_distances):
+                d = (n + 0.5) / n_distances
+                length = crest[i] + d
+                r = offsets[number] * typical[i] / length
+                far = FAR if number == last else length
+                information = along = square = 0.0
+                for k in range(slope.shape[1]):
+                    at = inverse[i, k] * _slope(d + k, r, far)
+                    measured = inverse[i, k] * slope[i, k]
+                    information, along, square = information + at * at, along + at * measured, square + measured**2
+                c = along / information
+                chi_square = max(square - c * along, 0.0)
+                log_weight[n] = -0.5 * (chi_square + math.log(information)) - math.log(abs(c) + 1e-12)
+                to_rim, to_first, to_second = _rise(0.0, r, far), _rise(d, r, far), _rise(1.0 + d, r, far)
+                scale[n], in_edge[n], in_next[n] = c, to_first - to_rim, to_second - to_first
+                spread[n] = 1.0 / information
+            largest = log_weight.max()
+            weight = np.exp(log_weight - largest)
+            total = weight.sum()
+            weight /= total
+            for place, rise in ((0, in_edge), (2, in_next)):
+                mean = (weight * scale * rise).sum()
+                found[place, number, i] = mean
+                found[place + 1, number, i] = (weight * ((scale * rise - mean) ** 2 + rise**2 * spread)).sum()
+            found[4, number, i] = largest + math.log(total / n_distances)
 
-    Attributes:
+
+@kernel
+def _slope(t, r, crest):
+    """Compute the slope of a section of a dome at a distance t from its rim, up to the crest, for c = 1.
+
+    Args:
+        t: the distance.
         r: offset.
         crest: distance L of the crest from the rim.
     """
+    t = min(t, crest)
+    return (1.0 - t / crest) / math.sqrt(t * (1.0 - 0.5 * t / crest) + r)
 
-    r: np.ndarray
-    crest: np.ndarray
 
-    def slope(self, t: np.ndarray) -> np.ndarray:
-        """Compute slopes at distances up to that of the crest."""
-        t = np.minimum(t, self.crest)
-        return (1.0 - t / self.crest) / np.sqrt(t * (1.0 - 0.5 * t / self.crest) + self.r)
-
-    def rise(self, t: np.ndarray) -> np.ndarray:
-        """Compute heights at distances up to that of the crest, above one that does not depend on them."""
-        t = np.minimum(t, self.crest)
-        return 2.0 * np.sqrt(t * (1.0 - 0.5 * t / self.crest) + self.r)
+@kernel
+def _rise(t, r, crest):
+    """Compute the height of the section there (`_slope`), above one that does not depend on t."""
+    t = min(t, crest)
+    return 2.0 * math.sqrt(t * (1.0 - 0.5 * t / crest) + r)
 
 
 class _Candidates(NamedTuple):
