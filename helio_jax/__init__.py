@@ -118,6 +118,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   geometry_change     change of a geometry stated as exact that the data ask for
   geometry_score      whether they ask for one (Rao's score test)
   wider_readout       fit of gains or offsets that are far from what is stated
+  instrument_choice   choice between instruments that explain the micrographs: geometry, gains and offsets
   explanations        competing explanations of the micrographs, each fitted; the best is kept
   photometric_start   surfaces that a fit starts from
   backtracking        a step halved until its surface can be traced

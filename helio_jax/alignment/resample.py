@@ -19,7 +19,7 @@ from helio_jax.arrays import pitch
 from helio_jax.campaign import MAX_LAW_STD, CampaignLaw
 from helio_jax.detector import MAX_NAME
 from helio_jax.errors import GuardError, InputFileError
-from helio_jax.geometry_prior import GeometryPrior, errors_in_common
+from helio_jax.geometry_prior import errors_in_common, geometry_covariance
 from helio_jax.instrument import MAX_DETECTORS, Detector, Instrument, Uncertainty
 from helio_jax.micrograph import OF_ONE_SCAN, Calibration, MicrographSet, MicrographStack, ScanAlignment
 
@@ -195,10 +195,10 @@ def _joined_uncertainty(instruments: Sequence[Instrument]) -> Uncertainty:
 def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
     """Refuse scans by one plate that state different errors of it; raises as `check_joinable`."""
     instruments = [s.instrument for s in stacks]
-    priors = [GeometryPrior.of(instrument).covariance for instrument in instruments]
+    tables = [_stated_covariance(instrument) for instrument in instruments]
     for number, (stack, (first, apertures)) in enumerate(zip(stacks, _plates(instruments), strict=True)):
         of_part = [0, *(1 + 2 * a + k for a in apertures for k in (0, 1))]
-        whole, own = priors[first][np.ix_(of_part, of_part)], priors[number]
+        whole, own = tables[first][np.ix_(of_part, of_part)], tables[number]
         unit = np.sqrt(np.outer(np.diag(whole), np.diag(whole)))
         for what, is_same in (
             ("[uncertainty]", instruments[first].uncertainty == instruments[number].uncertainty),
@@ -211,6 +211,13 @@ def _check_uncertainties(stacks: Sequence[MicrographStack]) -> None:
                     "their instrument files to both (where one has fewer detectors: without the rows and columns of "
                     "the others), and import them anew"
                 )
+
+
+def _stated_covariance(instrument: Instrument) -> np.ndarray:
+    """Compute what the table [covariance] of an instrument states of distance and directions; 0 without the table."""
+    if instrument.covariance is None:
+        return np.zeros((1 + 2 * len(instrument.detector),) * 2)
+    return geometry_covariance(instrument, instrument.covariance)
 
 
 def check_joinable(stacks: Sequence[MicrographStack]) -> None:

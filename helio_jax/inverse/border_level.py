@@ -11,8 +11,11 @@ from helio_jax.arrays import border_mask
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.laws import level_ratio
 from helio_jax.forward.optics import Optics
+from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.parameters import LawPrior
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.micrograph import MicrographStack
 
 OFF = 0.05
 """Levels count as right where no detector's is off by a larger share: multiple scattering and masks of high objects do
@@ -21,12 +24,18 @@ MOST = 5.0
 """Levels that are off by a larger factor, or not positive, count as off by this one."""
 
 
+def border_signal(optics: Optics, law: LawPrior | None = None) -> np.ndarray:
+    """Compute the signal of the level substrate [detector]; arguments as those of `border_levels`."""
+    return substrate_signal(optics) * (1.0 if law is None else level_ratio(law.mean, optics))
+
+
 def border_levels(
     signal: np.ndarray, optics: Optics, settings: ReconstructSettings, law: LawPrior | None = None
 ) -> np.ndarray:
     """Compute the level of a flat border's signal over that of the level substrate [detector].
 
-    1 in every detector where the border is free, or all levels are right (`OFF`); 1 in a detector without data there.
+    All are 1 where the border is free, and where none is off by more than `OFF`; so is that of a detector without data
+    on the border.
 
     Args:
         signal: in units of the beam, over the albedo [detector, y, x], NaN where not observed.
@@ -38,10 +47,20 @@ def border_levels(
     if settings.border != "flat":
         return none
     of_border = signal[:, border_mask(signal.shape[1:], settings.border_fraction)]  # type: ignore[arg-type]
-    expected = substrate_signal(optics) * (1.0 if law is None else level_ratio(law.mean, optics))
+    expected = border_signal(optics, law)
     found = none.copy()
     for i, data in enumerate(of_border):
         known = data[np.isfinite(data)]
         if known.size:
             found[i] = np.clip(np.median(known) / expected[i], 1.0 / MOST, MOST)
     return found if np.abs(found - 1.0).max() > OFF else none
+
+
+def levelled_signal(
+    stack: MicrographStack, settings: ReconstructSettings, patches: AlbedoPatches | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return signal and variance of a stack (`signal_of`), brought to the right level on a flat border."""
+    signal, variance = signal_of(stack)
+    of_sample = signal if patches is None else signal / patches.albedo
+    level = border_levels(of_sample, Optics.of(stack.instrument), settings)[:, None, None]
+    return signal / level, variance / level**2

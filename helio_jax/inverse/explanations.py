@@ -5,19 +5,19 @@ the border is free, of a step in the beam's shadow (`shadow_steps`). Where the d
 objects on a flat substrate are tried, and then patches of another albedo. An unknown instrument can explain nearly any
 images: there, patches are tried first, and so they are on a substrate that is too dark. With a flat border they are
 also tried where the fit moves the instrument far beyond what is stated (`is_strained`), and so are, at the end, gains
-and offsets that are not what is stated (`wider_readout`). At last the geometry is tested, where it is stated as exact
-(`geometry_score`). A level that explains the images about as well as the one that is kept is undecided.
+and offsets that are not what is stated (`wider_readout`). At last other instruments are fitted where the micrographs
+ask for one (`instrument_choice`). A level that explains the images about as well as the one that is kept is undecided.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.ndimage import binary_opening
+from scipy.ndimage import binary_opening, maximum_filter, minimum_filter
 
 from helio_jax.arrays import border_mask
 from helio_jax.errors import PredictionError, SceneError
@@ -40,8 +40,8 @@ from helio_jax.inverse.fit import (
     short_fit,
     without_noise_bias,
 )
-from helio_jax.inverse.geometry_change import LIKELY, GeometryScore, largest_changes
-from helio_jax.inverse.geometry_score import score_geometry, surface_misfit, usual_uncertainty
+from helio_jax.inverse.geometry_score import usual_uncertainty
+from helio_jax.inverse.instrument_choice import InstrumentChoice
 from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -65,16 +65,14 @@ from helio_jax.inverse.shadow_steps import find_shadow_step
 from helio_jax.inverse.state import FitState, Predict
 from helio_jax.inverse.step_parts import steps_in_parts
 from helio_jax.inverse.step_records import Steps
-from helio_jax.inverse.strain import instrument_pulls, is_strained, strain_improvement
+from helio_jax.inverse.strain import is_strained, strain_improvement
 from helio_jax.inverse.verdict import expected_chi_square, local_chi_square, residuals_of_state
 from helio_jax.inverse.wider_readout import (
     READOUT,
     Widths,
     evidence,
     fit_wider_readout,
-    heavy_tailed_penalty,
     instrument_improvement,
-    widths,
     with_widths,
 )
 from helio_jax.micrograph import MicrographStack
@@ -90,18 +88,11 @@ LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MORE_CONTRADICTED = 1.05
 """Gains and offsets that are not as stated may be contradicted in up to so many times as many pixels."""
-AROUND_OUTLINES = 1.25
-"""Objects may be contradicted in up to so many times as many pixels: their outlines are known to a pixel only."""
 UNLIKELY_GAIN = 3.0
 """Gains differ from what is stated by up to so many of their prior standard deviations."""
 OTHER_TRIED = "while another explanation was tried"
 FREE_TRIED = "while free gains and offsets were tried"
 """Said of a fit that was interrupted meanwhile."""
-FEW_DETECTORS = 3
-"""A fitted geometry may be less likely than the stated one by `GAIN` with up to so many detectors, with more in
-proportion: a plate that is turned moves all apertures."""
-UNDECIDED = 0.5 * GAIN
-"""What explains data and instrument by less than this worse may be true as well [half chi-square]."""
 AT_REST = 0.1
 """Fits with free gains whose last iteration changed the heights by more are not kept, rms over the relief with held
 gains: along what the data do not determine they wander, to a slightly lower misfit and a tilt of several degrees."""
@@ -150,9 +141,9 @@ def explain(
 
     Another explanation is kept where it explains the micrographs (with a flat border: and what is known of the
     instrument) better by `GAIN`, and where the data contradict it in fewer pixels (`LESS_CONTRADICTED`), or in as few
-    as before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`), and objects, which
-    are contradicted around their outlines (`AROUND_OUTLINES`). Interrupted after the first fit, it returns the best of
-    those that were compared. Arguments as `reconstruct_stack`.
+    as before (`MIN_CONTRADICTED`); other gains and offsets also in a few more (`MORE_CONTRADICTED`). The outlines of
+    objects are known to a pixel only: pixels beside them do not count. Interrupted after the first fit, it returns the
+    best of those that were compared. Arguments as `reconstruct_stack`.
     """
     stack = with_level_of_law(stack, settings.refine)
     fits = _Fits(stack, settings, make_predict, report, start)
@@ -192,9 +183,10 @@ def explain(
             most = LESS_CONTRADICTED * share if is_contradicted else MIN_CONTRADICTED
             if other == fits.from_wider_readout:  # gains and offsets act on all pixels: few contradict wrong ones
                 most = max(most, MORE_CONTRADICTED * share)
-            if other == fits.from_objects:  # without further unknowns that could explain something else
-                most = AROUND_OUTLINES * share
-            is_less = fits.contradicted(rest, right).mean() < most
+            still = fits.contradicted(rest, right)
+            if other == fits.from_objects and found.number is not None:
+                still &= ~beside_outlines(found.number)
+            is_less = still.mean() < most
             gained = improvement(residuals, rest)
             if fits.weighs_instrument:
                 gained += instrument_improvement(best.fit, found.fit)
@@ -204,7 +196,7 @@ def explain(
             fits.say(f"another explanation is given up: {e}")
         except KeyboardInterrupt:
             best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-    best = fits.with_likely_geometry(best, readout)
+    best = fits.with_likely_instrument(best, readout)
     fit = best.fit if fits.subtracts_bias_at_once else without_noise_bias(best.fit, report)
     return best._replace(fit=fit, steps=fits.steps)
 
@@ -640,108 +632,40 @@ class _Fits:
                 break
         return None if fit is best.fit else best._replace(fit=fit)
 
-    def with_likely_geometry(self, best: Explanation, readout: Fit | None) -> Explanation:
-        """Fit the geometry, too, where the micrographs ask for another one than is stated as exact.
+    def with_likely_instrument(self, best: Explanation, readout: Fit | None) -> Explanation:
+        """Fit other instruments where the micrographs ask for one (`instrument_choice`).
 
-        So they may where gains and offsets are not what is stated: that can stand for a wrong geometry, and so can
-        patches of other albedos, which have to explain more by `GAIN` than the fit without them. The other way round,
-        a geometry can stand for background that was not subtracted: fits of gains and offsets that are not as stated,
-        alone and with the geometry, are its rivals. Where one explains nearly as much as the one that is kept
-        (`UNDECIDED`), the error bars contain their difference. Returns the best explanation so far where it is
-        interrupted or nothing can be predicted.
-
-        Args:
-            best: the explanation.
-            readout: fit with wider priors of gains and offsets, kept or not; None: none was made.
+        `readout`: fit with wider priors of gains and offsets, kept or not; None: none was made.
         """
         fit = best.fit
         if fit.is_interrupted or not has_converged(fit.changes, self.settings.refine.tolerance_um):
             return best
-        try:
-            score = score_geometry(fit)
-            if score is None or not (score.is_likely or fit.prior_widths):
-                return best
-            if score.is_likely:
-                best = best._replace(fit=replace(fit, geometry_score=score))
-            self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
-            patches, none = fit.problem.patches, AlbedoPatches.none(self.stack.shape[1:])
-            residuals, found = self.residuals(fit), [(total_misfit(fit), fit)]
+
+        @cache
+        def first() -> tuple[float, float]:
+            residuals = self.residuals(fit)
             right = self.right_chi_square(residuals)
-            most = max(MIN_CONTRADICTED, MORE_CONTRADICTED * float(self.contradicted(residuals, right).mean()))
-            chosen = found[0]
-            for known in (none, patches) if patches.objects else (none,):
-                other = self._with_geometry(fit, score, known)
-                if other.is_interrupted:
-                    return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-                if self._is_allowed(other, right, most):
-                    found.append((total_misfit(other), replace(other, geometry_score=score)))
-                    chosen = found[-1] if found[-1][0] < chosen[0] - LIKELY else chosen
-            if chosen is found[0]:
-                return best
-            best = best._replace(fit=chosen[1])  # kept where a rival of it is interrupted or cannot be predicted
-            if readout is not None:
-                both = self._with_geometry_and(readout, fit, chosen[1].problem.patches)
-                if both.is_interrupted:
-                    return best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-                for other, least in ((readout, 0.0), (replace(both, geometry_score=score), LIKELY)):
-                    if self._is_allowed(other, right, most):
-                        found.append((total_misfit(other), other))
-                        chosen = found[-1] if found[-1][0] < chosen[0] - least else chosen
-            rivals = [one for one in found[1:] if one is not chosen and one[0] < chosen[0] + UNDECIDED]
-            changes = [other.surface.height - chosen[1].surface.height for _, other in rivals]
-            change = max(changes, key=lambda c: float(np.mean(c**2)), default=None)
-            best = best._replace(fit=replace(chosen[1], rival_change=change))
-        except PredictionError as e:
-            self.say(f"another geometry is given up: {e}")
-        except KeyboardInterrupt:
-            best = best._replace(fit=interrupted(best.fit, OTHER_TRIED))
-        return best
+            share = float(self.contradicted(residuals, right).mean())
+            return right, max(MIN_CONTRADICTED, MORE_CONTRADICTED * share)
 
-    def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches) -> Fit:
-        """Fit with an uncertain geometry, from where the score says that this ends."""
-        problem, surface = fit.problem, fit.state.surface
-        known = patches, problem.region, problem.anchors, self.settings, usual_uncertainty(problem)
-        posed, start = self.pose(surface, *known), score.parameters
-        as_stated = {name: factor * getattr(start, name) for name, factor in widths(fit).items()}
-        start = start.replaced(patch=start.patch if patches.objects else posed.prior_means().patch, **as_stated)
-        return self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
+        def is_explained(other: Fit) -> bool:
+            right, most = first()
+            return bool(self.contradicted(self.residuals(other), right).mean() <= most)
 
-    def _with_geometry_and(self, readout: Fit, fit: Fit, patches: AlbedoPatches) -> Fit:
-        """Fit with an uncertain geometry and wider priors of gains and offsets, from a fit with these priors."""
-        problem, surface, settings = readout.problem, readout.state.surface, with_widths(self.settings, widths(readout))
-        known = patches, problem.region, problem.anchors, settings, usual_uncertainty(fit.problem)
-        posed, before = self.pose(surface, *known), readout.parameters
-        start = posed.start_parameters().replaced(log_gain=before.log_gain, offset=before.offset)
-        found = self._unbiased(fit_heights(posed, surface, self.predict, self.report, start))
-        return replace(found, prior_widths=widths(readout))
+        return best._replace(fit=InstrumentChoice(self._refit_geometry, is_explained, self.say).best_of(fit, readout))
 
-    def _is_allowed(self, fit: Fit, right: float, most: float) -> bool:
-        """Whether another instrument may explain the data: its geometry is not too unlikely (`GAIN`, `FEW_DETECTORS`),
-        and the data, traced, contradict the fit in few pixels.
-
-        Args:
-            fit: of that instrument.
-            right: chi-square of a right fit.
-            most: share of the pixels that may be contradicted.
-        """
-        worst = GAIN * max(1.0, len(fit.problem.signal) / FEW_DETECTORS)
-        is_likely = 0.5 * float(np.sum(instrument_pulls(fit.parameters, READOUT) ** 2)) <= worst
-        return is_likely and bool(self.contradicted(self.residuals(fit), right).mean() <= most)
+    def _refit_geometry(self, fit: Fit, patches: AlbedoPatches, factors: Widths, start: Any) -> Fit:
+        """Fit with an uncertain geometry; arguments as `instrument_choice.Refit`."""
+        problem, surface, settings = fit.problem, fit.state.surface, with_widths(self.settings, factors)
+        known = patches, problem.region, problem.anchors, settings, usual_uncertainty(problem)
+        posed = self.pose(surface, *known)
+        found = self._unbiased(fit_heights(posed, surface, self.predict, self.report, start(posed)))
+        return replace(found, prior_widths=fit.prior_widths if max(factors.values()) > 1.0 else {})
 
     def _with_wider_priors(self, known: tuple, surface: Surface, smoothed: Surface, wider: Widths) -> Fit:
         """Fit as `fitted`, gains or offsets by wider priors; `known` as in `pose`: patches, regions, anchors."""
         fit = self.fitted(surface, smoothed, *known, with_widths(self.settings, wider))
         return replace(fit, prior_widths=wider)
-
-
-def total_misfit(fit: Fit) -> float:
-    """Compute half the chi-square of data, surface and instrument, gains and offsets by the heavy-tailed prior.
-
-    Patches of other albedos count as `GAIN`.
-    """
-    of_geometry = 0.5 * float(np.sum(instrument_pulls(fit.parameters, READOUT) ** 2))
-    of_readout = heavy_tailed_penalty(fit.parameters, widths(fit))
-    return surface_misfit(fit) + of_geometry + of_readout + (GAIN if fit.problem.patches.objects else 0.0)
 
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:
@@ -754,6 +678,11 @@ def has_contradicted_hollow(is_contradicted: np.ndarray, fit: Fit) -> bool:
     region, height = regions(fit.joined_x, fit.joined_y), fit.surface.height
     is_below = height < np.median(height[region == 0])
     return bool((contradicted_regions(is_contradicted, region) & is_below).any())
+
+
+def beside_outlines(number: np.ndarray) -> np.ndarray:
+    """Find the pixels [y, x] with another object, or the substrate, among their eight neighbours; `number` of it."""
+    return maximum_filter(number, 3) != minimum_filter(number, 3)
 
 
 def improvement(residuals: np.ndarray, others: np.ndarray) -> float:

@@ -45,10 +45,21 @@ DOUBTFUL = (
     "uncertain geometry was kept{held}: calibrate the instrument (helio calibrate) or state its [uncertainty]"
 )
 """Warning of a fit of which the data say so, and whose geometry is as stated."""
+RIVAL = (
+    "another geometry, gains or offsets explain the micrographs about as well, with heights that differ by up to "
+    "{most:.3g} um; the error bars contain the difference: calibrate the instrument (helio calibrate)"
+)
+"""Warning of a fit whose error bars contain `Fit.rival_change`."""
 
 
 def geometry_warnings(fit: Fit) -> tuple[str, ...]:
-    """Say what the data of a fit say of the geometry, where they ask for another one than is stated as exact."""
+    """Say what the data of a fit say of the geometry, where they ask for another one than is stated as exact, and
+    whether other instruments explain them about as well."""
+    rival = fit.rival_change if fit.posterior is not None else None
+    return _of_geometry(fit) + (() if rival is None else (RIVAL.format(most=float(np.abs(rival).max())),))
+
+
+def _of_geometry(fit: Fit) -> tuple[str, ...]:
     score = fit.geometry_score
     if score is None:
         return ()
@@ -56,9 +67,7 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
         held = "" if fit.posterior is None else ", but the error bars hold what it would change"
         return (DOUBTFUL.format(named=largest_changes(score.values), held=held),)
     if fit.posterior is None:
-        return (
-            FITTED.format(named=f"{largest_changes(score.values)}, expected before the fit, which has no error bars"),
-        )
+        return (FITTED.format(named=f"{largest_changes(score.values)}, an estimate from before the fit"),)
     fitted = describe_instrument(fit)["values"]
     values = {name: tuple(fitted[name][i] for i in (0, 1, 3)) for name in score.values if name in fitted}
     return (FITTED.format(named=largest_changes(values or score.values)),)

@@ -30,8 +30,8 @@ from helio_jax.forward.form_factor import form_factor
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import single_scattering
 from helio_jax.forward.surface import Surface
+from helio_jax.inverse.border_level import levelled_signal
 from helio_jax.inverse.levels import GAIN
-from helio_jax.inverse.linear import signal_of
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict
 from helio_jax.micrograph import MicrographStack
@@ -242,6 +242,11 @@ class _Substrate:
     predict: Predict
 
     @cached_property
+    def signal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Signal and variance, at the right level on the border [detector, y, x]."""
+        return levelled_signal(self.stack, self.settings)
+
+    @cached_property
     def form(self) -> np.ndarray:
         """Form factors, nothing masked [detector, 3, y, x]."""
         return form_factor(Optics.of(self.stack.instrument), np.zeros(self.stack.shape[1:]))
@@ -262,19 +267,19 @@ class _Substrate:
     @property
     def ratio(self) -> np.ndarray:
         """Signal over that of the substrate, nothing masked [detector, y, x]."""
-        return signal_of(self.stack)[0] / self.single(self.form)
+        return self.signal[0] / self.single(self.form)
 
     @property
     def ratio_std(self) -> np.ndarray:
         """Standard deviation of `ratio` by noise [detector, y, x]."""
-        return np.sqrt(signal_of(self.stack)[1]) / self.single(self.form)
+        return np.sqrt(self.signal[1]) / self.single(self.form)
 
     def unexplained(self, surface: Surface) -> np.ndarray:
         """Compute the mean square residual of the substrate, masked and lit by what stands on it [y, x].
 
         Infinite where nothing can be predicted.
         """
-        signal, variance = signal_of(self.stack)
+        signal, variance = self.signal
         try:
             corrections = self.predict(surface.height, surface.normals(self.stack.instrument.beam_shift))
         except PredictionError:

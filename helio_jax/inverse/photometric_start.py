@@ -14,25 +14,18 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.surface import Surface, slopes_of_normal
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.backtracking import with_backtracking
-from helio_jax.inverse.border_level import border_levels
+from helio_jax.inverse.border_level import levelled_signal
 from helio_jax.inverse.integrate import integrate_slopes
-from helio_jax.inverse.linear import PhotometricSolution, signal_of, solve_known_albedo
+from helio_jax.inverse.linear import PhotometricSolution, solve_known_albedo
 from helio_jax.inverse.nearfield import level, limited, solve_nearfield
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict, multiple_in_normal, prediction_std
 from helio_jax.micrograph import MicrographStack
 
 
-def _levelled(stack, settings, patches: AlbedoPatches) -> tuple[np.ndarray, np.ndarray]:
-    """Return signal and variance [detector, y, x] that have the right level on a flat border (`border_levels`)."""
-    signal, variance = signal_of(stack)
-    level = border_levels(signal / patches.albedo, Optics.of(stack.instrument), settings)[:, None, None]
-    return signal / level, variance / level**2
-
-
 def _corrected(stack, settings, patches: AlbedoPatches, surface: Surface, normals: np.ndarray, predict) -> Surface:
     """Solve photometrically with the albedo of patches and the corrections predicted on a surface."""
-    signal, variance = (f / patches.albedo**n for n, f in enumerate(_levelled(stack, settings, patches), 1))
+    signal, variance = (f / patches.albedo**n for n, f in enumerate(levelled_signal(stack, settings, patches), 1))
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
     corrections = predict(surface.height, normals, **patches.known)
     sigma = prediction_std(corrections, normals, settings.refine)
@@ -51,7 +44,7 @@ def start_of_known_albedo(
 ) -> tuple[Surface, Surface]:
     """Find the photometric solution of known gains and albedo, and a smoother one."""
     optics, raster, shift = Optics.of(stack.instrument), Raster.of(stack), stack.instrument.beam_shift
-    levelled = _levelled(stack, settings, patches)
+    levelled = levelled_signal(stack, settings, patches)
     height, solution = solve_nearfield(*levelled, optics, raster, settings, settings.rounds)
 
     def correct(surface: Surface) -> Surface:

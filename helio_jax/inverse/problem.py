@@ -21,7 +21,7 @@ from helio_jax.geometry_prior import GeometryPrior
 from helio_jax.instrument import Instrument, Uncertainty
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.anchors import Anchors
-from helio_jax.inverse.border_level import border_levels
+from helio_jax.inverse.border_level import border_levels, border_signal
 from helio_jax.inverse.law_prior import check_law, law_prior, numbers_of
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.parameters import LawPrior, Parameters, Priors, law_of, moves_of, smooth_albedo
@@ -272,11 +272,13 @@ class FitProblem:
 
         Where the level of a flat border is off, they share what explains it, by their priors.
         """
-        s = self.settings
-        level = border_levels(self.signal / self.patches.albedo, self.optics, self.reconstruct_settings, self.law_prior)
-        offset = (level - 1.0) * s.offset_std**2 / (s.offset_std**2 + s.gain_std**2)
-        log_gain = np.log(level - offset) / s.gain_std
-        return self.stated_parameters().replaced(log_gain=log_gain, offset=offset / s.offset_std)
+        of_sample = self.signal / self.patches.albedo
+        level = border_levels(of_sample, self.optics, self.reconstruct_settings, self.law_prior)
+        gain_std, expected = self.settings.gain_std, border_signal(self.optics, self.law_prior)
+        offset_std = self.priors.offset / expected
+        offset = (level - 1.0) * offset_std**2 / (offset_std**2 + gain_std**2)
+        log_gain = np.log(level - offset) / gain_std
+        return self.stated_parameters().replaced(log_gain=log_gain, offset=offset / offset_std)
 
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""

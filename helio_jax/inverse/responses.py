@@ -33,6 +33,8 @@ STEEP_FACET, LEVEL_FACET = 0.9, 0.98
 the two as at the first; from the second on less and less, down to nothing at 1: the normals of flat parts are noise."""
 MAX_RADIOSITY_PIXELS = 2500
 """Raster on which the derivative of multiple scattering is computed; it is smooth."""
+_ROUNDING = 1e-9
+"""Heights below this share of a change are rounding errors."""
 
 
 class Response(NamedTuple):
@@ -193,7 +195,7 @@ def without_levels(change: Surface, region: np.ndarray) -> Surface:
     """Subtract the mean change of each plateau, and of the region around them, from a change of a surface.
 
     What follows a plateau's level above that region (`region_responses`) follows nothing of the rest. Without plateaus
-    nothing is subtracted.
+    nothing is subtracted. A change of levels alone leaves 0, not what rounding does.
 
     Args:
         change: of the surface.
@@ -203,6 +205,7 @@ def without_levels(change: Surface, region: np.ndarray) -> Surface:
     for number in np.unique(region) if region.any() else ():
         inside = region == number
         height[inside] -= height[inside].mean()
+    height[np.abs(height) < _ROUNDING * np.abs(change.height).max(initial=0.0)] = 0.0
     return Surface(height, change.slope_x, change.slope_y)
 
 

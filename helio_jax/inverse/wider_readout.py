@@ -126,9 +126,11 @@ def instrument_improvement(fit: Fit, other: Fit) -> float:
 
 
 def warning_of(fit: Fit) -> tuple[str, ...]:
-    """Name the gains and offsets that were fitted with wider priors and lie far from what is stated; one at least."""
+    """Name the gains and offsets that lie far from what is stated, where a fit strains the instrument or had wider
+    priors of them; of those with wider priors one at least."""
     factors = widths(fit)
-    if max(factors.values()) <= 1.0:
+    has_wider = max(factors.values()) > 1.0
+    if not has_wider and not is_strained(fit.parameters, fit.problem.held):
         return ()
     stated = {key: getattr(fit.problem.settings, key) / factors[name] for name, key in READOUT.items()}
     changes = {
@@ -141,7 +143,9 @@ def warning_of(fit: Fit) -> tuple[str, ...]:
         for name, value in zip(fit.instrument.detector_names, values, strict=True)
     ]
     far = [text for pull, text in named if pull > FAR]
-    return (WARNING.format(far=", ".join(far)) if far else NEARLY.format(far=max(named)[1]),)
+    if far:
+        return (WARNING.format(far=", ".join(far)),)
+    return (NEARLY.format(far=max(named)[1]),) if has_wider else ()
 
 
 def priors_of(fit: Fit) -> dict[str, float]:

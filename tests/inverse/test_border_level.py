@@ -12,6 +12,8 @@ from helio_jax.inverse.border_level import MOST, OFF, border_levels
 from helio_jax.inverse.parameters import LawPrior
 from helio_jax.inverse.problem import FitProblem
 from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.inverse.state import FitState
+from helio_jax.inverse.steps import with_residuals
 
 SHAPE = 21, 31
 
@@ -45,15 +47,19 @@ def test_levels_that_may_be_the_samples_count_as_right(bshem, border, off):
 
 
 def test_a_fit_starts_where_the_border_is_explained(bshem):
-    """Gain and offset share the level in proportion to their variances; a dark substrate that is a patch needs none."""
+    """Flat images are explained; gain and offset share the level in proportion to their variances, that of the offset
+    in units of the median signal; a dark substrate that is a patch needs none."""
     settings, flat = ReconstructSettings(), Surface(*np.zeros((3, *SHAPE)))
-    signal = signal_of(bshem, (1.0, 1.2, 0.8))
+    levels = np.array((1.0, 1.5, 0.3))
+    signal = np.ones((3, *SHAPE)) * (substrate_signal(Optics.of(bshem)) * levels)[:, None, None]
     known = bshem, Raster.regular(SHAPE, 40.0), flat, settings
     problem = FitProblem.of(signal, (0.01 * signal) ** 2, *known)
+    assert np.abs(with_residuals(problem, FitState.at(problem, flat)).residuals[1:]).min() > 30.0
+    state = with_residuals(problem, FitState.starting(problem, flat))
+    assert np.abs(state.residuals).max() < 1.0
     start, s = problem.start_parameters(), settings.refine
-    gain, offset = np.exp(s.gain_std * start.log_gain), s.offset_std * start.offset
-    np.testing.assert_allclose(gain + offset, (1.0, 1.2, 0.8))
-    np.testing.assert_allclose(offset / (gain + offset - 1.0)[1], (0.0, 0.2, -0.2), atol=1e-9)
+    of_offset, of_gain = (s.offset_std * start.offset * levels)[1:], np.expm1(s.gain_std * start.log_gain)[1:]
+    np.testing.assert_allclose(of_offset / of_gain, (s.offset_std * levels[1:] / s.gain_std) ** 2, rtol=1e-6)
     dark = AlbedoPatches(np.ones(SHAPE, int), np.log([0.7]), True)
     signal = signal_of(bshem, (0.7,) * 3)
     problem = FitProblem.of(signal, (0.01 * signal) ** 2, *known, patches=dark)

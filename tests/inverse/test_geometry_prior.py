@@ -199,24 +199,27 @@ def test_many_scans_and_long_names_are_joined(bshem, length: int):
         check_joinable((blank,) * 22)
 
 
+@pytest.mark.parametrize("stated_deg", [0.0, 1.5])
 @pytest.mark.parametrize("order", [(0, 1), (2, 0, 1)])
-def test_a_part_of_a_plate_states_the_rows_of_its_own_apertures(bshem, order):
+def test_a_part_of_a_plate_states_the_rows_of_its_own_apertures(bshem, order, stated_deg):
     """[covariance] of a part of the apertures, or in another order, agrees; with one variance 20 % larger it does not.
 
-    Catches tables that are compared as they stand: those of a part can never be the same.
+    Catches tables that are compared as they stand: those of a part can never be the same; and priors that are compared
+    after [uncertainty] widened them: by how much depends on the largest error of an instrument's own apertures.
     """
+    uncertainty = Uncertainty(polar_deg=stated_deg, azimuth_deg=stated_deg)
 
     def scan(order, factor, name):
         names = [bshem.detector_names[k] for k in order]
         of = ("sample distance", *(f"{kind} of {one}" for one in names for kind in ("polar", "azimuth")))
-        std = (10.0, *np.repeat(1.0 + 0.1 * np.array(order), 2).tolist())
+        std = (10.0, *np.repeat(1.0 + 0.5 * np.array(order), 2).tolist())
         table = Covariance(
             parameters=of,
             units=("um", *["deg"] * (len(of) - 1)),
             std=(*std[:-1], std[-1] * math.sqrt(factor)),
             correlation=tuple(map(tuple, np.eye(len(of)).tolist())),
         )
-        known = {"detector": tuple(bshem.detector[k] for k in order), "covariance": table, "uncertainty": Uncertainty()}
+        known = {"detector": tuple(bshem.detector[k] for k in order), "covariance": table, "uncertainty": uncertainty}
         counts, x = np.ones((len(order), 4, 4)), 10.0 * np.arange(4)
         return MicrographStack(counts, x, x, bshem.model_copy(update=known), n_rays=1.0, name=name)
 

@@ -11,7 +11,7 @@ from helio_jax.alignment.rigid import Rigid
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import surface_of_heights
-from helio_jax.inverse import explanations
+from helio_jax.inverse import explanations, instrument_choice
 from helio_jax.inverse.fit import Fit, fit_heights
 from helio_jax.inverse.further_images import with_further_images
 from helio_jax.inverse.geometry_change import LIKELY, largest_changes
@@ -137,12 +137,15 @@ def with_background(stack: MicrographStack, shares: tuple[float, ...]) -> Microg
     return stack.replace(counts=counts, variance=np.maximum(counts, 1.0))
 
 
-@pytest.mark.parametrize("shares", [(0.1,) * 3, (0.2,) * 3, (0.0, 0.2, 0.0), (0.0, -0.15, 0.0)])
+@pytest.mark.parametrize(
+    "shares", [(0.1,) * 3, (0.2,) * 3, (0.2, 0.1, 0.15), (0.15, 0.15, 0.0), (0.0, 0.2, 0.0), (0.0, -0.15, 0.0)]
+)
 def test_background_is_not_taken_for_a_geometry_with_narrow_error_bars(bshem, shares):
-    """Background that was not subtracted, or too much: the hill within 2.5 stated standard deviations and 6 %.
+    """Background that was not subtracted, or too much: the hill within 2.5 stated standard deviations and 2 %.
 
-    By the geometry alone, the first two are 4.7 and 8.4 % too low, by 2 and 5 standard deviations. From a photometric
-    solution that takes the level of the border for slopes, the others came out 180 % too high and 87 % too low.
+    By the geometry alone, the first two are 4.7 and 8.4 % too low, by 2 and 5 standard deviations; with geometry and
+    background together, which the least misfit asks for, the third and fourth 3 %. From a photometric solution that
+    takes the level of the border for slopes, the last two came out 180 % too high and 87 % too low.
     """
     wrong, right = (
         reconstruct_stack(
@@ -153,7 +156,7 @@ def test_background_is_not_taken_for_a_geometry_with_narrow_error_bars(bshem, sh
     top = np.unravel_index(np.argmax(right.height), right.height.shape)
     found, std = wrong.spread(lambda z: float(z[top] - np.median(z[0])))
     expected, _ = right.spread(lambda z: float(z[top] - np.median(z[0])))
-    assert abs(found - expected) < min(2.5 * std, 0.06 * expected)
+    assert abs(found - expected) < min(2.5 * std, 0.02 * expected)
     assert any("background" in w or "deviates more from what is stated" in w for w in wrong.warnings)
 
 
@@ -167,9 +170,9 @@ def test_what_is_known_of_the_distance_stays(bshem):
 
 def test_interrupted_during_the_test_the_fit_is_kept(bshem, monkeypatch):
     """Ctrl-C after the fit, while its geometry is tested, loses nothing but the test."""
-    monkeypatch.setattr(explanations, "score_geometry", mock.Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(instrument_choice, "score_geometry", mock.Mock(side_effect=KeyboardInterrupt))
     rec = reconstruct_stack(recorded(bshem, bshem, 0), ReconstructSettings(), lambda _: nothing_traced)
-    assert rec.status.startswith("interrupted while another explanation was tried")
+    assert rec.status.startswith("interrupted while another instrument was tried")
     assert rec.height.max() > 100.0
 
 
@@ -203,7 +206,7 @@ def test_error_bars_hold_a_geometry_that_is_not_fitted(bshem, monkeypatch):
 
     Against those by the right instrument; without what another geometry would change, they hold half of them.
     """
-    monkeypatch.setattr(explanations._Fits, "_is_allowed", lambda *_: False)
+    monkeypatch.setattr(instrument_choice, "is_plausible", lambda *_: False)
     aim = np.zeros((3, 2))
     aim[:, 1] = np.radians(6.0)
     wrong, right = (

@@ -63,7 +63,7 @@ def stack():
     numbers = dict.fromkeys(OBJECT, 0.0) | {"radius": 1000.0, "height": 640.0, "log albedo ratio": math.log(RATIO)}
     axis = (np.arange(SIZE) - 0.5 * (SIZE - 1)) * PITCH
     scene = known_scene(KnownObject.parse("ball radius=1000"), numbers, bshem_wd3, axis, axis, substrate_um=8000.0)
-    traced = hx.simulate(scene, rays=512, seed=3, maps=False).only()
+    traced = hx.simulate(scene, rays=96, seed=3, maps=False).only()
     image = traced.counts.reshape(-1, SIZE, SIZE) / traced.n_rays
     std = np.median(image, axis=(1, 2), keepdims=True) / SNR
     rng = np.random.default_rng(8)
