@@ -79,13 +79,13 @@ def fitted_law(kind: str, values: dict[str, list[Any]]) -> Any:
     return hx.PowerLaw(numbers[0]) if kind == "power" else hx.MonotoneLaw(numbers)
 
 
-def run(member: Member, name: str, refine: dict[str, Any], dose: float) -> Row:
-    """Trace a sample with a law, reconstruct it twice, and score both."""
+def run(member: Member, name: str, rays: int, refine: dict[str, Any], dose: float) -> Row:
+    """Trace a sample with a law by so many rays per pixel, reconstruct it twice, and score both."""
     material, kind, true = LAWS[name]
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         scene = hx.load_scene(with_law(member, material, dose).write(Path(folder)))
-        stack = record(scene, hx.simulate(scene, rays=RAYS)).only()
+        stack = record(scene, hx.simulate(scene, rays=rays)).only()
         errors, found = [], {}
         for law in ("cosine", kind):
             rec = hx.reconstruct(stack, border=member.border, refine={"law": law} | refine)
@@ -127,16 +127,16 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "out")
     parser.add_argument("--tiny", action="store_true")
     given = parser.parse_args()
-    refine: dict[str, Any] = {}
+    rays, refine = RAYS, dict[str, Any]()
     if given.tiny:
         given.members, given.size, given.laws = 1, (16, 16), "EON of 20 deg"
-        refine = {"max_rounds": 2, "rays": 20_000, "samples": 8}
+        rays, refine = 64, {"max_rounds": 2, "rays": 20_000, "samples": 8}
     chosen = [name for name in LAWS if name in given.laws.split(",")]
     rows: list[Any] = []
     size, numbers = (given.size[0], given.size[1]), range(given.first, given.first + given.members)
     for member in members(given.family, given.seed, numbers, size):
         for name in chosen:
-            rows.append(run(member, name, refine, given.dose))
+            rows.append(run(member, name, rays, refine, given.dose))
             write(given.output / "law.json", rows, given.seed)
     for name in chosen:
         of = [r for r in rows if r["law"] == name]

@@ -25,14 +25,15 @@ NAMES = ("Sq", "Sdq", "Sk", "Sal")
 
 def texture_rows(seed: int, size: tuple[int, int] | None) -> list[Row]:
     """Compare the parameters of both methods with the true ones for one seed of tracer and noise."""
-    changes = {"trace.seed": seed, "noise.seed": seed}
+    changes, refine = {"trace.seed": seed, "noise.seed": seed}, {}
     if size:
         changes |= {"scan.nx": size[0], "scan.ny": size[1], "trace.rays": 16}
+        refine = {"max_rounds": 2, "rays": 20_000, "samples": 8}
     scene = hx.load_scene(ROOT / "scenes" / "rough.toml", changes)
     stack = record(scene, hx.simulate(scene))
     rows = []
     for method in ("nearfield", "refine"):
-        rec = hx.reconstruct(stack, method)
+        rec = hx.reconstruct(stack, method, refine=refine)
         rec = rec.replace(is_valid=np.ones(rec.height.shape, bool))
         true = rec.replace(height=hx.true_height(scene, rec).height, height_samples=None, height_std=None)
         for label, filters in FILTERS.items():

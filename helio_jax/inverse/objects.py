@@ -146,7 +146,7 @@ class ObjectSearch:
                 best = _best(tried)
             tried.append(self._peeled(best, number))
             best = _best(tried)
-            if not best.misfit <= limit < np.inf:
+            if not np.isfinite(best.misfit) or best.misfit > limit:
                 return []
             rival = _rival(tried, best, number)
             if rival is not None:

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
+from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.forward.optics import Optics
+from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import Surface
-from helio_jax.inverse.objects import LIMIT, STARTS, Objects, ObjectSearch, enclosed_by, jumps, segments
+from helio_jax.inverse.objects import LIMIT, STARTS, Objects, ObjectSearch, _Substrate, enclosed_by, jumps, segments
+from helio_jax.inverse.settings import ReconstructSettings
+from helio_jax.micrograph import MicrographStack
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene
 from helio_jax.workflows.truth import true_surface
@@ -113,6 +118,34 @@ def test_a_hopeless_object_is_not_refined():
     trial = ObjectSearch(relief, np.zeros(SHAPE, bool), (10.0, 10.0), misfit, lambda surface: unexplained)
     assert trial.find(Objects(inside.astype(int), (0.0,))) == []
     assert len(tried) == 2 + len(STARTS)
+
+
+def test_objects_are_found_where_the_relief_cannot_be_traced():
+    """They are the explanation that is left then; where they cannot be traced either, there are none."""
+    relief = Surface(np.full(SHAPE, 30.0), *np.zeros((2, *SHAPE)))
+    inside = (np.abs(X - 20) < 8) & (np.abs(Y - 20) < 8)
+    for of_objects, n_found in ((100.0, 1), (np.inf, 0)):
+        trial = ObjectSearch(
+            relief,
+            np.zeros(SHAPE, bool),
+            (10.0, 10.0),
+            lambda surface, m=of_objects: np.inf if np.all(surface.height == 30.0) else m,
+            lambda surface: np.full(SHAPE, 2.0 * LIMIT),
+        )
+        assert len(trial.find(Objects(inside.astype(int), (0.0,)))) == n_found
+
+
+def test_the_substrate_is_explained_where_a_gain_is_off(bshem):
+    """Flat micrographs of which one detector reads 20 % too much: by the level of the border, none is unexplained."""
+    signal = substrate_signal(Optics.of(bshem)) * (1.0, 1.2, 1.0)
+    counts, axis = np.ones((3, *SHAPE)) * signal[:, None, None], 30.0 * np.arange(max(SHAPE))
+    stack = MicrographStack(
+        counts, axis[: SHAPE[1]], axis[: SHAPE[0]], bshem, variance=(0.01 * counts) ** 2, n_rays=1.0
+    )
+    substrate = _Substrate(stack, ReconstructSettings(), lambda height, *_: Corrections.none((3, *height.shape)))
+    flat = Surface(*np.zeros((3, *SHAPE)))
+    assert substrate.unexplained(flat).max() < 0.1
+    assert np.abs(substrate.ratio - 1.0).max() < 0.02
 
 
 @pytest.fixture(scope="module")
