@@ -1,6 +1,7 @@
 """Records of the tracer: the shared state of a run (`Experiment`) and the atoms in flight (`Paths`)."""
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
 from helio_jax.trace.direct import ApertureTable
 from helio_jax.trace.intersect import Intersector
-from helio_jax.trace.lawtable import LawTable
+from helio_jax.trace.lawtable import LawTable, diffuse_shares
 from helio_jax.trace.meshplate import MeshPlate
 from helio_jax.trace.plate import PLATE, PlateTable
 from helio_jax.trace.source import Sampling, Source
@@ -34,13 +35,24 @@ class Experiment:
     plate: PlateTable | MeshPlate | None = None
     effusive: "Experiment | None" = None
 
+    @cached_property
+    def leaving(self) -> np.ndarray | None:
+        """Share of the atoms that leave each surface by the cosine law (`Intersector.by_surface`); empty: all.
+
+        None where some leave by lobes.
+        """
+        if self.laws is None:
+            return np.empty(0)
+        shares = None if self.plate is not None else diffuse_shares(self.laws)
+        return None if shares is None else self.intersector.by_surface(shares)
+
     def can_fuse(self, event: int) -> bool:
         """Whether `analog.trace_fused` applies from the scattering after `event` events on.
 
-        True with Embree, the cosine law everywhere and no scattering plate; with the expected estimator, also only
-        where no re-emitted atoms are needed to estimate the masked part (`next_event`).
+        True with Embree, no other laws than the cosine law, of albedos up to 1, and no scattering plate; with the
+        expected estimator, also only where no re-emitted atoms are needed to estimate the masked part (`next_event`).
         """
-        if self.laws is not None or self.plate is not None or not self.intersector.has_embree:
+        if self.leaving is None or self.plate is not None or not self.intersector.has_embree:
             return False
         gap = self.instrument.sample_distance - float(self.intersector.high[2])
         n_hits = self.sampling.n_branches if event == 0 else 1

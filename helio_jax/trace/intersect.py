@@ -208,6 +208,11 @@ class Intersector:
         out[~is_face] = self._sphere_material[-2 - surface[~is_face]]
         return out
 
+    def by_surface(self, of_material: np.ndarray) -> np.ndarray:
+        """Return a number of every surface's material, with `Hits.surface` as index: that of spheres is negative."""
+        of = np.concatenate([self._face_material, self._sphere_material[::-1]]).astype(np.int64)
+        return np.append(of_material[of], np.nan)
+
     def _set_scale(self) -> None:
         is_used = np.zeros(len(self.vertices), bool)
         is_used[self.triangles] = True

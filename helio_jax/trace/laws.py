@@ -142,6 +142,13 @@ def cosine_shares(table, material, incoming, normal, ids, path, event, seed):
 
 
 @kernel
+def leaves_surface(share, seed, pixel, path, event):
+    """Whether an atom leaves a surface that re-emits this share of them; the choice of `scatter_atoms`."""
+    key, number = np.uint64(seed), np.uint64(event)
+    return philox(key, _EMISSION, np.uint64(pixel), np.uint64(path), number, np.uint64(0))[0] < share
+
+
+@kernel
 def scatter_atoms(table, material, incoming, normal, u, ids, path, event, seed, with_density=True):
     """Sample the directions of scattered atoms.
 

@@ -73,6 +73,15 @@ def is_cosine(law: tuple[Term, ...]) -> bool:
     return all(term.shape == Shape.COSINE for term in law) and sum(term.share for term in law) == 1.0
 
 
+def diffuse_shares(table: LawTable) -> np.ndarray | None:
+    """Return each material's share of atoms that leave by the cosine law, the others adsorbed [materials].
+
+    None where a material's law has another term than a single one of this kind.
+    """
+    is_single = np.all(np.diff(table.first) == 1)
+    return table.share if is_single and np.all(table.shape == Shape.COSINE) else None
+
+
 def check_lattices(laws: Sequence[tuple[Term, ...]], names: Sequence[str], normals: np.ndarray, index: np.ndarray):
     """Check that no lattice plane is nearly perpendicular to a face of its material.
 

@@ -173,7 +173,7 @@ def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hit
             k, 1.0 / n_branches, cosine, point, normal, path_data, offset, plate_z, weight, is_open, table.shapes,
             table.rims, sums,
         )  # fmt: skip
-        if e.laws is not None:
+        if e.laws is not None and e.leaving is None:
             _score_lobes(
                 k, 1.0 / n_branches, n_hits, e.laws, material, paths.direction, point, normal, path_data, direction,
                 is_open, plate_z, table.shapes, table.area, sums,

@@ -1,11 +1,14 @@
 """The tracer: closed forms, book-keeping, two estimators and two ray engines against each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stats import assert_likely, assert_mean, smallest_tail
 
 from helio_jax.errors import GuardError
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
+from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.scene.shapes import Sphere, SpheresSample, TrenchSample
 from helio_jax.scene.surfaces import Body, flat_body
 from helio_jax.trace.experiment import Experiment
@@ -13,7 +16,7 @@ from helio_jax.trace.intersect import Intersector
 from helio_jax.trace.random import philox
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.tally import DETECTED, ESCAPED
+from helio_jax.trace.tally import DETECTED, ESCAPED, STOPPED
 
 
 def sphere_a() -> Body:
@@ -68,6 +71,33 @@ def test_one_kernel_gives_the_bits_of_separate_steps(bshem, monkeypatch, estimat
     for name in ("mean", "variance", "hits", "fates"):
         assert np.array_equal(getattr(fast, name), getattr(slow, name)), name
     assert fast.mean[1:].max() > 0
+
+
+def two_albedos() -> Body:
+    """Spheres of two materials on a sheet whose triangles are of either."""
+    spheres = Sphere(radius_um=1000.0, cap_height_um=720.0), Sphere(radius_um=500.0, center_um=(1200.0, 0.0))
+    body = SpheresSample(spheres=spheres, size_um=8000.0).build()
+    of_faces, of_spheres = (np.arange(len(of)) % 2 for of in (body.faces, body.spheres))
+    return replace(body, materials=("dark", "darker"), face_material=of_faces, sphere_material=of_spheres)
+
+
+@pytest.mark.parametrize(("estimator", "branches"), [("analog", 1), ("expected", 4), ("expected", 64)])
+def test_one_kernel_adsorbs_the_same_atoms(bshem, monkeypatch, estimator, branches):
+    """Surfaces of albedo 0.9 and 0.4: to the last bit as by separate steps; catches a number drawn for another event.
+
+    Adsorbed atoms count as stopped, and scatter towards the detectors before.
+    """
+    x, y = grid(9, 1200.0)
+    settings = TraceSettings(rays=16, branches=branches, estimator=estimator)
+    laws = {"dark": (replace(COSINE_LAW[0], share=0.9),), "darker": (replace(COSINE_LAW[0], share=0.4),)}
+    experiment = make_experiment(two_albedos(), bshem, settings, laws)
+    assert experiment.can_fuse(1)
+    fast = trace_pixels(experiment, x, y)
+    monkeypatch.setattr(Experiment, "can_fuse", lambda *_: False)
+    slow = trace_pixels(experiment, x, y)
+    for name in ("mean", "variance", "hits", "fates"):
+        assert np.array_equal(getattr(fast, name), getattr(slow, name)), name
+    assert fast.mean[1:].max() > 0 and fast.fates[STOPPED].sum() > 0.1 * fast.fates.sum()
 
 
 def test_flat_white_furnace():
