@@ -9,6 +9,7 @@ heights.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -71,12 +72,12 @@ class InstrumentChoice:
             if score.is_likely:
                 chosen = fit = replace(fit, geometry_score=score)
             self.say(f"the geometry is fitted, too; the micrographs may ask for {largest_changes(score.values)}")
-            found = [fit]
+            found = [(total_misfit(fit), fit)]
             for other in self._others(fit, score, readout):
                 if other.is_interrupted:
                     return interrupted(chosen, TRIED)
                 if is_plausible(other) and self.is_explained(other):
-                    found.append(other)
+                    found.append((total_misfit(other), other))
                     chosen = least_misfit(found)
         except PredictionError as e:
             self.say(f"another geometry is given up: {e}")
@@ -115,19 +116,19 @@ class InstrumentChoice:
         return replace(self.refit(fit, patches, factors, start), geometry_score=score)
 
 
-def least_misfit(fits: Sequence[Fit]) -> Fit:
-    """Return the fit to keep, with the change of its heights by the one of the others that may be right as well."""
-    misfits = [total_misfit(fit) for fit in fits]
-    as_stated = [i for i, fit in enumerate(fits) if not fit.is_geometry_fitted]
-    simplest = fits[min(as_stated, key=misfits.__getitem__)]
+def least_misfit(found: Sequence[tuple[float, Fit]]) -> Fit:
+    """Return the fit to keep, with the change of its heights by that of the others that may be right as well.
+
+    `found`: total misfits and fits.
+    """
+    simplest = min((one for one in found if not one[1].is_geometry_fitted), key=itemgetter(0))[1]
     asks_for_geometry = not simplest.prior_widths or simplest.geometry_score is not None
     least = LIKELY if asks_for_geometry else UNDECIDED
-    best = min(range(len(fits)), key=lambda i: misfits[i] + least * fits[i].is_geometry_fitted)
-    chosen, most = fits[best], misfits[best] + UNDECIDED
+    misfit, chosen = min(found, key=lambda one: one[0] + least * one[1].is_geometry_fitted)
     changes = [
-        fit.surface.height - chosen.surface.height
-        for fit, misfit in zip(fits, misfits, strict=True)
-        if fit is not chosen and misfit < most
+        other.surface.height - chosen.surface.height
+        for of_other, other in found
+        if other is not chosen and of_other < misfit + UNDECIDED
     ]
     return replace(chosen, rival_change=max(changes, key=lambda change: float(np.mean(change**2)), default=None))
 

@@ -89,7 +89,7 @@ DOUBTFUL = replace(READOUT, score=LIKELY, geometry_score=LIKELY)
 )
 def test_what_is_kept_and_what_may_be_right_as_well(fits, kept, change):
     """A geometry has to be likelier, and much more so than a read-out at which the data ask for none."""
-    found = least_misfit(fits)
+    found = least_misfit([(fit.misfit, fit) for fit in fits])
     assert found.name == kept
     assert (found.rival_change is None) if change is None else np.all(found.rival_change == change)
 
