@@ -201,8 +201,10 @@ def without_levels(change: Surface, region: np.ndarray) -> Surface:
         change: of the surface.
         region: number of the plateau of every pixel, 0: around them [y, x].
     """
+    if not region.any():
+        return change
     height = np.array(change.height)
-    for number in np.unique(region) if region.any() else ():
+    for number in np.unique(region):
         inside = region == number
         height[inside] -= height[inside].mean()
     height[np.abs(height) < _ROUNDING * np.abs(change.height).max(initial=0.0)] = 0.0
