@@ -1,0 +1,69 @@
+"""Slopes that `surface_of_heights` estimates from heights alone, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import helio_jax as hx
+
+STEP = 10.0
+X = STEP * np.arange(-20, 21.0)
+GX, GY = np.meshgrid(X, X[:31])
+RASTER = hx.Raster(jnp.asarray(X), jnp.asarray(X[:31]))
+
+
+def slopes(height):
+    """Slopes [2, y, x] of heights [y, x] in double precision."""
+    with jax.enable_x64():
+        surface = hx.surface_of_heights(jnp.asarray(height, jnp.float64), RASTER)
+        return np.stack([np.asarray(surface.slope_x), np.asarray(surface.slope_y)])
+
+
+def test_shoulders_of_a_steep_hill():
+    """Within 0.06 on a Gaussian of 2.75 pixels' width that is 0.8 steep.
+
+    A limiter between the two one-sided differences takes the flatter one at the shoulders: up to 0.3 too flat.
+    """
+    w, top = 2.75 * STEP, 37.5
+    height = top * np.exp(-0.5 * (GX**2 + (GY + 50) ** 2) / w**2)
+    true = np.stack([-GX, -GY - 50]) / w**2 * height
+    assert np.abs(true).max() > 0.8
+    assert np.abs(slopes(height) - true).max() < 0.06
+
+
+def test_fourth_order():
+    """Half the pixel size, a sixteenth of the error: of gentle relief, away from the border."""
+
+    def error(period):
+        k = 2 * np.pi / period
+        found = slopes(0.1 * np.sin(k * GX))[0]
+        return np.abs(found - 0.1 * k * np.cos(k * GX))[:, 3:-3].max()
+
+    assert error(200.0) / error(400.0) > 2**4.5  # a slope half as large, too: 2^5 in all
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+@pytest.mark.parametrize("width", [2, 3, 100])
+def test_steps_and_slots(width, tilt):
+    """Each side of a depth jump keeps its own slope, in a slot two pixels wide, too."""
+    inside = np.abs(GX - 5.0 - 0.5 * width * STEP) < 0.5 * width * STEP
+    found = slopes(tilt * GX - 60.0 * inside)
+    np.testing.assert_allclose(found[0], tilt, atol=0.05)
+    np.testing.assert_allclose(found[1], 0.0, atol=1e-9)
+
+
+def test_ridge():
+    """Two flanks that meet between pixels: each pixel has the slope of its flank."""
+    np.testing.assert_allclose(slopes(-np.abs(GX - 3.0))[0], -np.sign(GX - 3.0), atol=2e-3)
+
+
+def test_border_and_small_rasters():
+    """A plane is exact up to the border, on two pixels, too; on one the slope is 0, with finite derivatives."""
+    np.testing.assert_allclose(slopes(0.7 * GX - 0.2 * GY), np.array([0.7, -0.2])[:, None, None] + 0 * GX, atol=1e-9)
+    small = hx.Raster(jnp.asarray(X[:2]), jnp.asarray(X[:1]))
+    height = jnp.array([[0.0, 7.0]])
+    surface = hx.surface_of_heights(height, small)
+    np.testing.assert_allclose(surface.slope_x, 0.7, rtol=1e-6)
+    np.testing.assert_array_equal(surface.slope_y, 0.0)
+    assert np.isfinite(jax.grad(lambda h: hx.surface_of_heights(h, small).slope_x.sum())(height)).all()
