@@ -369,18 +369,22 @@ def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
 def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     """Compute the error bars of a fit, if it was not interrupted and its settings ask for them; `sums`: see above.
 
-    Where the data ask for another geometry, and none is fitted, they hold what it would change of the heights; and what
-    another instrument does that explains the data about as well.
+    Where the data ask for another geometry, and none is fitted, they hold what it would change of the heights, or what
+    another instrument changes that explains the data about as well: the larger change, as it may be one and the same.
     """
     n_samples = fit.problem.settings.samples
     if fit.is_interrupted or not n_samples:
         return fit
     posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
-    if fit.geometry_score is not None and not fit.is_geometry_fitted:
-        posterior = posterior.with_common_mode(fit.geometry_score.height_change)
-    if fit.rival_change is not None:
-        posterior = posterior.with_common_mode(fit.rival_change)
+    of_score = None if fit.geometry_score is None or fit.is_geometry_fitted else fit.geometry_score.height_change
+    if changes := [change for change in (of_score, fit.rival_change) if change is not None]:
+        posterior = posterior.with_common_mode(largest_change(changes))
     return replace(fit, posterior=posterior)
+
+
+def largest_change(changes: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the change of heights [y, x] with the largest mean square."""
+    return max(changes, key=lambda change: float(np.mean(change**2)))
 
 
 def at_state(fit: Fit, state: FitState, posterior: Posterior) -> Fit:

@@ -15,7 +15,7 @@ import numpy as np
 
 from helio_jax.errors import PredictionError
 from helio_jax.inverse.albedo_patches import AlbedoPatches
-from helio_jax.inverse.fit import Fit, interrupted
+from helio_jax.inverse.fit import Fit, interrupted, largest_change
 from helio_jax.inverse.geometry_change import LIKELY, GeometryScore, largest_changes
 from helio_jax.inverse.geometry_score import score_geometry, surface_misfit
 from helio_jax.inverse.levels import GAIN
@@ -47,7 +47,8 @@ class InstrumentChoice:
 
     Attributes:
         refit: see `Refit`.
-        is_explained: whether the data, traced, contradict a fit in no more pixels than the one to begin with.
+        is_explained: whether a fit can be traced, and the data contradict it in no more pixels than the one to begin
+            with.
         say: reports what is tried.
     """
 
@@ -58,7 +59,7 @@ class InstrumentChoice:
     def best_of(self, fit: Fit, readout: Fit | None) -> Fit:
         """Choose between a converged fit and those with other instruments.
 
-        Interrupted, or where nothing more can be predicted, it returns the best one so far.
+        Interrupted, it returns the best one so far.
 
         Args:
             fit: the best one so far, with the geometry as stated.
@@ -79,8 +80,6 @@ class InstrumentChoice:
                 if is_plausible(other) and self.is_explained(other):
                     found.append((total_misfit(other), other))
                     chosen = least_misfit(found)
-        except PredictionError as e:
-            self.say(f"another geometry is given up: {e}")
         except KeyboardInterrupt:
             chosen = interrupted(chosen, TRIED)
         return chosen
@@ -100,12 +99,15 @@ class InstrumentChoice:
             yield readout
         patches = fit.problem.patches
         for known in (AlbedoPatches.none(patches.number.shape), patches) if patches.objects else (patches,):
-            yield self._with_geometry(fit, score, known, stated)
+            yield from self._with_geometry(fit, score, known, stated)
         if readout is not None and (of_both := readout.geometry_score) is not None:
-            yield self._with_geometry(readout, of_both, readout.problem.patches, widths(readout))
+            yield from self._with_geometry(readout, of_both, readout.problem.patches, widths(readout))
 
-    def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches, factors: Widths) -> Fit:
-        """Fit with an uncertain geometry, from where the score says that this ends; `factors`: widths of the priors."""
+    def _with_geometry(self, fit: Fit, score: GeometryScore, patches: AlbedoPatches, factors: Widths) -> Iterator[Fit]:
+        """Fit with an uncertain geometry, from where the score says that this ends; nothing where it cannot be traced.
+
+        `factors`: widths of the priors over those stated.
+        """
 
         def start(problem: FitProblem) -> Parameters:
             p, before = score.parameters, widths(fit)
@@ -113,7 +115,12 @@ class InstrumentChoice:
             patch = p.patch if patches is fit.problem.patches else problem.stated_parameters().patch
             return p.replaced(patch=patch, **scaled)
 
-        return replace(self.refit(fit, patches, factors, start), geometry_score=score)
+        try:
+            found = self.refit(fit, patches, factors, start)
+        except PredictionError as e:
+            self.say(f"another instrument is given up: {e}")
+        else:
+            yield replace(found, geometry_score=score)
 
 
 def least_misfit(found: Sequence[tuple[float, Fit]]) -> Fit:
@@ -130,7 +137,7 @@ def least_misfit(found: Sequence[tuple[float, Fit]]) -> Fit:
         for of_other, other in found
         if other is not chosen and of_other < misfit + UNDECIDED
     ]
-    return replace(chosen, rival_change=max(changes, key=lambda change: float(np.mean(change**2)), default=None))
+    return replace(chosen, rival_change=largest_change(changes) if changes else None)
 
 
 def total_misfit(fit: Fit) -> float:

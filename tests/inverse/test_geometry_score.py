@@ -12,7 +12,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import surface_of_heights
 from helio_jax.inverse import explanations, instrument_choice
-from helio_jax.inverse.fit import Fit, fit_heights
+from helio_jax.inverse.fit import Fit, fit_heights, with_posterior
 from helio_jax.inverse.further_images import with_further_images
 from helio_jax.inverse.geometry_change import LIKELY, largest_changes
 from helio_jax.inverse.geometry_score import (
@@ -216,6 +216,23 @@ def test_error_bars_hold_a_geometry_that_is_not_fitted(bshem, monkeypatch):
     assert any("no fit with an uncertain geometry was kept" in w for w in wrong.warnings)
     error = np.abs(wrong.height - right.height)[wrong.is_valid]
     assert np.mean(error < 2.0 * wrong.height_std[wrong.is_valid]) > 0.9
+
+
+@pytest.mark.parametrize("factor", [0.5, -2.0])
+def test_error_bars_count_one_doubt_once(bshem, factor):
+    """What the test asks for and a fitted rival may be the same change of geometry: the larger one alone is contained.
+
+    Both together would be counted as independent: twice the variance where they agree.
+    """
+    fit = fitted(bshem, bshem.moved(np.radians([[3.0, 0.0]] * 3), 0.0), 0)
+    score = score_geometry(fit)
+    rival = factor * score.height_change
+    neither, both = (
+        with_posterior(one).posterior.common_modes
+        for one in (fit, replace(fit, geometry_score=score, rival_change=rival))
+    )
+    assert len(both) == len(neither) + 1
+    np.testing.assert_array_equal(both[-1], score.height_change if abs(factor) < 1.0 else rival)
 
 
 def test_misfit_grows_with_data_that_are_far_off(bshem):

@@ -134,6 +134,13 @@ def test_patches_may_stand_for_a_geometry():
     assert found.name == "geometry" and len(made) == 2
 
 
+def test_what_cannot_be_predicted_does_not_end_the_rest():
+    """The geometry is fitted with patches, though it cannot be traced without them."""
+    patches = AlbedoPatches(np.array([[0, 1], [0, 0]]), np.log([0.7]))
+    found, made = choose(replace(STATED, patches=patches), None, [PredictionError("too steep"), GEOMETRY])
+    assert found.name == "geometry" and len(made) == 2 and not found.is_interrupted
+
+
 def test_what_the_data_contradict_is_no_rival():
     """Neither kept nor in the error bars."""
     found, _ = choose(STATED, READOUT, [GEOMETRY], lambda fit: fit.name != "readout")
