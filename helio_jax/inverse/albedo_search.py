@@ -10,7 +10,8 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.inverse.albedo_patches import AlbedoPatches, find_albedo_patches
 from helio_jax.inverse.bootstrap import unmodelled_signal
-from helio_jax.inverse.linear import PhotometricSolution, signal_of
+from helio_jax.inverse.border_level import levelled_signal
+from helio_jax.inverse.linear import PhotometricSolution
 from helio_jax.inverse.nearfield import limited, solve_nearfield
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict, prediction_std
@@ -70,7 +71,7 @@ def search_albedo(stack: MicrographStack, settings: ReconstructSettings, predict
         predict: predicts masks and multiple scattering.
     """
     optics, raster = Optics.of(stack.instrument), Raster.of(stack)
-    signal, variance = signal_of(stack)
+    signal, variance = levelled_signal(stack, settings, is_albedo_known=False)
     height, solution = solve_nearfield(signal, variance, optics, raster, settings, settings.rounds)
     border = settings.border_fraction if settings.border == "flat" else None
     patches = AlbedoPatches.none(height.shape)

@@ -57,10 +57,22 @@ def border_levels(
 
 
 def levelled_signal(
-    stack: MicrographStack, settings: ReconstructSettings, patches: AlbedoPatches | None = None
+    stack: MicrographStack,
+    settings: ReconstructSettings,
+    patches: AlbedoPatches | None = None,
+    is_albedo_known: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return signal and variance of a stack (`signal_of`), brought to the right level on a flat border."""
+    """Return signal and variance of a stack (`signal_of`), brought to the right level on a flat border.
+
+    Args:
+        stack: micrographs.
+        settings: width and kind of the border.
+        patches: of other albedos, which the signal of the border is divided by.
+        is_albedo_known: whether the border has albedo 1 apart from `patches`; if not, the detectors are brought to one
+            level, their mean (of logarithms).
+    """
     signal, variance = signal_of(stack)
     of_sample = signal if patches is None else signal / patches.albedo
-    level = border_levels(of_sample, Optics.of(stack.instrument), settings)[:, None, None]
-    return signal / level, variance / level**2
+    level = border_levels(of_sample, Optics.of(stack.instrument), settings)
+    level = level if is_albedo_known else level / np.exp(np.mean(np.log(level)))
+    return signal / level[:, None, None], variance / level[:, None, None] ** 2

@@ -83,7 +83,8 @@ MAX_WIDTH = 0.125
 MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 NARROW = 5
-"""Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels]."""
+"""Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels].
+An area holds a disc of this width: a patch is as often round as square."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MORE_CONTRADICTED = 1.05
@@ -649,8 +650,12 @@ class _Fits:
             return right, max(MIN_CONTRADICTED, MORE_CONTRADICTED * share)
 
         def is_explained(other: Fit) -> bool:
-            right, most = first()
-            return bool(self.contradicted(self.residuals(other), right).mean() <= most)
+            try:
+                right, most = first()
+                return bool(self.contradicted(self.residuals(other), right).mean() <= most)
+            except PredictionError as e:
+                self.say(f"another instrument is given up: {e}")
+                return False
 
         return best._replace(fit=InstrumentChoice(self._refit_geometry, is_explained, self.say).best_of(fit, readout))
 
@@ -670,7 +675,8 @@ class _Fits:
 
 def share_of_areas(is_contradicted: np.ndarray) -> float:
     """Compute the share of the pixels that are contradicted [y, x] and in an area that is not `NARROW`."""
-    return float(binary_opening(is_contradicted, np.ones((NARROW, NARROW))).mean())
+    y, x = (axis - 0.5 * (NARROW - 1) for axis in np.ogrid[:NARROW, :NARROW])
+    return float(binary_opening(is_contradicted, x**2 + y**2 <= 0.25 * NARROW**2).mean())
 
 
 def has_contradicted_hollow(is_contradicted: np.ndarray, fit: Fit) -> bool:

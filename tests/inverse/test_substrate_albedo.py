@@ -1,11 +1,13 @@
-"""A substrate darker than albedo 1: the flat border shows it, and albedos are tried before pits and objects."""
+"""A dark substrate, which the flat border shows, and dark patches: of few pixels, and with background in one image."""
 
 import numpy as np
 import pytest
 
 import helio_jax as hx
 from helio_jax.forward.form_factor import substrate_signal
-from helio_jax.inverse.explanations import _Fits
+from helio_jax.inverse.albedo_search import search_albedo_patches
+from helio_jax.inverse.explanations import MIN_CONTRADICTED, NARROW, _Fits, share_of_areas
+from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
 
@@ -35,3 +37,50 @@ def test_a_dark_substrate_shows_at_the_border(bshem, albedo, border, gain_std, i
     stack = MicrographStack(ATOMS * (level + noise), axis, axis, bshem, variance=variance, n_rays=ATOMS)
     settings = ReconstructSettings.model_validate({"border": border, "refine": {"gain_std": gain_std}})
     assert _Fits(stack, settings, None, None).is_substrate_dark is is_dark
+
+
+def patched(bshem, background=0.0):
+    """Heights [y, x], where a patch of albedo 0.6 is, and micrographs without masks: a hill and a round patch.
+
+    The patch is six pixels wide; `background` of the second image is not known, in shares of its median.
+    """
+    x = 40.0 * np.arange(N)
+    gx, gy = np.meshgrid(x - x.mean(), x - x.mean())
+    height = 150.0 * np.exp(-((gx + 120.0) ** 2 + gy**2) / 2 / 110.0**2)
+    is_patch = (gx - 150.0) ** 2 + (gy + 220.0) ** 2 < 120.0**2
+    optics, raster = hx.Optics.of(bshem), hx.Raster(x=x, y=x)
+    signal = np.asarray(hx.render(height, optics, raster, corrections="none", albedo=np.where(is_patch, 0.6, 1.0)))
+    counts = np.random.default_rng(5).poisson(ATOMS * signal).astype(float)
+    counts[1] += background * np.median(counts[1])
+    stack = MicrographStack(counts, x, x, bshem, variance=np.maximum(counts, 1.0), n_rays=ATOMS, noise="poisson")
+    return height, is_patch, stack
+
+
+def nothing_traced(height, normals, *_, **__):
+    return hx.Corrections.none((3, *height.shape))
+
+
+def test_a_round_area_is_an_area():
+    """A disc of `NARROW` pixels' width counts and a line of less, along any direction, does not."""
+    y, x = np.mgrid[:N, :N] - N // 2
+    assert share_of_areas(x**2 + y**2 <= 0.25 * NARROW**2) > MIN_CONTRADICTED
+    for turn in np.radians([0.0, 30.0, 45.0]):
+        assert share_of_areas(np.abs(np.cos(turn) * x + np.sin(turn) * y) < 0.5 * (NARROW - 1)) == 0.0
+
+
+def test_a_round_patch_of_few_pixels_is_found(bshem):
+    """Its albedo to 1 %, the heights to 1 %; taken for relief, it is a hollow of 130 um in heights of 150 um."""
+    height, is_patch, stack = patched(bshem)
+    settings = ReconstructSettings.model_validate({"refine": {"objects": False, "samples": 0}})
+    rec = reconstruct_stack(stack, settings, lambda _: nothing_traced)
+    assert np.median(rec.albedo[is_patch]) == pytest.approx(0.6, rel=0.01)
+    assert np.sqrt(np.mean((rec.height - height) ** 2)) < 0.01 * np.ptp(height)
+
+
+def test_a_patch_is_found_with_background_in_one_image(bshem):
+    """The one patch there is, within some pixels; with images at different levels all of the surface leans."""
+    _, is_patch, stack = patched(bshem, 0.2)
+    found = search_albedo_patches(stack, ReconstructSettings(), nothing_traced)
+    albedo = found.albedo / np.median(found.albedo)
+    assert len(found.objects) == 1 and np.mean((albedo < 0.8) != is_patch) < 0.01
+    assert np.median(albedo[is_patch]) == pytest.approx(0.6, abs=0.1)
