@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from helio_jax.errors import SceneError
+from helio_jax.forward.compiling import compiled
 from helio_jax.forward.horizon import ACROSS, BEFORE, BESIDE, OUTSIDE, find_horizons, steps_per_um
 from helio_jax.forward.known_shapes import NO_HORIZON, PlacedShape
 from helio_jax.forward.optics import Optics, Raster, cast
@@ -176,7 +177,9 @@ def choose_horizons(
 ) -> jax.Array:
     """Choose the horizons of all slices on the host [detector, slice, y, x], constant under differentiation.
 
-    Arguments as those of `masked_form_factor`. A batch of surfaces or optics is searched in one call.
+    Arguments as those of `masked_form_factor`. Known ones are searched at once; give the result to compiled functions:
+    JAX does not keep a program that calls the host, and each process would compile it again. Under a JAX transformation
+    the program calls the host, once for a batch of surfaces or optics.
 
     Raises:
         SceneError: fewer than 2 x 2 beam positions, whose pitch is not known.
@@ -187,20 +190,32 @@ def choose_horizons(
             f"masks need at least 2 x 2 beam positions, got {' x '.join(map(str, height.shape))}: enlarge the "
             "raster, or render with corrections = 'none'"
         )
-    slices, tail = slice_apertures(cast(optics, height.dtype), n_slices), _TAIL * width
-    dx, dy = (jnp.asarray(d, height.dtype) for d in (raster.dx, raster.dy))
-    columns = [slices.direction[..., 0], slices.direction[..., 1], slices.plate, slices.far, slices.rise]
-    table, pitch = jnp.stack(columns, -1), jnp.stack([dy, dx])
-    shape = (*slices.far.shape, *height.shape)
+    table = _slice_table(cast(optics, height.dtype), n_slices)
+    pitch, tail = jnp.stack([jnp.asarray(d, height.dtype) for d in (raster.dy, raster.dx)]), _TAIL * width
+    shape = (*table.shape[:2], *height.shape)
 
-    def choose(*batch: Any) -> np.ndarray:
-        heights, tables, pitches = (_from_bits(a) for a in batch)
+    def choose(heights: np.ndarray, tables: np.ndarray, pitches: np.ndarray) -> np.ndarray:
         lead, n = heights.shape[:-2], math.prod(heights.shape[:-2])
         images, pieces = heights.reshape(n, *heights.shape[-2:]), tables.reshape(n, -1, tables.shape[-1])
         return find_horizons(images, pieces, tail, pitches.reshape(n, 2)).reshape(*lead, *shape)
 
-    operands = (_as_bits(jax.lax.stop_gradient(a)) for a in (height, table, pitch))
-    return jax.pure_callback(choose, jax.ShapeDtypeStruct(shape, jnp.int32), *operands, vmap_method="broadcast_all")
+    operands = [jax.lax.stop_gradient(a) for a in (height, table, pitch)]
+    if not any(isinstance(a, jax.core.Tracer) for a in operands):
+        return jnp.asarray(choose(*(np.asarray(a, np.float64) for a in operands)))
+    return jax.pure_callback(
+        lambda *batch: choose(*(_from_bits(a) for a in batch)),
+        jax.ShapeDtypeStruct(shape, jnp.int32),
+        *(_as_bits(a) for a in operands),
+        vmap_method="broadcast_all",
+    )
+
+
+@compiled
+def _slice_table(optics: Optics, n_slices: int) -> jax.Array:
+    """Collect what `find_horizons` takes of the slices [detector, slice, number]."""
+    slices = slice_apertures(optics, n_slices)
+    columns = slices.direction[..., 0], slices.direction[..., 1], slices.plate, slices.far, slices.rise
+    return jnp.stack(columns, -1)
 
 
 def _as_bits(array: jax.Array) -> jax.Array:

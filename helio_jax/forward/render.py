@@ -129,7 +129,9 @@ def render(
         corrections = _planned(surface, optics, raster)
     kind = corrections if isinstance(corrections, str) else ""
     given = None if kind else corrections
-    return _rendered(surface, optics, raster, readout, given, albedo, law, kind, n_slices)
+    is_masked = kind != "none" and not isinstance(given, Corrections)
+    horizons = choose_horizons(surface, optics, raster, n_slices) if is_masked else None
+    return _rendered(surface, optics, raster, readout, given, albedo, law, horizons, kind, n_slices)
 
 
 def _planned(surface: Surface, optics: Optics, raster: Raster) -> Plan:
@@ -143,7 +145,7 @@ def _planned(surface: Surface, optics: Optics, raster: Raster) -> Plan:
     return plan_radiosity(surface.height, surface.normals(np.asarray(optics.beam_shift)), optics, raster)
 
 
-def _corrections(surface, optics, raster, plan, kind: str, n_slices: int, horizons: Any = None) -> Corrections:
+def _corrections(surface, optics, raster, plan, horizons, kind: str, n_slices: int) -> Corrections:
     dtype = jnp.asarray(surface.height).dtype
     surface, optics, raster = (cast(part, dtype) for part in (surface, optics, raster))
     multiple = jnp.zeros((optics.n_detectors, *surface.height.shape), dtype)
@@ -161,26 +163,29 @@ _jitted_corrections = compiled(_corrections)
 
 def masking_corrections(surface: Surface, optics: Optics, raster: Raster) -> Corrections:
     """Compute the masks of a surface, without multiple scattering, as NumPy arrays in float64."""
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _jitted_corrections(surface, optics, raster, None, "masking", N_SLICES))
+    return _corrections_by(surface, optics, raster, None, "masking")
 
 
 def radiosity_corrections(surface: Surface, optics: Optics, raster: Raster, plan: Plan) -> Corrections:
     """Compute masks and multiple scattering of a surface by a plan, as NumPy arrays in float64."""
+    return _corrections_by(surface, optics, raster, plan, "radiosity")
+
+
+def _corrections_by(surface: Surface, optics: Optics, raster: Raster, plan: Plan | None, kind: str) -> Corrections:
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, _jitted_corrections(surface, optics, raster, plan, "radiosity", N_SLICES))
+        horizons = choose_horizons(surface, optics, raster)
+        found = _jitted_corrections(surface, optics, raster, plan, horizons, kind, N_SLICES)
+        return jax.tree.map(np.asarray, found)
 
 
 @eqx.filter_jit
-def _rendered(surface, optics, raster, readout, corrections, albedo, law, kind: str, n_slices: int) -> jax.Array:
+def _rendered(surface, optics, raster, readout, corrections, albedo, law, horizons, kind: str, n_slices: int):
     dtype = jnp.asarray(surface.height).dtype
     given, plan = (corrections, None) if isinstance(corrections, Corrections) else (None, corrections)
-    is_masked = given is None and kind != "none"
-    horizons = choose_horizons(surface, optics, raster, n_slices) if is_masked else None
 
     def probability_of(surface, optics, raster, given, plan, albedo, law, horizons):
         if given is None:
-            given = _corrections(surface, optics, raster, plan, kind, n_slices, horizons)
+            given = _corrections(surface, optics, raster, plan, horizons, kind, n_slices)
         return detection_probability(surface, optics, given, albedo, law)
 
     surface, optics, raster, given, plan, albedo, law = (

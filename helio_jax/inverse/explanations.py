@@ -30,7 +30,6 @@ from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
-from helio_jax.inverse.convergence import has_converged
 from helio_jax.inverse.fit import (
     Fit,
     Report,
@@ -41,7 +40,7 @@ from helio_jax.inverse.fit import (
     without_noise_bias,
 )
 from helio_jax.inverse.geometry_score import usual_uncertainty
-from helio_jax.inverse.instrument_choice import InstrumentChoice
+from helio_jax.inverse.instrument_choice import InstrumentChoice, is_at_rest
 from helio_jax.inverse.law_prior import with_level_of_cosine_law, with_level_of_law
 from helio_jax.inverse.levels import GAIN, Region, covered, search_levels
 from helio_jax.inverse.linear import noise_share_of, parallax_of, signal_of
@@ -639,19 +638,19 @@ class _Fits:
         `readout`: fit with wider priors of gains and offsets, kept or not; None: none was made.
         """
         fit = best.fit
-        if fit.is_interrupted or not has_converged(fit.changes, self.settings.refine.tolerance_um):
+        if fit.is_interrupted or not is_at_rest(fit):
             return best
 
         @cache
         def first() -> tuple[float, float]:
-            residuals = self.residuals(fit)
+            residuals = self.residuals_of_first(fit)
             right = self.right_chi_square(residuals)
             share = float(self.contradicted(residuals, right).mean())
             return right, max(MIN_CONTRADICTED, MORE_CONTRADICTED * share)
 
         def is_explained(other: Fit) -> bool:
+            right, most = first()
             try:
-                right, most = first()
                 return bool(self.contradicted(self.residuals(other), right).mean() <= most)
             except PredictionError as e:
                 self.say(f"another instrument is given up: {e}")

@@ -115,6 +115,17 @@ class Fit:
         return self.geometry_score is not None and self.problem.geometry.is_aimed
 
     @property
+    def instrument_change(self) -> np.ndarray | None:
+        """Change of the heights by an instrument that may be right as well [y, x], um: what the error bars contain.
+
+        That of a geometry that the data ask for and that was not fitted, or that of another fit: the one with the
+        larger mean square, as both may be one and the same. None: there is none.
+        """
+        of_score = None if self.geometry_score is None or self.is_geometry_fitted else self.geometry_score.height_change
+        changes = [change for change in (of_score, self.rival_change) if change is not None]
+        return largest_change(changes) if changes else None
+
+    @property
     def chi_square(self) -> list[float]:
         """Mean square residual of the data of every detector, each counted by its robust weight, squared."""
         total = np.sum((self.weight * self.residuals) ** 2, axis=(1, 2))
@@ -369,16 +380,14 @@ def without_noise_bias(fit: Fit, report: Report | None = None) -> Fit:
 def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     """Compute the error bars of a fit, if it was not interrupted and its settings ask for them; `sums`: see above.
 
-    Where the data ask for another geometry, and none is fitted, they hold what it would change of the heights, or what
-    another instrument changes that explains the data about as well: the larger change, as it may be one and the same.
+    They contain what another instrument that may be right changes of the heights (`Fit.instrument_change`).
     """
     n_samples = fit.problem.settings.samples
     if fit.is_interrupted or not n_samples:
         return fit
     posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
-    of_score = None if fit.geometry_score is None or fit.is_geometry_fitted else fit.geometry_score.height_change
-    if changes := [change for change in (of_score, fit.rival_change) if change is not None]:
-        posterior = posterior.with_common_mode(largest_change(changes))
+    if fit.instrument_change is not None:
+        posterior = posterior.with_common_mode(fit.instrument_change)
     return replace(fit, posterior=posterior)
 
 

@@ -47,16 +47,27 @@ DOUBTFUL = (
 """Warning of a fit of which the data say so, and whose geometry is as stated."""
 RIVAL = (
     "another geometry, gains or offsets explain the micrographs about as well, with heights that differ by up to "
-    "{most:.3g} um; the error bars contain the difference: calibrate the instrument (helio calibrate)"
+    "{most:.3g} um{contained}: calibrate the instrument (helio calibrate)"
 )
-"""Warning of a fit whose error bars contain `Fit.rival_change`."""
+"""Warning of a fit with a `Fit.rival_change`."""
 
 
 def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     """Say what the data of a fit say of the geometry, where they ask for another one than is stated as exact, and
     whether other instruments explain them about as well."""
-    rival = fit.rival_change if fit.posterior is not None else None
-    return _of_geometry(fit) + (() if rival is None else (RIVAL.format(most=float(np.abs(rival).max())),))
+    return _of_geometry(fit) + _of_rival(fit)
+
+
+def _of_rival(fit: Fit) -> tuple[str, ...]:
+    """Warn of another instrument; not where the error bars are wider than the heights differ without it, too."""
+    rival, contained = fit.rival_change, ""
+    if rival is None:
+        return ()
+    if fit.posterior is not None:
+        if fit.instrument_change is not rival or not np.any(2.0 * rival**2 > fit.posterior.height_std**2):
+            return ()
+        contained = "; the error bars contain the difference"
+    return (RIVAL.format(most=float(np.abs(rival).max()), contained=contained),)
 
 
 def _of_geometry(fit: Fit) -> tuple[str, ...]:

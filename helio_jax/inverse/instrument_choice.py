@@ -3,8 +3,8 @@
 A wrong geometry, background that nobody subtracted and patches of another albedo can look alike. Each is fitted, and
 the fit with the least misfit is kept; another geometry has to be better by `LIKELY`, as it has more numbers to fit. It
 has to be better by `UNDECIDED` than gains and offsets at whose fit the micrographs ask for no other geometry (the score
-test of `geometry_score`). Where a fit that is not kept is hardly worse (`UNDECIDED`), the error bars contain its
-heights.
+test of `geometry_score`). A fit that did not converge is never kept for another one. Where a fit that is not kept is
+hardly worse (`UNDECIDED`), the error bars contain its heights.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +15,7 @@ import numpy as np
 
 from helio_jax.errors import PredictionError
 from helio_jax.inverse.albedo_patches import AlbedoPatches
+from helio_jax.inverse.convergence import has_converged
 from helio_jax.inverse.fit import Fit, interrupted, largest_change
 from helio_jax.inverse.geometry_change import LIKELY, GeometryScore, largest_changes
 from helio_jax.inverse.geometry_score import score_geometry, surface_misfit
@@ -94,7 +95,7 @@ class InstrumentChoice:
         if readout is not None and readout.state is fit.state:
             readout = fit
         elif readout is not None:
-            of_readout = score_geometry(readout)
+            of_readout = score_geometry(readout) if is_at_rest(readout) else None
             readout = replace(readout, geometry_score=of_readout if of_readout and of_readout.is_likely else None)
             yield readout
         patches = fit.problem.patches
@@ -126,18 +127,29 @@ class InstrumentChoice:
 def least_misfit(found: Sequence[tuple[float, Fit]]) -> Fit:
     """Return the fit to keep, with the change of its heights by that of the others that may be right as well.
 
-    `found`: total misfits and fits.
+    `found`: total misfits and fits, the first one with the geometry as stated, and converged.
     """
-    simplest = min((one for one in found if not one[1].is_geometry_fitted), key=itemgetter(0))[1]
-    asks_for_geometry = not simplest.prior_widths or simplest.geometry_score is not None
-    least = LIKELY if asks_for_geometry else UNDECIDED
-    misfit, chosen = min(found, key=lambda one: one[0] + least * one[1].is_geometry_fitted)
+    at_rest = found[0], *(one for one in found[1:] if is_at_rest(one[1]))
+    simpler = [one for one in at_rest if not one[1].is_geometry_fitted]
+    geometry = min((one for one in at_rest if one[1].is_geometry_fitted), key=itemgetter(0), default=None)
+    is_better = geometry is not None and all(geometry[0] < of_one - _lead(one) for of_one, one in simpler)
+    misfit, chosen = geometry if geometry is not None and is_better else min(simpler, key=itemgetter(0))
     changes = [
         other.surface.height - chosen.surface.height
         for of_other, other in found
         if other is not chosen and of_other < misfit + UNDECIDED
     ]
     return replace(chosen, rival_change=largest_change(changes) if changes else None)
+
+
+def _lead(fit: Fit) -> float:
+    """Return by how much a fitted geometry has to be better than a fit without, in half chi-square."""
+    return UNDECIDED if fit.prior_widths and fit.geometry_score is None else LIKELY
+
+
+def is_at_rest(fit: Fit) -> bool:
+    """Whether a fit has converged: until then its misfit is not that of its surface."""
+    return has_converged(fit.changes, fit.problem.settings.tolerance_um)
 
 
 def total_misfit(fit: Fit) -> float:

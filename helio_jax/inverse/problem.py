@@ -275,10 +275,10 @@ class FitProblem:
         of_sample = self.signal / self.patches.albedo
         level = border_levels(of_sample, self.optics, self.reconstruct_settings, self.law_prior)
         gain_std, expected = self.settings.gain_std, border_signal(self.optics, self.law_prior)
-        offset_std = self.priors.offset / expected
-        offset = (level - 1.0) * offset_std**2 / (offset_std**2 + gain_std**2)
-        log_gain = np.log(level - offset) / gain_std
-        return self.stated_parameters().replaced(log_gain=log_gain, offset=offset / offset_std)
+        offset_std = self.priors.offset / expected  # 0 where more than half of the pixels have no counts
+        offset = (level - 1.0) * offset_std / (offset_std**2 + gain_std**2)
+        log_gain = np.log(level - offset_std * offset) / gain_std
+        return self.stated_parameters().replaced(log_gain=log_gain, offset=offset)
 
     def patches_at(self, parameters: Parameters) -> AlbedoPatches:
         """Return the patches with the albedos of parameters."""

@@ -21,7 +21,7 @@ from helio_jax.arrays import substrate_mask
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.laws import Law, by_law
-from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.masking import choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.radiosity import Plan, plan_radiosity, radiosity
 from helio_jax.forward.render import single_scattering
@@ -74,10 +74,15 @@ def normal_slope(multiple: np.ndarray, up: np.ndarray, level: np.ndarray) -> np.
     return np.minimum(multiple * share, 0.5 * level[:, None, None])
 
 
-@compiled
 def _masked_change(surface: Surface, change: Surface, optics: Optics, raster: Raster, law: Law | None) -> jax.Array:
     """Compute the change of single scattering by masks [detector, y, x] along a change of the surface."""
-    slope = jax.jvp(lambda s: masked_form_factor(s, optics, raster), (surface,), (change,))[1]
+    horizons = choose_horizons(surface, optics, raster)
+    return _masked_change_by(horizons, surface, change, optics, raster, law)
+
+
+@compiled
+def _masked_change_by(horizons: jax.Array, surface: Surface, change: Surface, optics, raster, law) -> jax.Array:
+    slope = jax.jvp(lambda s: masked_form_factor(s, optics, raster, horizons=horizons), (surface,), (change,))[1]
     normal = unit_normal(surface.slope_x, surface.slope_y, optics.beam_shift)
     return -by_law(law, single_scattering(slope, normal), optics, surface.height, normal)
 

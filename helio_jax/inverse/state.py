@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from helio_jax.forward.compiling import compiled
 from helio_jax.forward.form_factor import substrate_signal
-from helio_jax.forward.masking import masked_form_factor
+from helio_jax.forward.masking import choose_horizons, masked_form_factor
 from helio_jax.forward.optics import Optics, Raster, cast
 from helio_jax.forward.render import Corrections, single_scattering
 from helio_jax.forward.surface import Surface
@@ -247,14 +247,19 @@ def with_responses(problem: FitProblem, state: FitState, growing: Sequence[Surfa
     return replace(state, held=replace(state.held, responses=responses))
 
 
-@compiled
 def masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any) -> jax.Array:
     """Compute the derivative of the masked form factors by distance, polar angle and azimuth, each detector by its own.
 
     Each aperture depends on its own polar angle and azimuth only, so that one derivative serves all detectors.
     """
+    horizons = choose_horizons(surface, moved_optics(optics, moved), raster)
+    return _masked_moves(surface, optics, raster, moved, horizons)
 
+
+@compiled
+def _masked_moves(surface: Surface, optics: Optics, raster: Raster, moved: Any, horizons: jax.Array) -> jax.Array:
     def masked(step):
-        return masked_form_factor(surface, moved_optics(optics, moved + step[:, None]), raster)
+        there = moved_optics(optics, moved + step[:, None])
+        return masked_form_factor(surface, there, raster, horizons=horizons)
 
     return jnp.moveaxis(jax.jacfwd(masked)(jnp.zeros(3)), -1, 0)

@@ -53,12 +53,12 @@ LEAVES = {
     "moved from normal incidence": [f"moves.{name}" for name in MOVES if name != "beam_azimuth"] + OPTICS,
 }
 IS_AFFINE = {"albedo", *READOUT}
-SIZE = {"slope_x": 0.05, "slope_y": 0.05, "beam_shift": 0.003, "edges": 0.1}
+SIZE = {"surface": 0.3, "slope_x": 0.05, "slope_y": 0.05, "beam_shift": 0.003, "edges": 0.1}
 SIZE |= {"exponent": 0.1, "share": 0.1, "width_deg": 3.0, "roughness": 0.1, "log_exponents": 0.1}
 SIZE |= dict.fromkeys(MOVES, 1e-3) | {"plate_shift": 1.0}
 SIZE |= dict.fromkeys(["distance", "working_distance", "sample_distance"], 10.0)
 """Standard deviation of a leaf's direction, 1 where it is not named: large against rounding, and so small that the
-longest step crosses no kink."""
+longest step crosses no kink, nor that the weights of slopes from heights alone change much."""
 
 
 class Case(NamedTuple):

@@ -64,3 +64,15 @@ def test_a_fit_starts_where_the_border_is_explained(bshem):
     signal = signal_of(bshem, (0.7,) * 3)
     problem = FitProblem.of(signal, (0.01 * signal) ** 2, *known, patches=dark)
     assert not problem.start_parameters().log_gain.any()
+
+
+@pytest.mark.parametrize("border", ["flat", "free"])
+def test_a_detector_with_few_counts_has_a_start(bshem, border):
+    """More than half of its pixels have none: its offset is known to 0, and the start is finite."""
+    signal = signal_of(bshem, (1.0, 1.0, 1.0))
+    signal[0] *= np.random.default_rng(1).random(SHAPE) < 0.3
+    surface, settings = Surface(*np.zeros((3, *SHAPE))), ReconstructSettings().changed(border=border)
+    problem = FitProblem.of(signal, np.full_like(signal, 1e-6), bshem, Raster.regular(SHAPE, 40.0), surface, settings)
+    assert problem.priors.offset[0] == 0.0
+    start = problem.start_parameters()
+    assert np.isfinite(start.offset).all() and np.isfinite(start.log_gain).all()

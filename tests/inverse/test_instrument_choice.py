@@ -44,6 +44,7 @@ class Known:
     rival_change: np.ndarray | None = None
     status: str = ""
     is_interrupted: bool = False
+    is_at_rest: bool = True
     patches: AlbedoPatches = field(default_factory=lambda: AlbedoPatches.none((2, 2)))
 
     @property
@@ -63,7 +64,8 @@ class Known:
 def _known(monkeypatch):
     monkeypatch.setattr(instrument_choice, "total_misfit", lambda fit: fit.misfit)
     monkeypatch.setattr(instrument_choice, "is_plausible", lambda fit: True)
-    monkeypatch.setattr(instrument_choice, "score_geometry", lambda fit: fit.score)
+    monkeypatch.setattr(instrument_choice, "is_at_rest", lambda fit: fit.is_at_rest)
+    monkeypatch.setattr(instrument_choice, "score_geometry", lambda fit: fit.score if fit.is_at_rest else 1 / 0)
 
 
 STATED = Known("stated", 100.0, 1.0, LIKELY)
@@ -85,10 +87,16 @@ DOUBTFUL = replace(READOUT, score=LIKELY, geometry_score=LIKELY)
         ([STATED, replace(GEOMETRY, misfit=70.0), DOUBTFUL], "geometry", None),
         ([STATED, GEOMETRY, DOUBTFUL], "geometry", 4.0),
         ([STATED, replace(READOUT, misfit=101.0)], "stated", 6.0),
+        ([replace(STATED, misfit=94.0), GEOMETRY, READOUT], "stated", 6.0),
+        ([STATED, replace(GEOMETRY, is_at_rest=False)], "stated", 2.0),
+        ([STATED, GEOMETRY, replace(READOUT, is_at_rest=False)], "geometry", 4.0),
     ],
 )
 def test_what_is_kept_and_what_may_be_right_as_well(fits, kept, change):
-    """A geometry has to be likelier, and much more so than a read-out at which the data ask for none."""
+    """A geometry has to be likelier, and much more so than a read-out at which the data ask for none.
+
+    Fits that did not converge are not kept; the error bars contain them.
+    """
     found = least_misfit([(fit.misfit, fit) for fit in fits])
     assert found.name == kept
     assert (found.rival_change is None) if change is None else np.all(found.rival_change == change)
@@ -118,6 +126,9 @@ def test_what_is_fitted():
     assert (found.name, made) == ("readout", [("stated", 1.0, 1.0)])
     found, made = choose(STATED, replace(READOUT, score=LIKELY), [GEOMETRY, both])
     assert (found.name, made) == ("both", [("stated", 1.0, 1.0), ("readout", 4.0, 1.0)])
+    # a read-out that did not converge is not tested
+    found, made = choose(STATED, replace(READOUT, misfit=80.0, is_at_rest=False), [GEOMETRY])
+    assert (found.name, len(made)) == ("geometry", 1) and np.all(found.rival_change == 4.0)
     # the read-out that was kept before: its offset, in wider units, starts the fit with the stated prior
     found, made = choose(replace(READOUT, score=UNLIKELY), READOUT, [GEOMETRY])
     assert (found.name, made) == ("readout", [("readout", 1.0, 4.0)])

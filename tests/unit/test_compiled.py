@@ -5,8 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
+import jax
+import numpy as np
 import pytest
 
+import helio_jax as hx
+from helio_jax.forward import masking, render
+from helio_jax.inverse import responses, state
 from helio_jax.workflows.compilation_cache import keep_compiled
 
 NAME = "JAX_COMPILATION_CACHE_DIR"
@@ -54,3 +60,43 @@ def test_a_second_process_compiles_nothing(home):
 
     first = entries()
     assert first and entries() == first
+
+
+def test_the_programs_of_masks_do_not_call_the_host(bshem, monkeypatch):
+    """JAX keeps no program that does: each process would compile it again, the derivatives of masks for 6 s.
+
+    That the search does show where it is seen: masks whose horizons nobody chose before.
+    """
+    shape = 5, 6
+    optics, raster = hx.Optics.of(bshem), hx.Raster.regular(shape, 40.0)
+    surface = hx.Surface(np.random.default_rng(0).random(shape), *np.zeros((2, *shape)))
+    programs = []
+
+    def spied(module, name):
+        function = getattr(module, name)
+
+        def spy(*args):
+            arrays, rest = eqx.partition(args, eqx.is_array)
+            programs.append(str(jax.make_jaxpr(lambda a: function(*eqx.combine(a, rest)))(arrays)))
+            return function(*args)
+
+        monkeypatch.setattr(module, name, spy)
+
+    for module, name in [
+        (render, "_rendered"),
+        (render, "_jitted_corrections"),
+        (responses, "_masked_change_by"),
+        (state, "_masked_moves"),
+    ]:
+        spied(module, name)
+    hx.render(surface, optics, raster)
+    render.masking_corrections(surface, optics, raster)
+    with jax.enable_x64(True):
+        responses._masked_change(surface, surface, optics, raster, None)
+        state.masked_moves(surface, optics, raster, np.zeros((3, optics.n_detectors)))
+        assert "callback" in str(
+            jax.make_jaxpr(
+                lambda h: masking.masked_form_factor(hx.Surface(h, surface.slope_x, surface.slope_y), optics, raster)
+            )(surface.height)
+        )
+    assert len(programs) == 4 and not any("callback" in program for program in programs)
