@@ -219,6 +219,7 @@ scores/               errors against something known
   agreement           agreement of a simulation with measured micrographs
 measure/              numbers from height maps
   facets              planar facets: angles, sides, areas
+  planes              planes through regions of a height map
   sample_grid         heights of an oblique beam on a regular grid of the sample frame
   sample_surface      the surface that is measured: regular grid of the sample frame, errors, flags
   areal_filters       Gaussian S-filter and L-filter, F-operator (ISO 16610-61)

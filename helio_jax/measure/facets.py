@@ -14,21 +14,20 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from helio_jax.arrays import as_json, pitch, robust_std
+from helio_jax.arrays import as_json, pitch
 from helio_jax.errors import GuardError
+from helio_jax.measure.planes import extrapolated, fit_planes
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.settings import Settings
 
-_TUKEY = 4.685
-_ITERATIONS = 30
 _WINDOW = 5
 """Side of the square in which the local plane is fitted [pixels]."""
+_AT_A_TIME = 1_000_000
+"""Numbers of drawn heights to which planes are fitted at a time."""
 _RIM = 2
 """Pixels along a facet's border that its plane is not fitted to, because edges are rounded."""
 _LEAST_CORE = 0.25
 """A region with less than this fraction inside its rim is the rounding of an edge, not a facet."""
-_NO_CORE = 1e-6
-"""Sum of Gaussian weights below which a facet is not extrapolated."""
 
 
 class FacetSettings(Settings):
@@ -212,7 +211,7 @@ def _assign_borders(rec: Reconstruction, labels: np.ndarray, use: np.ndarray) ->
     numbers = range(1, int(labels.max()) + 1)
     for number in numbers:
         region = labels == number
-        away = np.abs(rec.height - _extrapolate(rec, _core(region)))
+        away = np.abs(rec.height - extrapolated(rec, _core(region), _WINDOW))
         reach = ndimage.binary_dilation(region, iterations=_WINDOW) & use
         is_nearer = reach & (away < best)
         out, best = np.where(is_nearer, number, out), np.where(is_nearer, away, best)
@@ -224,50 +223,6 @@ def _assign_borders(rec: Reconstruction, labels: np.ndarray, use: np.ndarray) ->
     return out
 
 
-def _extrapolate(rec: Reconstruction, core: np.ndarray) -> np.ndarray:
-    """Compute the heights [y, x] of the planes fitted, around every pixel, to a facet's core with Gaussian weights.
-
-    The standard deviation of the weights is `_WINDOW`; beyond 5 of them from the core the result is infinite.
-    """
-
-    def weighted(values: np.ndarray | float) -> np.ndarray:
-        return ndimage.gaussian_filter(np.where(core, values, 0.0), _WINDOW, mode="constant", truncate=5.0)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return weighted(values) / total
-
-    total = np.maximum(weighted(1.0), np.finfo(float).tiny)
-    x, y, z = rec.x - rec.x.mean(), rec.y - rec.y.mean(), rec.height
-    at = np.stack([mean(x), mean(y)], -1)
-    level = mean(z)
-    moments = [[mean(a * b) - mean(a) * mean(b) for b in (x, y)] for a in (x, y)]
-    slopes = np.stack([mean(a * z) - mean(a) * level for a in (x, y)], -1)
-    ridge = 0.1 * pitch(rec.raster_x) * pitch(rec.raster_y)  # a core one pixel wide has no slope across
-    matrix = np.moveaxis(np.array(moments), (0, 1), (-2, -1)) + ridge * np.eye(2)
-    plane = np.linalg.solve(matrix, slopes[..., None])[..., 0]
-    height = level + np.sum(plane * (np.stack([x, y], -1) - at), -1)
-    return np.where(total > _NO_CORE, height, np.inf)
-
-
-def _fit_plane(
-    rec: Reconstruction, region: np.ndarray, height: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fit z = a x + b y + c robustly (Tukey's biweight); return (a, b, c) and the misfit of the region's pixels."""
-    z = (rec.height if height is None else height)[region]
-    design = np.stack([rec.x[region], rec.y[region], np.ones(z.size)], -1)
-    weight = np.ones(z.size)
-    for _ in range(_ITERATIONS):
-        root = np.sqrt(weight)[:, None]
-        plane = np.linalg.lstsq(design * root, z * root[:, 0], rcond=None)[0]
-        misfit = z - design @ plane
-        scale = _TUKEY * robust_std(misfit) + 1e-9 * (np.ptp(z) + 1.0)
-        new = np.where(np.abs(misfit) < scale, (1 - np.minimum(np.abs(misfit) / scale, 1.0) ** 2) ** 2, 0.0)
-        if np.allclose(new, weight, atol=1e-6):
-            break
-        weight = new
-    return plane, misfit
-
-
 def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit: np.ndarray) -> np.ndarray:
     """Compute the covariance of a plane's slopes [2, 2] from the posterior's samples, or else from the misfit.
 
@@ -275,7 +230,10 @@ def _slope_std(rec: Reconstruction, core: np.ndarray, plane: np.ndarray, misfit:
     the mean area over which the misfit keeps its sign.
     """
     if rec.height_samples is not None:
-        drawn = np.stack([_fit_plane(rec, core, rec.height + d)[0][:2] - plane[:2] for d in rec.height_samples])
+        n = max(1, _AT_A_TIME // misfit.size)
+        starts = range(0, len(rec.height_samples), n)
+        planes = [fit_planes(rec, core, rec.height + rec.height_samples[i : i + n])[0] for i in starts]
+        drawn = np.concatenate(planes)[:, :2] - plane[:2]
         return drawn.T @ drawn / len(drawn)
     signs = np.zeros(core.shape, int)
     signs[core] = np.where(misfit > 0, 1, 2)
@@ -290,7 +248,7 @@ def _measure(rec: Reconstruction, labels: np.ndarray, number: int, use: np.ndarr
     """Measure one facet."""
     region = labels == number
     core = _core(region)
-    plane, misfit = _fit_plane(rec, core)
+    (plane,), (misfit,) = fit_planes(rec, core, rec.height[None])
     covariance = _slope_std(rec, core, plane, misfit)
     normal = _normal(plane[:2])
     cell = pitch(rec.raster_x) * pitch(rec.raster_y)

@@ -9,6 +9,7 @@ import pytest
 
 from helio_jax.errors import SceneError
 from helio_jax.measure.facets import find_facets
+from helio_jax.measure.planes import fit_planes
 from helio_jax.workflows.measure import Wanted, measure_height_map, reconstructed_area
 from tests.height_maps import PITCH, make_rec
 
@@ -50,6 +51,39 @@ def test_angles_of_a_truncated_octahedron(noise, limit):
         if edge.n_profiles >= 5:
             assert abs(edge.profile_angle_deg - exact) < 2 * limit, (edge, exact)
     assert kinds == {"top": 4, "side": 4, "foot": 4}
+
+
+def test_planes_by_least_squares_and_without_outliers():
+    """Several surfaces at a time, each as if alone; a fifth of the pixels far off changes nothing; far from the origin.
+
+    Catches weights that are shared, and normal equations that lose the digits of coordinates of centimetres.
+    """
+    rec = make_rec(lambda x, y: 0.3 * x - 0.2 * y + 7.0)
+    rec = replace(rec, raster_x=rec.raster_x + 4e4, raster_y=rec.raster_y - 1e4)
+    rng = np.random.default_rng(2)
+    region = rng.random(rec.height.shape) < 0.5
+    noise = rng.standard_normal(rec.height.shape)
+    plane = 0.3 * rec.x - 0.2 * rec.y + 7.0
+    far = np.where(rng.random(rec.height.shape) < 0.2, plane + 500.0, plane)
+    planes, misfit = fit_planes(rec, region, np.stack([plane, plane + noise, far]))
+    np.testing.assert_allclose(planes[[0, 2]], [[0.3, -0.2, 7.0]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(planes[1], fit_planes(rec, region, (plane + noise)[None])[0][0], rtol=1e-6)
+    design = np.stack([rec.x[region], rec.y[region], np.ones(region.sum())], -1)
+    plain = np.linalg.lstsq(design, (plane + noise)[region], rcond=None)[0]
+    std = 1.0 / np.sqrt(region.sum()) / rec.raster_x.std()
+    assert np.abs(planes[1] - plain)[:2].max() < std  # the biweight deviates from least squares by 0.23 of it
+    assert misfit.shape == (3, region.sum()) and np.abs(misfit[2]).max() == pytest.approx(500.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("along", ["x", "y", "diagonal"])
+def test_a_line_of_pixels_has_no_slope_across(along):
+    """Its slope along is right; across it is 0, not the ratio of two rounding errors."""
+    rec = make_rec(lambda x, y: 0.3 * x + 0.3 * y)
+    region = np.zeros(rec.height.shape, bool)
+    region[{"x": (10, slice(5, 25)), "y": (slice(5, 25), 10), "diagonal": (np.arange(20), np.arange(20))}[along]] = True
+    (plane,), _ = fit_planes(rec, region, rec.height[None])
+    expected = {"x": (0.3, 0.0), "y": (0.0, 0.3), "diagonal": (0.3, 0.3)}[along]
+    np.testing.assert_allclose(plane[:2], expected, atol=1e-6)
 
 
 def test_sides_and_area_of_the_top_face():
