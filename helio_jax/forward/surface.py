@@ -17,7 +17,7 @@ from helio_jax.forward.optics import Raster
 
 MIN_FACING = 0.02
 """Smallest -n . u / cos t that a measured normal may have; below, the slope would be beyond the grazing limit."""
-SMOOTH_CHANGE = 0.1
+SMOOTH_CHANGE = 0.2
 """Change of slope e from pixel to pixel up to which `surface_of_heights` takes a surface as smooth."""
 _LINE_PENALTY = 1.0
 """Change of slope from which it prefers the line to the next pixel to a parabola through three pixels."""

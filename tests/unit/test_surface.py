@@ -21,7 +21,7 @@ def slopes(height):
 
 
 def test_shoulders_of_a_steep_hill():
-    """Within 0.06 on a Gaussian of 2.75 pixels' width that is 0.8 steep.
+    """Within 0.04 on a Gaussian of 2.75 pixels' width that is 0.8 steep.
 
     A limiter between the two one-sided differences takes the flatter one at the shoulders: up to 0.3 too flat.
     """
@@ -29,7 +29,7 @@ def test_shoulders_of_a_steep_hill():
     height = top * np.exp(-0.5 * (GX**2 + (GY + 50) ** 2) / w**2)
     true = np.stack([-GX, -GY - 50]) / w**2 * height
     assert np.abs(true).max() > 0.8
-    assert np.abs(slopes(height) - true).max() < 0.06
+    assert np.abs(slopes(height) - true).max() < 0.04
 
 
 def test_fourth_order():
@@ -46,16 +46,16 @@ def test_fourth_order():
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 @pytest.mark.parametrize("width", [2, 3, 100])
 def test_steps_and_slots(width, tilt):
-    """Each side of a depth jump keeps its own slope, in a slot two pixels wide, too."""
+    """Each side of a depth jump of 6 pixels keeps its own slope, to 0.06 also in a slot two pixels wide."""
     inside = np.abs(GX - 5.0 - 0.5 * width * STEP) < 0.5 * width * STEP
     found = slopes(tilt * GX - 60.0 * inside)
-    np.testing.assert_allclose(found[0], tilt, atol=0.05)
+    np.testing.assert_allclose(found[0], tilt, atol=0.06 if width == 2 else 1e-3)
     np.testing.assert_allclose(found[1], 0.0, atol=1e-9)
 
 
 def test_ridge():
     """Two flanks that meet between pixels: each pixel has the slope of its flank."""
-    np.testing.assert_allclose(slopes(-np.abs(GX - 3.0))[0], -np.sign(GX - 3.0), atol=2e-3)
+    np.testing.assert_allclose(slopes(-np.abs(GX - 3.0))[0], -np.sign(GX - 3.0), atol=0.02)
 
 
 def test_border_and_small_rasters():
