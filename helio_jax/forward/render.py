@@ -179,7 +179,9 @@ def _corrections_by(surface: Surface, optics: Optics, raster: Raster, plan: Plan
 
 
 @eqx.filter_jit
-def _rendered(surface, optics, raster, readout, corrections, albedo, law, horizons, kind: str, n_slices: int):
+def _rendered(
+    surface, optics, raster, readout, corrections, albedo, law, horizons, kind: str, n_slices: int
+) -> jax.Array:
     dtype = jnp.asarray(surface.height).dtype
     given, plan = (corrections, None) if isinstance(corrections, Corrections) else (None, corrections)
 

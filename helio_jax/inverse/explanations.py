@@ -594,7 +594,11 @@ class _Fits:
         return start
 
     def from_albedo_patches(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
-        """Fit with the albedos of patches that a fit does not explain; None where there are none."""
+        """Fit with the albedos of patches that a fit does not explain; None where there are none.
+
+        Objects and pits that leave something unexplained may be what a patch looked like: a fit without them is tried,
+        too, and the better of the two returned.
+        """
         if not self.settings.refine.albedo_patches:
             return None
         patches = self.albedo_search.patches
@@ -605,7 +609,18 @@ class _Fits:
         if not best.has_levels and self.given is None:
             return self.from_steps(patches)
         surface, problem = best.fit.state.surface, best.fit.problem  # levels that were found hold here, too
-        return best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
+        found = best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
+        if best.number is None or found.fit.is_interrupted:
+            return found
+        try:
+            without = self.from_steps(patches)
+        except PredictionError as e:
+            self.say(f"patches without objects are given up: {e}")
+            return found
+        except KeyboardInterrupt:
+            return found._replace(fit=interrupted(found.fit, OTHER_TRIED))
+        both = [(self.traced_misfit(one.fit), one) for one in (found, without)]
+        return self._best_of(both, without.fit.is_interrupted)
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit gains or offsets that are not what is stated; None where no such fit explains more.

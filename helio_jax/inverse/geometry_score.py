@@ -75,7 +75,8 @@ def _of_geometry(fit: Fit) -> tuple[str, ...]:
     if score is None:
         return ()
     if not fit.is_geometry_fitted:
-        held = "" if fit.posterior is None else ", but the error bars hold what it would change"
+        is_held = fit.posterior is not None and fit.instrument_change is score.height_change
+        held = ", but the error bars hold what it would change" if is_held else ""
         return (DOUBTFUL.format(named=largest_changes(score.values), held=held),)
     if fit.posterior is None:
         return (FITTED.format(named=f"{largest_changes(score.values)}, an estimate from before the fit"),)

@@ -1,12 +1,17 @@
 """A dark substrate, which the flat border shows, and dark patches: of few pixels, and with background in one image."""
 
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import helio_jax as hx
+from helio_jax.errors import PredictionError
 from helio_jax.forward.form_factor import substrate_signal
+from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
-from helio_jax.inverse.explanations import MIN_CONTRADICTED, NARROW, _Fits, share_of_areas
+from helio_jax.inverse.explanations import MIN_CONTRADICTED, NARROW, OTHER_TRIED, Explanation, _Fits, share_of_areas
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
@@ -84,3 +89,49 @@ def test_a_patch_is_found_with_background_in_one_image(bshem):
     albedo = found.albedo / np.median(found.albedo)
     assert len(found.objects) == 1 and np.mean((albedo < 0.8) != is_patch) < 0.01
     assert np.median(albedo[is_patch]) == pytest.approx(0.6, abs=0.1)
+
+
+@dataclass(frozen=True)
+class Known:
+    """A fit of a known misfit."""
+
+    misfit: float
+    is_interrupted: bool = False
+    status: str = ""
+    state: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(surface=None))
+    problem: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(region=np.ones((2, 2), int), anchors=None))
+
+
+@pytest.mark.parametrize(
+    ("number", "without", "kept"),
+    [
+        (np.ones((2, 2), int), 40.0, 40.0),
+        (np.ones((2, 2), int), 60.0, 50.0),
+        (np.ones((2, 2), int), PredictionError("too steep"), 50.0),
+        (np.ones((2, 2), int), KeyboardInterrupt(), 50.0),
+        (None, 40.0, 50.0),
+    ],
+)
+def test_patches_are_fitted_without_objects_too(monkeypatch, number, without, kept):
+    """Objects that leave something unexplained may be a patch: a hill with one became an object three times as high.
+
+    Levels that are no objects stay; what cannot be predicted, or is interrupted, loses nothing.
+    """
+    is_undecided = np.zeros((2, 2), bool)
+
+    def from_steps(self, patches):
+        if isinstance(without, BaseException):
+            raise without
+        return Explanation(Known(without), is_undecided)
+
+    patches = AlbedoPatches(np.array([[0, 1], [0, 0]]), np.log([0.7]))
+    monkeypatch.setattr(_Fits, "albedo_search", SimpleNamespace(patches=patches))
+    monkeypatch.setattr(_Fits, "is_strained", lambda self, fit: True)
+    monkeypatch.setattr(_Fits, "traced_misfit", lambda self, fit: fit.misfit)
+    monkeypatch.setattr(_Fits, "fitted", lambda self, *args: Known(50.0))
+    monkeypatch.setattr(_Fits, "from_steps", from_steps)
+    found = _Fits(None, ReconstructSettings(), None, None).from_albedo_patches(
+        Explanation(Known(100.0), is_undecided, number), np.zeros((3, 2, 2))
+    )
+    assert found.fit.misfit == kept and (found.number is None) == (number is None or kept == 40.0)
+    assert (OTHER_TRIED in found.fit.status) == isinstance(without, KeyboardInterrupt)
