@@ -124,8 +124,11 @@ def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | Non
     Along each axis the slope is a weighted mean of the slopes of the three parabolas through a pixel and two of its
     neighbours. On smooth surfaces the weights 1/6, 4/6, 1/6 make it the central difference of fourth order. Divided
     by (e^2 + c^2)^2, with c the change of slope along the parabola, they leave out what crosses a kink or a depth
-    jump. Where all three cross one, as in a slot two pixels wide, the line to the flatter neighbour remains. Only on
-    a feature one pixel wide the slope is meaningless: where slopes or normals are known, make the `Surface` from them.
+    jump. Where all three cross one, as in a slot two pixels wide, the line to the flatter neighbour remains.
+
+    Valid to 0.04 in slope on a Gaussian hill 0.8 steep whose standard deviation is 2.75 pixels, to 0.12 where it is 2;
+    to 0.1 beside kinks and steps of less than half a pixel, which look like curvature. On a feature one pixel
+    wide the slope is meaningless. Where slopes or normals are known, make the `Surface` from them.
 
     Args:
         height: above the substrate [y, x], um.

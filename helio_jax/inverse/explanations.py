@@ -614,12 +614,12 @@ class _Fits:
             return found
         try:
             without = self.from_steps(patches)
+            both = [(self.traced_misfit(one.fit), one) for one in (found, without)]
         except PredictionError as e:
-            self.say(f"patches without objects are given up: {e}")
+            self.say(f"patches without objects or pits are given up: {e}")
             return found
         except KeyboardInterrupt:
             return found._replace(fit=interrupted(found.fit, OTHER_TRIED))
-        both = [(self.traced_misfit(one.fit), one) for one in (found, without)]
         return self._best_of(both, without.fit.is_interrupted)
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:

@@ -29,6 +29,7 @@ from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographSet, MicrographStack
 from helio_jax.workflows.next_scan import _joint, _like
 from helio_jax.workflows.several_scans import JoinedScans
+from tests.predictions import nothing_traced
 
 SIDE = 25
 PITCH = 40.0
@@ -41,10 +42,6 @@ def hill_and_raster() -> tuple[np.ndarray, Raster]:
     gx, gy = np.meshgrid(x - x.mean(), x - x.mean())
     height = 150.0 * np.exp(-((gx + 120.0) ** 2 + gy**2) / 2 / 110.0**2)
     return height - 90.0 * np.exp(-((gx - 180.0) ** 2 + (gy - 120.0) ** 2) / 2 / 90.0**2), Raster(x=x, y=x)
-
-
-def nothing_traced(height, normals, *_, **__) -> Corrections:
-    return Corrections.none((3, *height.shape))
 
 
 def recorded(instrument: hx.Instrument, truth: hx.Instrument, seed: int) -> MicrographStack:

@@ -15,6 +15,7 @@ from helio_jax.inverse.explanations import MIN_CONTRADICTED, NARROW, OTHER_TRIED
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.micrograph import MicrographStack
+from tests.predictions import nothing_traced
 
 N, ATOMS, SNR = 25, 1e6, 60.0
 ALBEDO = 0.8
@@ -59,10 +60,6 @@ def patched(bshem, background=0.0):
     counts[1] += background * np.median(counts[1])
     stack = MicrographStack(counts, x, x, bshem, variance=np.maximum(counts, 1.0), n_rays=ATOMS, noise="poisson")
     return height, is_patch, stack
-
-
-def nothing_traced(height, normals, *_, **__):
-    return hx.Corrections.none((3, *height.shape))
 
 
 def test_a_round_area_is_an_area():

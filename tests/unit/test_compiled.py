@@ -1,4 +1,7 @@
-"""Where compiled code is kept: the user's cache, unless he says otherwise or it cannot be written to."""
+"""Where compiled code is kept: the user's cache, unless he says otherwise or it cannot be written to.
+
+And that it can be: JAX keeps no program that calls the host.
+"""
 
 import os
 import subprocess
