@@ -206,8 +206,9 @@ def expect_errors(case: Case, optics: Optics, is_smooth: Any = False) -> Expecta
     Args:
         case: from `pose_case`.
         optics: JAX arrays in float64.
-        is_smooth: the fit takes the median over all data for the noise of slopes; where detectors exchange their ranks
-            its gradient jumps, which ends a search too early. True: the geometric mean of the detectors' medians.
+        is_smooth: the fit takes the median over all data for the noise of slopes, and of each detector for the priors;
+            where pixels or detectors exchange their ranks the gradient jumps, which ends a search too early. True:
+            interquartile means of the pixels, for the noise their geometric mean over the detectors.
 
     Source: Cramer-Rao bound as in `posterior.sample_posterior`, whose sandwich it takes in closed form:
         White, Econometrica 48 (1980) 817.
@@ -349,9 +350,9 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
     signal = single_scattering(factors.terms[0], normal)
     visible = dose * jnp.maximum(signal, 0.0)
     variance = jnp.maximum(visible + case.background[:, None, None], 1.0) / dose**2
-    median = jnp.median(signal, axis=(1, 2))
+    median = jnp.where(is_smooth, _interquartile_mean(signal), jnp.median(signal, axis=(1, 2)))
     relative = variance / median[:, None, None] ** 2
-    smoothed = jnp.exp(jnp.mean(jnp.log(jnp.median(relative, axis=(1, 2)))))
+    smoothed = jnp.exp(jnp.mean(jnp.log(_interquartile_mean(relative))))
     noise = jnp.clip(jnp.sqrt(jnp.where(is_smooth, smoothed, jnp.median(relative))), 1e-3, 1.0)
     hidden = single_scattering(masked, normal)
     assumed = (s.mask_error * hidden) ** 2 + (0.5 * _largest_change(hidden)) ** 2
@@ -378,6 +379,13 @@ def _terms_at(case: Case, optics: Optics, is_smooth: Any) -> _Terms:
     own = factors.terms[0] + masked
     of_aperture = jnp.sum(masked * own, 1) / jnp.sum(own**2, 1)
     return _Terms(fixed, share, NOISE_FLOOR * noise, jnp.mean(of_aperture), jnp.mean(jnp.sum(visible, 0)))
+
+
+def _interquartile_mean(image: jax.Array) -> jax.Array:
+    """Compute the mean of the middle half of every image's pixels [detector]."""
+    ordered = jnp.sort(image.reshape(len(image), -1), 1)
+    quarter = ordered.shape[1] // 4
+    return jnp.mean(ordered[:, quarter : ordered.shape[1] - quarter], 1)
 
 
 def _edges_at(case: Case, noise: Any) -> Edges:
