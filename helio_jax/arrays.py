@@ -78,6 +78,13 @@ def robust_std(residuals: np.ndarray, axes: tuple[int, ...] | None = None) -> np
     return _STD_OVER_MEDIAN * np.nanmedian(np.abs(residuals), axis=axes, keepdims=axes is not None)
 
 
+def typical_signal(image: np.ndarray) -> float:
+    """Return the median of an image's finite values [y, x]; the mean where that is not positive, else 1."""
+    known = image[np.isfinite(image)]
+    of_size = (float(f(known)) for f in (np.median, np.mean) if known.size)
+    return next((size for size in of_size if size > 0.0), 1.0)
+
+
 def pitch(axis: np.ndarray) -> float:
     """Return the pitch of a regular axis [um]; 1 um for a single position."""
     return float((axis[-1] - axis[0]) / (axis.size - 1)) if axis.size > 1 else 1.0

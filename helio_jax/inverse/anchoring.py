@@ -8,6 +8,7 @@ where they are better held (`explanations`), and one fit tells what the heights 
 first order: the data are tested on the heights as moved (`verdict`).
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -251,6 +252,12 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
         ),
         parameters=parameters,
     )
+
+    def brought(changes: np.ndarray) -> np.ndarray:
+        """Bring changes of the heights, which the posterior contains, to the anchors [change, y, x]."""
+        moves = changes.reshape(len(changes), -1) @ weight.T @ inverse @ heights
+        return changes - moves.reshape(changes.shape)
+
     drawn = posterior.samples.reshape(len(posterior.samples), -1)
     # other numbers than those of the posterior (seed 0) and of its common modes (1, 2, ...)
     drawn_off = drawn @ weight.T + np.random.default_rng([0, 1]).standard_normal((len(drawn), n))
@@ -260,12 +267,23 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
         samples=(drawn - drawn_off @ inverse @ heights).reshape(posterior.samples.shape),
         instrument_samples=posterior.instrument_samples - drawn_off @ inverse @ instrument,
         instrument_covariance=(ways * np.maximum(of_instrument, 1e-6)) @ ways.T,
-        common_modes=modes - np.einsum("ae,ab,byx->eyx", by_modes, inverse, heights.reshape(n, *shape)),
+        common_modes=brought(modes),
     )
     if is_wrong.any():  # either the anchor is wrong, or all else
         change = of_all if (is_wrong & is_used).any() else of_all - answer
         conditioned = conditioned.with_common_mode((change @ heights).reshape(shape))
-    return Anchored(at_state(fit, moved, conditioned), checks, anchors.taken(is_used))
+    found = with_brought_changes(at_state(fit, moved, conditioned), lambda change: brought(change[None])[0])
+    return Anchored(found, checks, anchors.taken(is_used))
+
+
+def with_brought_changes(fit: Fit, brought: Callable[[np.ndarray], np.ndarray]) -> Fit:
+    """Bring to the anchors what another instrument would change of the heights (`Fit.instrument_change`), too."""
+    score, rival = fit.geometry_score, fit.rival_change
+    return replace(
+        fit,
+        geometry_score=score and replace(score, height_change=brought(score.height_change)),
+        rival_change=None if rival is None else brought(rival),
+    )
 
 
 def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:

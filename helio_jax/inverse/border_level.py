@@ -30,7 +30,11 @@ def border_signal(optics: Optics, law: LawPrior | None = None) -> np.ndarray:
 
 
 def border_levels(
-    signal: np.ndarray, optics: Optics, settings: ReconstructSettings, law: LawPrior | None = None
+    signal: np.ndarray,
+    optics: Optics,
+    settings: ReconstructSettings,
+    law: LawPrior | None = None,
+    is_albedo_known: bool = True,
 ) -> np.ndarray:
     """Compute the level of a flat border's signal over that of the level substrate [detector].
 
@@ -42,17 +46,17 @@ def border_levels(
         optics: as stated.
         settings: width and kind of the border.
         law: whose mean the substrate scatters by; None: the cosine law.
+        is_albedo_known: whether `signal` is that of albedo 1; if not, levels are relative to their geometric mean.
     """
     none = np.ones(len(signal))
     if settings.border != "flat":
         return none
     of_border = signal[:, border_mask(signal.shape[1:], settings.border_fraction)]  # type: ignore[arg-type]
     expected = border_signal(optics, law)
-    found = none.copy()
-    for i, data in enumerate(of_border):
-        known = data[np.isfinite(data)]
-        if known.size:
-            found[i] = np.clip(np.median(known) / expected[i], 1.0 / MOST, MOST)
+    found, is_known = none.copy(), np.isfinite(of_border).any(1)
+    found[is_known] = np.clip(np.nanmedian(of_border[is_known], axis=1) / expected[is_known], 1.0 / MOST, MOST)
+    if is_known.any() and not is_albedo_known:
+        found[is_known] /= np.exp(np.mean(np.log(found[is_known])))
     return found if np.abs(found - 1.0).max() > OFF else none
 
 
@@ -68,11 +72,9 @@ def levelled_signal(
         stack: micrographs.
         settings: width and kind of the border.
         patches: of other albedos, which the signal of the border is divided by.
-        is_albedo_known: whether the border has albedo 1 apart from `patches`; if not, the detectors are brought to one
-            level, their mean (of logarithms).
+        is_albedo_known: as in `border_levels`, apart from `patches`; if not, the detectors are brought to one level.
     """
     signal, variance = signal_of(stack)
     of_sample = signal if patches is None else signal / patches.albedo
-    level = border_levels(of_sample, Optics.of(stack.instrument), settings)
-    level = level if is_albedo_known else level / np.exp(np.mean(np.log(level)))
+    level = border_levels(of_sample, Optics.of(stack.instrument), settings, is_albedo_known=is_albedo_known)
     return signal / level[:, None, None], variance / level[:, None, None] ** 2

@@ -10,7 +10,7 @@ ask for one (`instrument_choice`). A level that explains the images about as wel
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
@@ -53,7 +53,7 @@ from helio_jax.inverse.measured_steps import (
     off_ground,
     walls_of,
 )
-from helio_jax.inverse.objects import find_objects
+from helio_jax.inverse.objects import Objects, find_objects
 from helio_jax.inverse.parameters import HELD, Parameters
 from helio_jax.inverse.photometric_start import start_of_free_albedo, start_of_known_albedo
 from helio_jax.inverse.pits import PitSearch
@@ -83,7 +83,7 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 NARROW = 5
 """Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels].
-An area holds a disc of this width: a patch is as often round as square."""
+An area holds a disc of this width, of whole pixels: a patch is as often round as square. Aslant, strips of 4.3 do."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MORE_CONTRADICTED = 1.05
@@ -187,9 +187,7 @@ def explain(
             if other == fits.from_objects and found.number is not None:
                 still &= ~beside_outlines(found.number)
             is_less = still.mean() < most
-            gained = improvement(residuals, rest)
-            if fits.weighs_instrument:
-                gained += instrument_improvement(best.fit, found.fit)
+            gained = improvement(residuals, rest) + fits.instrument_improvement(best.fit, found.fit)
             if is_less and gained > GAIN:
                 best, residuals = found, rest
         except PredictionError as e:
@@ -378,6 +376,10 @@ class _Fits:
         """
         return self.settings.border == "flat"
 
+    def instrument_improvement(self, fit: Fit, other: Fit) -> float:
+        """Compute by how much another fit is nearer to what is stated of the instrument, in half chi-square."""
+        return instrument_improvement(fit, other) if self.weighs_instrument else 0.0
+
     def is_strained(self, fit: Fit) -> bool:
         """Whether the instrument speaks against a fit."""
         return self.weighs_instrument and is_strained(fit.parameters, fit.problem.held)
@@ -531,28 +533,48 @@ class _Fits:
             lambda surface: self.misfit(surface, none),
             self.say,
         )
+
+        def fitted(objects: Objects) -> Explanation | None:
+            start = self.promising(objects.surface(surface), best)
+            if start is None:
+                return None
+            fit = self.fitted(start, smoothed, none, objects.number)
+            return Explanation(fit, np.zeros(self.stack.shape[1:], bool), objects.number, "objects on")
+
+        return self.best_of((partial(fitted, objects) for objects in found), best, "outlines")
+
+    def best_of(
+        self, attempts: Iterable[Callable[[], Explanation | None]], before: Explanation, what: str
+    ) -> Explanation | None:
+        """Try several explanations of one kind, and return the best; None where none can be fitted.
+
+        Compared by their misfits, with a flat border by what is known of the instrument, too, as in `explain`.
+        Interrupted, it returns the best so far, marked so; nothing is lost but the attempts that follow.
+
+        Args:
+            attempts: each makes one; it may fail (`PredictionError`).
+            before: the best explanation of other kinds.
+            what: name of what an attempt starts from, plural, for the report.
+        """
         fits: list[tuple[float, Explanation]] = []
-        for objects in found:
+        is_interrupted = False
+        for attempt in attempts:
             try:
-                start = self.promising(objects.surface(surface), best)
-                if start is not None:
-                    fit = self.fitted(start, smoothed, none, objects.number)
-                    is_undecided = np.zeros(self.stack.shape[1:], bool)
-                    explained = Explanation(fit, is_undecided, objects.number, "objects on")
-                    fits.append((self.traced_misfit(fit), explained))
-                    if fit.is_interrupted:
-                        break
+                if (found := attempt()) is None:
+                    continue
+                misfit = self.traced_misfit(found.fit) - self.instrument_improvement(before.fit, found.fit)
+                fits.append((misfit, found))
+                is_interrupted = found.fit.is_interrupted
             except PredictionError as e:
-                self.say(f"these outlines are given up: {e}")
+                self.say(f"these {what} are given up: {e}")
             except KeyboardInterrupt:
                 if not fits:
                     raise
-                return self._best_of(fits, is_interrupted=True)
-        return self._best_of(fits, any(one.fit.is_interrupted for _, one in fits)) if fits else None
-
-    @staticmethod
-    def _best_of(fits: list[tuple[float, Explanation]], is_interrupted: bool) -> Explanation:
-        """Return the explanation with the least misfit, marked where the search for it was interrupted."""
+                is_interrupted = True
+            if is_interrupted:
+                break
+        if not fits:
+            return None
         best = min(fits, key=lambda one: one[0])[1]
         return best._replace(fit=interrupted(best.fit, OTHER_TRIED)) if is_interrupted else best
 
@@ -609,18 +631,13 @@ class _Fits:
         if not best.has_levels and self.given is None:
             return self.from_steps(patches)
         surface, problem = best.fit.state.surface, best.fit.problem  # levels that were found hold here, too
-        found = best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
-        if best.number is None or found.fit.is_interrupted:
-            return found
-        try:
-            without = self.from_steps(patches)
-            both = [(self.traced_misfit(one.fit), one) for one in (found, without)]
-        except PredictionError as e:
-            self.say(f"patches without objects or pits are given up: {e}")
-            return found
-        except KeyboardInterrupt:
-            return found._replace(fit=interrupted(found.fit, OTHER_TRIED))
-        return self._best_of(both, without.fit.is_interrupted)
+
+        def kept() -> Explanation:
+            return best._replace(fit=self.fitted(surface, surface, patches, problem.region, problem.anchors))
+
+        if best.number is None:
+            return kept()
+        return self.best_of((kept, lambda: self.from_steps(patches)), best, "patches")
 
     def from_wider_readout(self, best: Explanation, residuals: np.ndarray, /) -> Explanation | None:
         """Fit gains or offsets that are not what is stated; None where no such fit explains more.

@@ -59,15 +59,16 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
 
 
 def _of_rival(fit: Fit) -> tuple[str, ...]:
-    """Warn of another instrument; not where the error bars are wider than the heights differ without it, too."""
+    """Warn of another instrument; not where the error bars are wider than the heights differ most without it, too."""
     rival, contained = fit.rival_change, ""
     if rival is None:
         return ()
+    at = np.unravel_index(np.argmax(np.abs(rival)), rival.shape)
     if fit.posterior is not None:
-        if fit.instrument_change is not rival or not np.any(2.0 * rival**2 > fit.posterior.height_std**2):
+        if fit.instrument_change is not rival or 2.0 * rival[at] ** 2 <= fit.posterior.height_std[at] ** 2:
             return ()
         contained = "; the error bars contain the difference"
-    return (RIVAL.format(most=float(np.abs(rival).max()), contained=contained),)
+    return (RIVAL.format(most=abs(float(rival[at])), contained=contained),)
 
 
 def _of_geometry(fit: Fit) -> tuple[str, ...]:

@@ -87,7 +87,8 @@ def reconstruct_stack(
         start: heights that `refine` starts from [y, x], um; default: the photometric solution.
 
     Raises:
-        GuardError: fewer than 3 images, no pixel recorded in 3 of them, or a height that is not finite.
+        GuardError: fewer than 3 images, no pixel recorded in 3 of them, a detector that counted nothing, or a height
+            that is not finite.
     """
     n_usable = stack.is_observed.sum(0)
     if stack.shape[0] < MIN_IMAGES or not (n_usable >= MIN_IMAGES).any():
@@ -95,6 +96,12 @@ def reconstruct_stack(
             f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
+    for name, counts in zip(stack.instrument.detector_names, stack.counts, strict=True):
+        if np.isfinite(counts).any() and not np.nan_to_num(counts).any():
+            raise GuardError(
+                f"detector {name!r} counted 0 in every pixel: if it was off, leave its image out or set it to NaN, "
+                "which stands for pixels without data"
+            )
     if settings.method == "refine":
         result, misfit_of, anchors, region, off_substrate = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from helio_jax.arrays import border_mask
+from helio_jax.arrays import border_mask, typical_signal
 from helio_jax.forward.laws import Law
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
@@ -52,7 +52,8 @@ class FitProblem:
         anchors: what is known of the heights.
         region: number of the plateau of every pixel, whose masks are to follow their levels, 0: none [y, x].
         drift_modes: shapes of the slow drift [detector or 1, mode, y, x].
-        median_signal: of every detector, 1 without data [detector].
+        median_signal: of every detector; the mean where more than half of its pixels have no counts, 1 without data
+            [detector].
         slope_noise: typical standard deviation of the slopes of one pixel.
         patches: parts of the surface of other albedo, which is unknown.
         parallax: how the signal changes per um that the surface is higher than `parallax_height` [detector, y, x], 0
@@ -127,8 +128,7 @@ class FitProblem:
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
         modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
-        observed = [d[np.isfinite(d)] for d in signal]
-        median = np.array([np.median(d) if d.size else 1.0 for d in observed])
+        median = np.array([typical_signal(image) for image in signal])
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
             signal, variance, optics, math.radians(stated.tilt_deg), stated.discrepancy, geometry, raster, settings,
@@ -275,7 +275,7 @@ class FitProblem:
         of_sample = self.signal / self.patches.albedo
         level = border_levels(of_sample, self.optics, self.reconstruct_settings, self.law_prior)
         gain_std, expected = self.settings.gain_std, border_signal(self.optics, self.law_prior)
-        offset_std = self.priors.offset / expected  # 0 where more than half of the pixels have no counts
+        offset_std = self.priors.offset / expected
         offset = (level - 1.0) * offset_std / (offset_std**2 + gain_std**2)
         log_gain = np.log(level - offset_std * offset) / gain_std
         return self.stated_parameters().replaced(log_gain=log_gain, offset=offset)

@@ -31,7 +31,7 @@ def small_scene(tmp_path_factory) -> Path:
     text = text.replace("nx = 121", "nx = 21").replace("ny = 121", "ny = 21")
     text = text.replace("pixel_size_um = 30.0", "pixel_size_um = 170.0")
     path = tmp_path_factory.mktemp("scene") / "small.toml"
-    text = text.replace("[reconstruct.refine]", "[reconstruct.refine]\nmax_rounds = 1")
+    text = text.replace("[reconstruct.refine]", "[reconstruct.refine]\nmax_rounds = 1\nrays = 100_000")
     path.write_text(text.replace('method = "refine"', 'method = "nearfield"'))
     return path
 

@@ -38,6 +38,19 @@ def test_levels_are_those_of_the_border(bshem):
     np.testing.assert_allclose(border_levels(by_law, optics, settings, law), (1.0, 1.2, 0.9), rtol=1e-6)
 
 
+def test_levels_relative_to_an_unknown_albedo(bshem):
+    """Of a dark substrate: their mean is 1, and a detector without data on the border, of which nothing is known, is
+    left as it is. Catches a mean that counts it as measured."""
+    optics, settings = Optics.of(bshem), ReconstructSettings()
+    signal = signal_of(bshem, (0.7, 0.7 * 1.2, 0.7 / 1.2))
+    np.testing.assert_allclose(border_levels(signal, optics, settings, is_albedo_known=False), (1.0, 1.2, 1.0 / 1.2))
+    dark = signal_of(bshem, (0.7, 0.7, 0.7))
+    dark[1, :4] = dark[1, -4:] = dark[1, :, :4] = dark[1, :, -4:] = np.nan
+    assert np.array_equal(border_levels(dark, optics, settings, is_albedo_known=False), np.ones(3))
+    dark[0] *= 1.44
+    np.testing.assert_allclose(border_levels(dark, optics, settings, is_albedo_known=False), (1.2, 1.0, 1.0 / 1.2))
+
+
 @pytest.mark.parametrize(("border", "off"), [("flat", 0.9 * OFF), ("free", 0.3)])
 def test_levels_that_may_be_the_samples_count_as_right(bshem, border, off):
     """All within some per cent, as multiple scattering; or a border that is not the substrate."""
@@ -68,11 +81,11 @@ def test_a_fit_starts_where_the_border_is_explained(bshem):
 
 @pytest.mark.parametrize("border", ["flat", "free"])
 def test_a_detector_with_few_counts_has_a_start(bshem, border):
-    """More than half of its pixels have none: its offset is known to 0, and the start is finite."""
+    """More than half of its pixels have none: their mean says how large its offset may be, and the start is finite."""
     signal = signal_of(bshem, (1.0, 1.0, 1.0))
     signal[0] *= np.random.default_rng(1).random(SHAPE) < 0.3
     surface, settings = Surface(*np.zeros((3, *SHAPE))), ReconstructSettings().changed(border=border)
     problem = FitProblem.of(signal, np.full_like(signal, 1e-6), bshem, Raster.regular(SHAPE, 40.0), surface, settings)
-    assert problem.priors.offset[0] == 0.0
+    assert problem.priors.offset[0] == pytest.approx(settings.refine.offset_std * signal[0].mean())
     start = problem.start_parameters()
     assert np.isfinite(start.offset).all() and np.isfinite(start.log_gain).all()

@@ -12,12 +12,15 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.render import Corrections
 from helio_jax.forward.surface import surface_of_heights
 from helio_jax.inverse import explanations, instrument_choice
+from helio_jax.inverse.anchor_settings import AnchorSettings
+from helio_jax.inverse.anchoring import with_anchors
 from helio_jax.inverse.fit import Fit, fit_heights, with_posterior
 from helio_jax.inverse.further_images import with_further_images
 from helio_jax.inverse.geometry_change import LIKELY, largest_changes
 from helio_jax.inverse.geometry_score import (
     USUAL_DEG,
     _log_bayes,
+    geometry_warnings,
     score_geometry,
     surface_misfit,
     usual_uncertainty,
@@ -230,6 +233,23 @@ def test_error_bars_count_one_doubt_once(bshem, factor):
     )
     assert len(both) == len(neither) + 1
     np.testing.assert_array_equal(both[-1], score.height_change if abs(factor) < 1.0 else rival)
+
+
+def test_an_anchor_settles_which_instrument_is_right(bshem):
+    """A known top: the other instrument's heights go through it as well, and nothing is left to warn of.
+
+    Without it the warning names the difference, which the error bars contain.
+    """
+    fit = fitted(bshem, bshem, 0)
+    rival = replace(fit, rival_change=0.6 * fit.surface.height)
+    (warned,) = geometry_warnings(with_anchors(rival).fit)
+    assert f"{0.6 * np.abs(fit.surface.height).max():.3g} um; the error bars contain" in warned
+    x, y = np.meshgrid(fit.problem.raster.x, fit.problem.raster.y)
+    top = np.unravel_index(np.argmax(fit.surface.height), x.shape)
+    known = {"at_um": (float(x[top]), float(y[top])), "height_um": float(fit.surface.height[top]), "std_um": 1.0}
+    settings = fit.problem.reconstruct_settings.changed(anchor=(AnchorSettings(**known, radius_um=20.0),))
+    anchored = with_anchors(replace(rival, problem=replace(fit.problem, reconstruct_settings=settings))).fit
+    assert np.abs(anchored.rival_change[top]) < 2.0 and not geometry_warnings(anchored)
 
 
 def test_misfit_grows_with_data_that_are_far_off(bshem):

@@ -95,6 +95,16 @@ def test_two_images_are_refused(bshem):
         pipeline.reconstruct(MicrographStack(stack.counts[:2], stack.x, stack.y, two, n_rays=1e6), "nearfield")
 
 
+@pytest.mark.parametrize("method", ["linear", "refine"])
+def test_a_detector_that_counted_nothing_is_refused(bshem, method):
+    """A channel that was off is no image of a dark surface: the error names it; catches heights from such data."""
+    stack, _, _ = bump_stack(bshem)
+    counts = stack.counts.copy()
+    counts[1] = 0.0
+    with pytest.raises(GuardError, match=f"detector {bshem.detector_names[1]!r} counted 0 in every pixel"):
+        pipeline.reconstruct(stack.replace(counts=counts, variance=np.ones_like(counts)), method)
+
+
 def test_calibration_undoes_gain_background_and_drift(bshem):
     """Known gain and drift are found from the border; the background from a masked spot with no multiple scattering."""
     stack, _, _ = bump_stack(bshem, amplitude=1e-6)

@@ -90,45 +90,60 @@ def test_a_patch_is_found_with_background_in_one_image(bshem):
 
 @dataclass(frozen=True)
 class Known:
-    """A fit of a known misfit."""
+    """A fit of a known misfit, with an instrument as far from what is stated."""
 
     misfit: float
+    strain: float = 0.0
     is_interrupted: bool = False
     status: str = ""
     state: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(surface=None))
     problem: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(region=np.ones((2, 2), int), anchors=None))
 
 
+TOO_STEEP = PredictionError("too steep")
+OBJECT = np.ones((2, 2), int)
+
+
 @pytest.mark.parametrize(
-    ("number", "without", "kept"),
+    ("number", "with_objects", "without", "kept"),
     [
-        (np.ones((2, 2), int), 40.0, 40.0),
-        (np.ones((2, 2), int), 60.0, 50.0),
-        (np.ones((2, 2), int), PredictionError("too steep"), 50.0),
-        (np.ones((2, 2), int), KeyboardInterrupt(), 50.0),
-        (None, 40.0, 50.0),
+        (OBJECT, Known(50.0), Known(40.0), 40.0),
+        (OBJECT, Known(50.0), Known(60.0), 50.0),
+        (OBJECT, Known(50.0), Known(40.0, strain=20.0), 50.0),
+        (OBJECT, Known(50.0, strain=20.0), Known(60.0), 60.0),
+        (OBJECT, Known(50.0), TOO_STEEP, 50.0),
+        (OBJECT, TOO_STEEP, Known(60.0), 60.0),
+        (OBJECT, TOO_STEEP, TOO_STEEP, None),
+        (OBJECT, Known(50.0), KeyboardInterrupt(), 50.0),
+        (None, Known(50.0), Known(40.0), 50.0),
     ],
 )
-def test_patches_are_fitted_without_objects_too(monkeypatch, number, without, kept):
+def test_patches_are_fitted_without_objects_too(monkeypatch, number, with_objects, without, kept):
     """Objects that leave something unexplained may be a patch: a hill with one became an object three times as high.
 
-    Levels that are no objects stay; what cannot be predicted, or is interrupted, loses nothing.
+    What is known of the instrument counts. Levels that are no objects stay; what cannot be predicted, or is
+    interrupted, loses nothing.
     """
     is_undecided = np.zeros((2, 2), bool)
 
-    def from_steps(self, patches):
-        if isinstance(without, BaseException):
-            raise without
-        return Explanation(Known(without), is_undecided)
+    def given(fit):
+        if isinstance(fit, BaseException):
+            raise fit
+        return fit
 
     patches = AlbedoPatches(np.array([[0, 1], [0, 0]]), np.log([0.7]))
     monkeypatch.setattr(_Fits, "albedo_search", SimpleNamespace(patches=patches))
     monkeypatch.setattr(_Fits, "is_strained", lambda self, fit: True)
     monkeypatch.setattr(_Fits, "traced_misfit", lambda self, fit: fit.misfit)
-    monkeypatch.setattr(_Fits, "fitted", lambda self, *args: Known(50.0))
-    monkeypatch.setattr(_Fits, "from_steps", from_steps)
+    monkeypatch.setattr(_Fits, "instrument_improvement", lambda self, fit, other: fit.strain - other.strain)
+    monkeypatch.setattr(_Fits, "fitted", lambda self, *args: given(with_objects))
+    monkeypatch.setattr(_Fits, "from_steps", lambda self, patches: Explanation(given(without), is_undecided))
     found = _Fits(None, ReconstructSettings(), None, None).from_albedo_patches(
         Explanation(Known(100.0), is_undecided, number), np.zeros((3, 2, 2))
     )
-    assert found.fit.misfit == kept and (found.number is None) == (number is None or kept == 40.0)
+    if kept is None:
+        assert found is None
+        return
+    assert found.fit.misfit == kept
+    assert (found.number is None) == (number is None or found.fit is without)
     assert (OTHER_TRIED in found.fit.status) == isinstance(without, KeyboardInterrupt)

@@ -11,8 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from helio_jax.inverse import settings
+
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = [p for p in sorted((ROOT / "benchmarks").glob("*.py")) if "--tiny" in p.read_text()]
+FEW_PATHS = 100_000
+"""Paths per prediction of multiple scattering: most of the time would go into the three million of a real fit."""
 QUICKEST = ROOT / "benchmarks" / "outline.py"
 
 
@@ -35,6 +39,7 @@ def test_runs_at_tiny_size(script, tmp_path, monkeypatch):
     """
     assert script.read_text().rstrip().endswith('if __name__ == "__main__":\n    main()')
     monkeypatch.syspath_prepend(str(ROOT))
+    monkeypatch.setattr(settings, "LEAST_PATHS", FEW_PATHS)
     monkeypatch.setattr(sys, "argv", [str(script), "--tiny", "--output", str(tmp_path)])
     importlib.import_module(f"benchmarks.{script.stem}").main()
     check_result(tmp_path)
