@@ -6,7 +6,8 @@ the distance of the crest from the rim, r = 0 where the tangent at the rim is ve
 cone or a wall the slope is constant (L and r infinite). Where in its edge a rim lies, and how steep the rim itself is,
 follows to some extent from the slopes of the first pixels within; what they do not tell of r is common to a whole
 outline. An oblique beam shears the sections along its azimuth, and moves the others off the middle: the sides of a dome
-that rise and that fall along the beam then have an r each, and of the sheared sections each direction.
+that rise and that fall along the beam then have an r each, and of the sheared sections each direction. What is not
+known of these is counted as one error, for they are the sections of one dome.
 
 The first pixel outside is level: masks and multiple scattering are not predicted well enough there to tell its slope.
 Rows that leave the image before they reach a crest tell nothing.
@@ -30,7 +31,7 @@ OFFSETS = np.r_[np.arange(0.0, 1.5, 0.05), np.arange(1.5, 3.0, 0.1), 3.0, 3.5, 4
 errors. The last two have no rim: a parabola and, with the crest at infinity, a constant slope."""
 NO_RIM = 0.15
 """Prior probability of the last two together; of the others those of the root of r in equal ranges are alike."""
-VERTICAL = 5.0
+VERTICAL = 20.0
 """A tangent that is vertical at the rim (r = 0), as that of half a ball, is so many times as likely as r near it."""
 _RANGES = np.gradient(np.sqrt(OFFSETS[:-2])) * np.where(OFFSETS[:-2] == 0.0, VERTICAL, 1.0)
 LOG_PRIOR = np.log(np.r_[(1.0 - NO_RIM) * _RANGES / _RANGES.sum(), 0.5 * NO_RIM, 0.5 * NO_RIM])
@@ -73,6 +74,8 @@ ACROSS = 0.05
 HIDING = 0.2, 0.3
 """Where a side falls along an oblique beam and the root of r is below the first number, with a probability above the
 second, its foot may be hidden behind the limb: edges there may be depth jumps and count as no rims."""
+LOW_FOOT = 0.2
+"""No foot that is certainly lower is a depth jump [pixels]."""
 DECISIVE = 0.75
 """Least logarithm of the evidence for a rim against a parabola and a constant slope."""
 
@@ -85,7 +88,7 @@ class AxisRims:
         gap: by how much (height change / pitch) should exceed the mean of the two slopes [edge].
         sigma: standard deviation of it; 0: no rim [edge].
         common: change of it by one standard deviation of what is common to its outline [edge].
-        outline: number of the outline, or of a side of it that has an r of its own; 0: no rim [edge].
+        outline: number of the outline, whose sides err alike; 0: no rim [edge].
     """
 
     gap: np.ndarray
@@ -238,6 +241,7 @@ class _Candidates(NamedTuple):
         outer: slope of the first pixel outside.
         beyond: size of the slope of the second pixel outside, over the largest of level pixels.
         falls: whether the first pixel within falls along the beam.
+        shear: of the beam along the slope there, over the cosine of the slope's angle to the axis.
     """
 
     y: np.ndarray
@@ -248,6 +252,7 @@ class _Candidates(NamedTuple):
     outer: np.ndarray
     beyond: np.ndarray
     falls: np.ndarray
+    shear: np.ndarray
 
     def only(self, which: np.ndarray) -> "_Candidates":
         """Keep some of them [candidate]."""
@@ -270,7 +275,7 @@ def find_rims(
     size, along = math.hypot(*shift), shift[0] * slopes[0] + shift[1] * slopes[1]
     falls = (along < -ACROSS * size * steep) & (size > LEAST_SHEAR)
     ways = [(axis, sign) for axis in (1, 0) for sign in (1, -1)]
-    found = {way: _candidates(slopes[1 - way[0]], steep, std, falls, *way) for way in ways}
+    found = {way: _candidates(slopes[1 - way[0]], steep, std, along, falls, *way) for way in ways}
     out = {axis: AxisRims.none(np.diff(steep, axis=axis).shape) for axis in (1, 0)}
     numbers = _outlines(found, steep.shape)
     is_sheared = {1: abs(shift[0]) > LEAST_SHEAR, 0: abs(shift[1]) > LEAST_SHEAR}
@@ -286,15 +291,15 @@ def find_rims(
             parts = {way: mine[way].only(mine[way].falls == is_falling) for way in group}
             sides.append({way: part for way, part in parts.items() if len(part.y)})
         outlines.append([side for side in sides if side])
-    n_sides, beside = 0, _rises_of([side for sides in outlines for side in sides])
+    n_outlines, beside = 0, _rises_of([side for sides in outlines for side in sides])
     for sides in outlines:
         judged = [_Side.of(side, next(beside)) for side in sides]
         if sum(side.gain for side in judged) < DECISIVE:
             continue
+        n_outlines += 1
         for side in judged:
             if not side.may_hide_its_foot:
-                n_sides += 1
-                side.set_edges(out, n_sides)
+                side.set_edges(out, n_outlines)
     return out[1], out[0]
 
 
@@ -372,10 +377,14 @@ class _Side(NamedTuple):
 
     @property
     def may_hide_its_foot(self) -> bool:
-        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen."""
+        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen.
+
+        A vertical tangent sheared by k hides 2 c^2 k behind the limb; c follows from the second slope.
+        """
         root, probability = HIDING
         is_steep = self.probability[np.sqrt(OFFSETS) < root].sum() > probability
-        return bool(is_steep and all(c.falls.all() for c in self.mine.values()))
+        foot = np.concatenate([2.0 * 1.5 * c.slope[:, 1] ** 2 * np.abs(c.shear) for c in self.mine.values()])
+        return bool(is_steep and np.median(foot) > LOW_FOOT and all(c.falls.all() for c in self.mine.values()))
 
     @property
     def gain(self) -> float:
@@ -383,7 +392,7 @@ class _Side(NamedTuple):
         return float(np.max(self.evidence[:-2]) - np.max(self.evidence[-2:]))
 
     def set_edges(self, out: dict[int, AxisRims], number: int) -> None:
-        """Set the edges at and beside the rim along each axis; `number`: of this side."""
+        """Set the edges at and beside the rim along each axis; `number`: of the outline."""
         probability = self.probability
         for (axis, sign), b in self.beside.items():
             c = self.mine[axis, sign]
@@ -401,15 +410,28 @@ class _Side(NamedTuple):
 
 
 def _candidates(
-    slope: np.ndarray, steep: np.ndarray, std: np.ndarray, falls: np.ndarray, axis: int, sign: int
+    slope: np.ndarray,
+    steep: np.ndarray,
+    std: np.ndarray,
+    along: np.ndarray,
+    falls: np.ndarray,
+    axis: int,
+    sign: int,
 ) -> _Candidates:
     """Find the first pixels within rims along an axis (0: y, 1: x), upwards or downwards (`sign`).
 
     Rows and columns of less than four pixels have none.
+
+    Args:
+        slope: along the axis [y, x].
+        steep, std: size of the slope, and standard deviation of each component [y, x].
+        along: slope times the shift of the beam along it [y, x].
+        falls: whether the surface falls along the beam [y, x].
+        axis, sign: see above.
     """
     way = (slice(None), slice(None, None, sign)) if axis == 1 else (slice(None, None, sign), slice(None))
     turned = (lambda a: a[way]) if axis == 1 else (lambda a: a[way].T)
-    s, t, e, falling = sign * turned(slope), turned(steep), turned(std), turned(falls)
+    s, t, e, beam, falling = sign * turned(slope), turned(steep), turned(std), turned(along), turned(falls)
     far, near, first, second = (slice(k, max(0, s.shape[1] - 3) + k) for k in range(4))
     size, is_known = np.abs(s[:, first]), np.isfinite(e)
     is_rim = np.logical_and.reduce([is_known[:, k] for k in (far, near, first, second)])
@@ -427,7 +449,9 @@ def _candidates(
     position = first if sign > 0 else s.shape[1] - 1 - first
     place = (row, position) if axis == 1 else (position, row)
     level = np.hypot(LEVEL_STD * e[row, column], LEVEL_SHARE * s[row, first])
-    found = _Candidates(*place, s[at], std, crest, s[row, column + 1], t[row, column] / level, falling[row, first])
+    shear = beam[row, first] / np.abs(s[row, first])
+    outer, beyond = s[row, column + 1], t[row, column] / level
+    found = _Candidates(*place, s[at], std, crest, outer, beyond, falling[row, first], shear)
     return found.only(crest > LEAST_CREST)
 
 

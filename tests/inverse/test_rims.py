@@ -204,6 +204,35 @@ def test_rises_in_closed_form():
     np.testing.assert_allclose(np.sqrt(even.variance[-1]), 0.5 / np.sqrt(12.0), rtol=1e-2)
 
 
+@pytest.mark.parametrize("kind", ("half ellipsoids", "caps"))
+def test_heights_of_domes_have_honest_error_bars(kind: str):
+    """Mean rise over all sides of 40 domes, by random beams and noise: rms error below 1.2 of what is stated as common.
+
+    Stated are 3 to 7 % of the height. With vertical tangents five times as likely as others near them, instead of
+    twenty times, half ellipsoids are 10 % of their height too low, at 1.5 standard deviations.
+    """
+    pulls = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        foot, share = rng.uniform(8.0, 18.0), 1.0 if kind == "half ellipsoids" else rng.uniform(0.1, 0.9)
+        tangent, turn = np.tan(np.radians(rng.choice([0.0, 25.0]))), rng.uniform(0.0, 2.0 * np.pi)
+        shift = float(tangent * np.cos(turn)), float(tangent * np.sin(turn))
+        shape = {"foot": (foot, foot * rng.uniform(0.8, 1.25)), "rise": foot * share * rng.uniform(0.1, 1.0)}
+        seen = ellipsoid(**shape, share=share, at=tuple(rng.uniform(-2.0, 2.0, 2)), shift=shift)
+        error, _, stated = rises_over_rims(seen, seed, float(rng.choice([0.005, 0.02])), shift=shift)
+        if error.size:
+            pulls.append(error.mean() / stated.mean())
+    assert len(pulls) > 25
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.2, pulls
+
+
+def test_the_sides_of_a_dome_err_together():
+    """They have one number, whose error is common. Catches sides that err independently: half of a dome's error."""
+    for about in (DOMES["low"], DOMES["oblique"]):
+        found = find_rims(noisy(ellipsoid(**about), 1, 0.005), 0.005, about.get("shift", (0.0, 0.0)))
+        assert all(set(np.unique(rims.outline)) == {0, 1} for rims in found)
+
+
 @pytest.mark.parametrize("sign", (1.0, -1.0))
 def test_rim_of_a_dome_rises_by_more_than_the_trapezoid_rule(sign):
     """Half ellipsoids and bowls: off by less than by that rule, of 9 % of their height, and as stated."""
