@@ -20,7 +20,7 @@ MIN_FACING = 0.02
 """Smallest -n . u / cos t that a measured normal may have; below, the slope would be beyond the grazing limit."""
 SMOOTH_CHANGE = 0.2
 """Change of slope e from pixel to pixel up to which `surface_of_heights` takes a surface as smooth."""
-_LINE_PENALTY = 0.7
+_LINE_PENALTY = 0.9
 """Change of slope from which it prefers the line to the next pixel to a parabola through three pixels."""
 _NO_EDGE = 1e-3
 """Weight that a pixel with two cut edges would still need: its one-sided slope is then about zero."""
@@ -130,8 +130,8 @@ def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | Non
 
     Valid to 0.05 in slope on a Gaussian hill 0.8 steep whose standard deviation is 2.75 pixels, to 0.13 where it is 2;
     beside a kink to half of its change of slope, at one pixel; beside a step of half a pixel or more to 0.04, a lower
-    one to 0.1. In a level slot two pixels wide, or on such a tread, to 0.5 where it is 0.2 to 2 pixels deep, else to
-    0.15; on a steep ground such a slot is not told from the ground. On a feature one pixel wide the slope is
+    one to 0.1. In a level slot two pixels wide, or on such a tread, to 0.6 where it is 0.2 to 2 pixels deep, else to
+    0.15; on steep ground such a slot is not distinguished from the ground. On a feature one pixel wide the slope is
     meaningless. A height that is not finite spoils three pixels to either side. Where slopes or normals are known,
     make the `Surface` from them.
 
