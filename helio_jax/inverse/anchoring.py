@@ -8,7 +8,6 @@ where they are better held (`explanations`), and one fit tells what the heights 
 first order: the data are tested on the heights as moved (`verdict`).
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -254,8 +253,8 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     )
 
     def brought(changes: np.ndarray) -> np.ndarray:
-        """Bring changes of the heights, which the posterior contains, to the anchors [change, y, x]."""
-        moves = changes.reshape(len(changes), -1) @ weight.T @ inverse @ heights
+        """Bring changes of the heights, which the posterior contains, to the anchors [..., y, x]."""
+        moves = changes.reshape(-1, weight.shape[1]) @ weight.T @ inverse @ heights
         return changes - moves.reshape(changes.shape)
 
     drawn = posterior.samples.reshape(len(posterior.samples), -1)
@@ -272,18 +271,13 @@ def _moved(fit: Fit, given: _Known) -> Anchored:
     if is_wrong.any():  # either the anchor is wrong, or all else
         change = of_all if (is_wrong & is_used).any() else of_all - answer
         conditioned = conditioned.with_common_mode((change @ heights).reshape(shape))
-    found = with_brought_changes(at_state(fit, moved, conditioned), lambda change: brought(change[None])[0])
-    return Anchored(found, checks, anchors.taken(is_used))
-
-
-def with_brought_changes(fit: Fit, brought: Callable[[np.ndarray], np.ndarray]) -> Fit:
-    """Bring to the anchors what another instrument would change of the heights (`Fit.instrument_change`), too."""
-    score, rival = fit.geometry_score, fit.rival_change
-    return replace(
-        fit,
+    score, rival = fit.geometry_score, fit.rival_change  # of other instruments, whose heights go through them, too
+    found = replace(
+        at_state(fit, moved, conditioned),
         geometry_score=score and replace(score, height_change=brought(score.height_change)),
         rival_change=None if rival is None else brought(rival),
     )
+    return Anchored(found, checks, anchors.taken(is_used))
 
 
 def _levelled(fit: Fit, height: np.ndarray, instrument: np.ndarray) -> np.ndarray:

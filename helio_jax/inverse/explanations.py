@@ -83,7 +83,8 @@ MIN_CONTRADICTED = 0.02
 """Other explanations are tried where the data contradict a fit in a larger share of the pixels."""
 NARROW = 5
 """Contradicted strips less wide are those of walls and creases, not of pits and patches of another albedo [pixels].
-An area holds a disc of this width, of whole pixels: a patch is as often round as square. Aslant, strips of 4.3 do."""
+An area holds a disc of this width, of whole pixels: a patch is as often round as square. Slanted strips
+4.3 pixels wide hold it, too."""
 LESS_CONTRADICTED = 0.95
 """An explanation that the data contradict in more than this share of the pixels of another explains nothing more."""
 MORE_CONTRADICTED = 1.05

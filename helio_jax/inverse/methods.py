@@ -96,8 +96,8 @@ def reconstruct_stack(
             f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
-    for name, counts in zip(stack.instrument.detector_names, stack.counts, strict=True):
-        if np.isfinite(counts).any() and not np.nan_to_num(counts).any():
+    for name, counts, is_observed in zip(stack.instrument.detector_names, stack.counts, stack.is_observed, strict=True):
+        if is_observed.any() and not counts[is_observed].any():
             raise GuardError(
                 f"detector {name!r} counted 0 in every pixel: if it was off, leave its image out or set it to NaN, "
                 "which stands for pixels without data"

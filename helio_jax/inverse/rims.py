@@ -75,7 +75,7 @@ HIDING = 0.2, 0.3
 """Where a side falls along an oblique beam and the root of r is below the first number, with a probability above the
 second, its foot may be hidden behind the limb: edges there may be depth jumps and count as no rims."""
 LOW_FOOT = 0.2
-"""No foot that is certainly lower is a depth jump [pixels]."""
+"""A hidden foot that is lower is no depth jump [pixels]."""
 DECISIVE = 0.75
 """Least logarithm of the evidence for a rim against a parabola and a constant slope."""
 
@@ -379,12 +379,15 @@ class _Side(NamedTuple):
     def may_hide_its_foot(self) -> bool:
         """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen.
 
-        A vertical tangent sheared by k hides 2 c^2 k behind the limb; c follows from the second slope.
+        A vertical tangent sheared by k hides 2 c^2 k behind the limb. Near the rim the slope is c / sqrt(t), and the
+        second pixel lies at t = 1.5 on average.
         """
+        if not all(c.falls.all() for c in self.mine.values()):
+            return False
         root, probability = HIDING
         is_steep = self.probability[np.sqrt(OFFSETS) < root].sum() > probability
-        foot = np.concatenate([2.0 * 1.5 * c.slope[:, 1] ** 2 * np.abs(c.shear) for c in self.mine.values()])
-        return bool(is_steep and np.median(foot) > LOW_FOOT and all(c.falls.all() for c in self.mine.values()))
+        foot = np.concatenate([2.0 * (1.5 * c.slope[:, 1] ** 2) * np.abs(c.shear) for c in self.mine.values()])
+        return bool(is_steep and np.median(foot) > LOW_FOOT)
 
     @property
     def gain(self) -> float:

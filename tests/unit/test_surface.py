@@ -20,20 +20,30 @@ def slopes(height):
         return np.stack([np.asarray(surface.slope_x), np.asarray(surface.slope_y)])
 
 
-@pytest.mark.parametrize(("width", "most"), [(2.75, 0.05), (2.0, 0.13)])
+@pytest.mark.parametrize(("width", "most"), [(2.75, 0.04), (2.0, 0.12)])
 def test_shoulders_of_a_steep_hill(width, most):
-    """Within what the docstring says on a Gaussian that is 0.8 steep; `width`: its standard deviation in pixels.
+    """Gaussian that is 0.8 steep, its top at a pixel or, 0.01 less exact, between two; `width`: its standard deviation
+    in pixels.
 
     A limiter between the two one-sided differences takes the flatter one at the shoulders: up to 0.3 too flat.
     """
     w = width * STEP
     top = 0.83 * np.exp(0.5) * w
-    for place in PLACES:
+    for place in (0.0, *PLACES):
         x, y = GX - place, GY + 50
         height = top * np.exp(-0.5 * (x**2 + y**2) / w**2)
         true = np.stack([-x, -y]) / w**2 * height
         assert np.abs(true).max() > 0.8
-        assert np.abs(slopes(height) - true).max() < most
+        assert np.abs(slopes(height) - true).max() < most + 0.01 * (place > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("height", "slope"),
+    [(0.2 * np.abs(GX - 3.0), 0.2 * np.sign(GX - 3.0)), (2.0 * (GX > 5.0), 0.0), (5.0 * (GX > 5.0), 0.0)],
+)
+def test_weak_kinks_and_steps_blur(height, slope):
+    """By no more than 0.1 in slope, where the vertex is well between two pixels."""
+    assert np.abs(slopes(height)[0] - slope).max() < 0.1
 
 
 PLACES = np.arange(0.5, STEP)
