@@ -79,6 +79,7 @@ trace/                Scene -> MicrographStack by Monte Carlo (NumPy, numba, Emb
   meshplate           plates with channels
   tally               integer fates, hits and sums
   masks               maps of masking and shadowing
+  guided              multiple scattering from known points, with guided first bounces
   denoise             averaging of traced images within smooth regions
   run                 blocks of pixels on threads
   converge            rays per pixel until a target error is reached

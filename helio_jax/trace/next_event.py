@@ -19,9 +19,11 @@ from helio_jax.trace.source import Sampling
 from helio_jax.trace.tally import Tally
 
 
-def _path_data(s: Sampling, paths: Paths, n_branches: int) -> tuple[np.ndarray, ...]:
-    """Return pixel, order, met_plate and replicate of each path, for `n_branches` paths per beam ray."""
-    return paths.pixel, paths.order, paths.met_plate, paths.path // (s.n_rays * n_branches // s.n_replicates)
+def _path_data(s: Sampling, paths: Paths, n_branches: int, tally: Tally) -> tuple[np.ndarray, ...]:
+    """Return pixel, order, met_plate, replicate and weight of each path, for `n_branches` paths per beam ray."""
+    replicate = paths.path // (s.n_rays * n_branches // s.n_replicates)
+    weight = np.ones(len(replicate)) if tally.weights is None else tally.weights[paths.pixel, paths.path]
+    return paths.pixel, paths.order, paths.met_plate, replicate, weight
 
 
 @kernel
@@ -56,11 +58,12 @@ def _aim(k, n_hits, point, normal, pixel, offset, plate_z, target, shapes, area)
 def _add(value, k, i, order, paths, sums):
     """Add the contribution of path `i` to detector `k` and scattering order `order`.
 
-    `paths`: pixel, order, met_plate, replicate [n]; `sums`: `Tally.sums`, `Tally.plate_sums`.
+    `paths`: pixel, order, met_plate, replicate, weight [n]; `sums`: `Tally.sums`, `Tally.plate_sums`.
     """
-    pixel, _, met_plate, replicate = paths
+    pixel, _, met_plate, replicate, weight = paths
     by_order, plate = sums
     r, p = replicate[i], pixel[i]
+    value *= weight[i]
     by_order[min(order, by_order.shape[0]) - 1, r, k, p] += value
     if met_plate[i]:
         plate[r, k, p] += value
@@ -69,7 +72,7 @@ def _add(value, k, i, order, paths, sums):
 @kernel
 def _score(k, share, cosine, point, normal, paths, offset, plate_z, weight, is_open, shapes, rims, sums):
     """Add P = n . Phi - (masked part), times the share of cosine atoms, for each scattering point."""
-    pixel, order, _, _ = paths
+    pixel, order, _, _, _ = paths
     for i in range(point.shape[0]):
         if cosine[i] == 0.0:
             continue
@@ -107,7 +110,7 @@ def _score_lobes(
 @kernel
 def _score_hits(share, n_hits, density, origin, direction, paths, surface, offset, plate_z, shapes, area, sums):
     """Add the atoms of lobes that hit a detector."""
-    pixel, order, _, _ = paths
+    pixel, order, _, _, _ = paths
     for i in range(origin.shape[0]):
         if density[i] > 0.0 and surface[i] == MISS:
             p = pixel[i]
@@ -126,7 +129,7 @@ def _subtract_masked(
 
     The mirror image of an atom's direction at its surface estimates the parts of the detectors below the horizon.
     """
-    pixel, order, _, _ = paths
+    pixel, order, _, _, _ = paths
     for i in range(origin.shape[0]):
         if density[i] != 0.0:
             continue
@@ -156,7 +159,7 @@ def add_next_event(e: Experiment, event: int, ids: np.ndarray, tally: Tally, hit
         hits, paths = hits.take(~on_plate), paths.take(~on_plate)
     table, plate_z, n_branches = e.apertures, e.instrument.sample_distance, 1 if event == 0 else e.sampling.n_branches
     point, normal, n_hits = hits.point, hits.normal, e.sampling.n_branches if event == 0 else 1
-    path_data, sums = _path_data(e.sampling, paths, n_branches), (tally.sums, tally.plate_sums)
+    path_data, sums = _path_data(e.sampling, paths, n_branches, tally), (tally.sums, tally.plate_sums)
     origin, skip = lift_off(point, normal, hits.surface, e.intersector.restart)
     cosine = np.ones(len(point))
     if e.laws is not None:
@@ -184,7 +187,7 @@ def add_hits(e: Experiment, event: int, tally: Tally, surface: np.ndarray, paths
     """Add the estimates by re-emitted atoms after `event` events: hits of lobes, and the masked part."""
     n_branches, table = e.sampling.n_branches, e.apertures
     weight = 1.0 / n_branches, n_branches if event == 1 else 1
-    path_data, sums = _path_data(e.sampling, paths, n_branches), (tally.sums, tally.plate_sums)
+    path_data, sums = _path_data(e.sampling, paths, n_branches, tally), (tally.sums, tally.plate_sums)
     flight = paths.origin, paths.direction, path_data, surface
     plate = offset, e.instrument.sample_distance, table.shapes, table.area
     _subtract_masked(*weight, paths.density, paths.normal, *flight, *plate, sums)

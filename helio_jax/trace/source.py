@@ -136,6 +136,13 @@ def first_bounce_shift(seed, pixel_id, replicate):
 
 
 @kernel
+def first_bounce_shifts(seed, pixel_id):
+    """Compute four random shifts: of the points of first bounces of a pixel, and of those of their aperture points."""
+    zero = np.uint64(0)
+    return philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), zero, zero, zero)
+
+
+@kernel
 def shifted(a, b, points, i):
     """Return point number `i` of `points` [n, 2], shifted by (a, b) modulo 1."""
     a, b = a + points[i, 0], b + points[i, 1]

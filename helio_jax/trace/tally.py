@@ -23,6 +23,7 @@ class Tally:
             that a plate has scattered.
         n_rays: beam rays per pixel.
         n_branches: paths from the first hit of each beam ray.
+        weights: of the paths in `sums` [pixels, path]; None: all are 1.
     """
 
     fates: np.ndarray
@@ -32,10 +33,18 @@ class Tally:
     plate_sums: np.ndarray
     n_rays: int
     n_branches: int = 1
+    weights: np.ndarray | None = None
 
     @classmethod
     def zeros(
-        cls, n_orders: int, n_detectors: int, n_pixels: int, n_replicates: int, n_rays: int, n_branches: int
+        cls,
+        n_orders: int,
+        n_detectors: int,
+        n_pixels: int,
+        n_replicates: int,
+        n_rays: int,
+        n_branches: int,
+        weights: np.ndarray | None = None,
     ) -> "Tally":
         """Make an empty tally."""
         return cls(
@@ -46,6 +55,7 @@ class Tally:
             np.zeros((n_replicates, n_detectors, n_pixels)),
             n_rays,
             n_branches,
+            weights,
         )
 
     def estimate(self) -> "Estimate":

@@ -75,10 +75,18 @@ def launch_paths(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray) -
     return Paths(origin, direction, pixel, path, numbers[:, 4:].copy(), skip, density, normal, *history)
 
 
-def scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths, stopped: np.ndarray) -> Paths:
+def scatter(
+    e: Experiment,
+    event: int,
+    ids: np.ndarray,
+    hits: Hits,
+    paths: Paths,
+    stopped: np.ndarray,
+    u: np.ndarray | None = None,
+) -> Paths:
     """Return the rays re-emitted at the scattering points, `n_branches` from each of the beam's first hits.
 
-    Adsorbed atoms are added to `stopped` [pixels].
+    Adsorbed atoms are added to `stopped` [pixels]. `u`: random numbers of the paths [n, 4]; default: `bounce_numbers`.
     """
     s = e.sampling
     if event == 0 and s.n_branches > 1:
@@ -86,7 +94,8 @@ def scatter(e: Experiment, event: int, ids: np.ndarray, hits: Hits, paths: Paths
         hits, paths = hits.take(index), paths.take(index)
         paths.path = paths.path * s.n_branches + np.tile(np.arange(s.n_branches), index.size // s.n_branches)
     path, pixel = paths.path, paths.pixel
-    u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed)
+    if u is None:
+        u = bounce_numbers(ids[pixel], path, s.per_replicate, s.bounces, event, s.seed)
     origin, skip = lift_off(hits.point, hits.normal, hits.surface, e.intersector.restart)
     on_plate = hits.surface == PLATE
     normal = np.where(on_plate[:, None], 0.0, hits.normal)
@@ -112,15 +121,32 @@ def trace_block(
         x, y: beam positions [pixels] [um].
         first: known first hit of all beam rays of each pixel [pixels]; None: the beam is traced.
     """
-    e, s, table = experiment, experiment.sampling, experiment.apertures
+    e, s = experiment, experiment.sampling
     tally = Tally.zeros(
-        e.n_orders, len(table), len(pixel_ids), s.n_replicates if e.is_expected else 0, s.n_rays, s.n_branches
+        e.n_orders, len(e.apertures), len(pixel_ids), s.n_replicates if e.is_expected else 0, s.n_rays, s.n_branches
     )
     ids = np.ascontiguousarray(pixel_ids, np.int64)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
-    paths = launch_paths(e, ids, x, y)
-    for event in range(e.max_events + 1):
-        if event == 0 and first is not None:
+    follow(e, 0, ids, launch_paths(e, ids, x, y), offset, tally, first)
+    return tally
+
+
+def follow(
+    e: Experiment,
+    start: int,
+    ids: np.ndarray,
+    paths: Paths,
+    offset: np.ndarray,
+    tally: Tally,
+    first: Hits | None = None,
+) -> None:
+    """Trace rays until all have ended, and tally the flights after more than `start` events, and their hits.
+
+    With `first` [pixels], these are the hits of the first flight. `offset`: `Instrument.sample_origin` [pixels, 2].
+    """
+    table, n_branches = e.apertures, e.sampling.n_branches
+    for event in range(start, e.max_events + 1):
+        if event == start and first is not None:
             hits = first.take(paths.pixel)
         else:
             hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
@@ -130,11 +156,11 @@ def trace_block(
                 count_caught(tally, caught[ends], paths.pixel[ends], paths.order[ends], paths.met_plate[ends])
                 hits, paths = hits.take(~ends), paths.take(~ends)
         keep = _tally_flight(
-            event, e.max_events, s.n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
+            event, e.max_events, n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
             hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes, tally.fates, tally.hits,
             tally.plate_hits,
         )  # fmt: skip
-        if e.is_expected and event > 0:
+        if e.is_expected and event > start:
             add_hits(e, event, tally, hits.surface, paths, offset)
         if not keep.size:
             break
@@ -145,4 +171,3 @@ def trace_block(
             trace_fused(e, event, ids, hits, paths, offset, tally)
             break
         paths = scatter(e, event, ids, hits, paths, tally.fates[STOPPED])
-    return tally

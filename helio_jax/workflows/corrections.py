@@ -26,14 +26,11 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.trace.denoise import passes_for
-from helio_jax.trace.settings import MAX_BRANCHES, TraceSettings
 from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
 
-RAYS = 8
-"""Paths per pixel and branch."""
 DEGREE: Literal[1, 2] = 2
 """Degree of the polynomials that smooth the traced image."""
-SMOOTH_PATHS = 40
+SMOOTH_PATHS = 8
 """The traced image is averaged over neighbours until this many paths count in every pixel."""
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
@@ -126,11 +123,10 @@ def make_predictor(
         hidden = raster.hidden_side(smooth, smooth_normals)
         either_way = [raster.sides(smooth, smooth_normals, hidden, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
-        branches = min(max(1, round(n_rays / height.size / RAYS / n_traced)), MAX_BRANCHES)
-        settings = TraceSettings(rays=RAYS, branches=branches, n_orders=2, seed=seed, workers=workers)
-        passes, limit = passes_for(RAYS * branches, SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
+        n_paths = round(n_rays / n_traced)
+        passes, limit = passes_for(max(n_paths / height.size, 1.0), SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
         terms = COSINE_LAW if law is None else law.terms()
-        multiple = [[s.multiple(settings, limit, albedo, terms) for s in way] for way in either_way]
+        multiple = [[s.multiple(n_paths, seed, limit, albedo, terms, workers) for s in way] for way in either_way]
         images = np.array(
             [[raster.smoothed(m, smooth, smooth_normals, passes, degree=DEGREE) for m in way] for way in multiple]
         )

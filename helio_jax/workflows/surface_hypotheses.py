@@ -24,10 +24,13 @@ from helio_jax.scene.surfaces import surface_body
 from helio_jax.scene.wall_grid import Grid, has_level_rims, wall_links, with_upright_walls
 from helio_jax.trace import masks
 from helio_jax.trace.denoise import SMOOTH_NORMALS, smooth_along_surface, surface_width
+from helio_jax.trace.guided import trace_multiple
 from helio_jax.trace.intersect import Hits, Intersector
-from helio_jax.trace.run import make_experiment, trace_pixels
+from helio_jax.trace.run import make_experiment
 from helio_jax.trace.settings import TraceSettings
 
+MAX_EVENTS = 16
+"""Scatterings after which a path ends: what goes on is shut in below a wall, where no aperture sees it."""
 LIFT = {"multiple": 0.01, "masks": 0.1}
 """How far off the surface multiply scattered atoms start, and rays that test whether a detector is masked [pitches].
 Atoms that start off it see what stands around lower by as much: 0.1 made the multiple scattering about a pyramid of 4.7
@@ -89,29 +92,42 @@ class SurfaceHypothesis:
 
     def multiple(
         self,
-        settings: TraceSettings,
+        n_paths: int,
+        seed: int,
         max_buried: float,
         albedo: np.ndarray | None = None,
         law: tuple[Term, ...] = COSINE_LAW,
+        workers: int | None = None,
     ) -> np.ndarray:
-        """Trace the multiple scattering [detector, y, x], per albedo of the own pixel; default: albedo 1 everywhere."""
+        """Trace the multiple scattering [detector, y, x], per albedo of the own pixel; default: albedo 1 everywhere.
+
+        Args:
+            n_paths: number of paths, over all pixels.
+            seed: of the random numbers.
+            max_buried: largest share of atoms that may start below a neighbouring facet.
+            albedo: of the pixels [y, x].
+            law: scattering law of all of the surface.
+            workers: number of threads; default: one per CPU.
+
+        Raises:
+            PredictionError: more atoms start below a neighbouring facet.
+        """
         r = self.raster
         if albedo is None and law is COSINE_LAW:
             intersector, laws, own = self.intersector, {}, 1.0
         else:
             intersector, laws, own = self._with_materials(np.ones(r.x.shape) if albedo is None else albedo, law)
-        experiment = make_experiment(intersector, r.instrument, settings, laws)
-        x, y = self.beam_x.ravel(), self.beam_y.ravel()
+        experiment = make_experiment(intersector, r.instrument, TraceSettings(seed=seed, max_events=MAX_EVENTS), laws)
         try:
             first = self._lifted("multiple")
-            tally = trace_pixels(experiment, x, y, settings.workers, first=first, max_lost=max_buried)
+            found = trace_multiple(experiment, first, self.beam_x, self.beam_y, n_paths, workers, max_buried)
         except GuardError as e:
-            found = str(e).split(";")[0]
+            why = str(e).split(";")[0]
             raise PredictionError(
-                f"the surface of the fit is too rough or steep to trace multiple scattering from ({found}): check "
+                f"the surface of the fit is too rough or steep to trace multiple scattering from ({why}): check "
                 "background and gains, or use method = 'nearfield'"
             ) from e
-        return tally.probability()[0][1].reshape(-1, *r.x.shape) / own
+        return found / own
 
     def _with_materials(
         self, albedo: np.ndarray, law: tuple[Term, ...]

@@ -1,0 +1,210 @@
+"""Multiple scattering from known first points, with guided first bounces.
+
+Most atoms escape at once: 95 of 100 from a level substrate about a ball, and none of them adds to its multiple
+scattering. So a pilot shoots one ray through each cell of the unit square from which first bounces are drawn, and the
+paths take the cells by how much of them meets the surface. Weights keep the estimate unbiased, whatever the pilot saw.
+
+Source: guiding in the space of random numbers: Guo, Bauszat, Bikker and Eisemann, Eurographics Symposium on Rendering
+(2018) 27; densities in proportion to the root of the second moment: Rath et al., ACM Trans. Graph. 39 (2020) 151.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from helio_jax.cpus import n_cpus
+from helio_jax.kernel import kernel
+from helio_jax.trace.experiment import Experiment
+from helio_jax.trace.intersect import MISS, Hits
+from helio_jax.trace.random import low_discrepancy_points
+from helio_jax.trace.run import RAYS_PER_BLOCK, check_rays, in_order, pixels_per_block
+from helio_jax.trace.source import Sampling, bounce_number, first_bounce_shifts, shifted
+from helio_jax.trace.tally import FATES, LOST, STOPPED, Tally
+from helio_jax.trace.transport import follow, launch_paths, scatter
+
+AZIMUTHS, ELEVATIONS = 16, 8
+"""Cells of a pilot along both random numbers of a bounce: equal in azimuth and in the sine of the elevation above the
+surface, so that what lies low above a level substrate has cells of its own."""
+UNGUIDED = 0.2
+"""Share of the paths that take all cells alike: where the pilot met nothing, weights are up to 1 / UNGUIDED."""
+MOST_PILOT = 0.5
+"""Largest number of rays of the pilot, per path: it leaves out pixels where it would have more."""
+NEIGHBOURS = 0.6, 0.4
+"""Gaussian width over which the cells met are averaged: in pixels of the pilot, and in cells."""
+_PILOT = 1 << 62  # offset of the pixel numbers, which key the random numbers
+AREA = np.tile((2.0 * np.arange(ELEVATIONS) + 1.0) / (ELEVATIONS**2 * AZIMUTHS), (AZIMUTHS, 1))
+"""Area of each cell of the unit square [azimuth, elevation]."""
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Probability that a path takes a cell [guide, azimuth, elevation]; the number of each pixel's guide [pixel]."""
+
+    shares: np.ndarray
+    of_pixel: np.ndarray
+
+
+def trace_multiple(
+    experiment: Experiment,
+    first: Hits,
+    x: np.ndarray,
+    y: np.ndarray,
+    n_paths: int,
+    workers: int | None = None,
+    max_lost: float = 1e-4,
+) -> np.ndarray:
+    """Compute the probability of detection after two or more scatterings [detector, y, x].
+
+    Args:
+        experiment: sample, instrument, laws and seed, of the expected estimator; the numbers of its rays are not used.
+        first: first scattering points and the normals there, pixels in the order of the raster [y * x].
+        x, y: beam positions at which the points are illuminated [y, x] [um].
+        n_paths: paths of all pixels together; each has one at least, and 65536 at most. The pilot's rays come on top.
+        workers: number of threads; default: one per CPU.
+        max_lost: largest share of atoms that may meet the surface from behind in their first flight.
+
+    Raises:
+        GuardError: rays are unaccounted for, or a larger share than `max_lost` was lost.
+    """
+    of_each = min(max(1, round(n_paths / x.size)), RAYS_PER_BLOCK)
+    flat = np.ascontiguousarray(x.ravel()), np.ascontiguousarray(y.ravel())
+    guide = make_guide(experiment, first, *flat, x.shape, of_each, workers, max_lost)
+    e = replace(experiment, sampling=Sampling.make(1, of_each, 1, experiment.sampling.seed))
+
+    def trace(part: slice) -> tuple[np.ndarray, int]:
+        ids = np.arange(x.size)[part]
+        tally = _trace_block(e, ids, flat[0][part], flat[1][part], first.take(part), guide)
+        return tally.sums[1:].sum((0, 1)), int(np.abs(tally.fates.sum(0) - of_each).sum())
+
+    parts = list(in_order(workers or n_cpus(), _tasks(trace, x.size, pixels_per_block(e))))
+    check_rays(np.zeros(len(FATES)), sum(n_unaccounted for _, n_unaccounted in parts), 1)
+    return np.concatenate([found for found, _ in parts], -1).reshape(-1, *x.shape)
+
+
+def make_guide(
+    experiment: Experiment,
+    first: Hits,
+    x: np.ndarray,
+    y: np.ndarray,
+    shape: tuple[int, int],
+    of_each: int,
+    workers: int | None = None,
+    max_lost: float = 1e-4,
+) -> Guide:
+    """Shoot a pilot; arguments as those of `trace_multiple`, `of_each`: paths of each pixel.
+
+    Raises:
+        GuardError: a larger share than `max_lost` of the atoms meets the surface from behind.
+    """
+    stride = math.ceil(math.sqrt(AREA.size / (MOST_PILOT * of_each)))
+    rows, columns = (np.arange(min(stride // 2, n - 1), n, stride) for n in shape)
+    numbers = np.arange(x.size).reshape(shape)
+    chosen = numbers[np.ix_(rows, columns)].ravel()
+    e = replace(experiment, sampling=Sampling.make(1, AREA.size, 1, experiment.sampling.seed))
+
+    def shoot(part: slice) -> tuple[np.ndarray, np.ndarray]:
+        at = chosen[part]
+        ids = at + _PILOT
+        paths, u = launch_paths(e, ids, x[at], y[at]), _cell_numbers(ids, e.sampling.seed)
+        paths = scatter(e, 0, ids, first.take(at), paths, np.zeros(at.size, np.int64), u)
+        hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
+        is_met, is_back = np.zeros((2, at.size, AREA.size), np.float32)
+        is_met[paths.pixel, paths.path] = (hits.surface != MISS) | (e.plate is not None)  # a plate sends atoms back
+        is_back[paths.pixel, paths.path] = hits.is_back
+        return is_met, is_back
+
+    parts = list(in_order(workers or n_cpus(), _tasks(shoot, chosen.size, pixels_per_block(e))))
+    met, back = (np.concatenate(of_kind) for of_kind in zip(*parts, strict=True))
+    fates = np.zeros(len(FATES))
+    fates[LOST] = round(float((back @ AREA.ravel()).sum()))
+    check_rays(fates, 0, chosen.size, max_lost)
+    met = met.reshape(rows.size, columns.size, AZIMUTHS, ELEVATIONS)
+    pixels, cells = NEIGHBOURS
+    beyond: Any = ("nearest", "nearest", "wrap", "nearest")
+    met = gaussian_filter(met, (pixels, pixels, cells, cells), mode=beyond)
+    wanted = AREA * np.sqrt(np.maximum(met.reshape(-1, AZIMUTHS, ELEVATIONS), 0.0))
+    total = wanted.sum((1, 2), keepdims=True)
+    wanted = np.where(total > 0.0, wanted / np.where(total > 0.0, total, 1.0), AREA)
+    shares = (1.0 - UNGUIDED) * wanted + UNGUIDED * AREA
+    y_guide, x_guide = (
+        np.minimum(np.arange(n) // stride, m.size - 1) for n, m in zip(shape, (rows, columns), strict=True)
+    )
+    return Guide(shares, (y_guide[:, None] * columns.size + x_guide).ravel())
+
+
+def _tasks(work: Callable, n: int, size: int):
+    """Yield the calls of `work` for blocks of so many pixels."""
+    for start in range(0, n, size):
+        yield lambda part=slice(start, start + size): work(part)
+
+
+def _trace_block(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray, first: Hits, guide: Guide) -> Tally:
+    """Trace the paths of some pixels from their second scattering on."""
+    s = e.sampling
+    u, weights = _guided_numbers(
+        ids, s.n_branches, low_discrepancy_points(s.n_branches, 4), s.seed, guide.shares, guide.of_pixel[ids]
+    )
+    tally = Tally.zeros(2, len(e.apertures), len(ids), 1, s.n_rays, s.n_branches, weights)
+    paths = scatter(e, 0, ids, first, launch_paths(e, ids, x, y), tally.fates[STOPPED], u)
+    offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
+    follow(replace(e, n_orders=2), 1, ids, paths, offset, tally)
+    return tally
+
+
+@kernel
+def _cell_numbers(ids, seed):
+    """Compute the random numbers of one bounce through each cell of each pixel [pixels * cells, 4]."""
+    n_cells = AZIMUTHS * ELEVATIONS
+    out = np.zeros((ids.size * n_cells, 4))
+    for row in range(out.shape[0]):
+        cell = row % n_cells
+        a, b, _, _ = bounce_number(seed, ids[row // n_cells], cell, 0)
+        out[row, 0], out[row, 1] = _in_cell(cell // ELEVATIONS, cell % ELEVATIONS, a, b)
+    return out
+
+
+@kernel
+def _in_cell(azimuth, elevation, a, b):
+    """Return the point of the unit square that divides a cell so."""
+    square = elevation**2 + a * (2 * elevation + 1)
+    return 1.0 - square / ELEVATIONS**2, (azimuth + b) / AZIMUTHS
+
+
+@kernel
+def _guided_numbers(ids, n_paths, points, seed, shares, of_pixel):
+    """Compute the random numbers of the first bounces [pixels * paths, 4] and their weights [pixels, paths]."""
+    out, weights = np.empty((ids.size * n_paths, 4)), np.empty((ids.size, n_paths))
+    by_azimuth, up_to = np.empty(AZIMUTHS), np.empty(AZIMUTHS)
+    for p in range(ids.size):
+        share = shares[of_pixel[p]]
+        total = 0.0
+        for i in range(AZIMUTHS):
+            by_azimuth[i] = 0.0
+            for j in range(ELEVATIONS):
+                by_azimuth[i] += share[i, j]
+            total += by_azimuth[i]
+            up_to[i] = total
+        shift_a, shift_b, shift_c, shift_d = first_bounce_shifts(seed, ids[p])
+        for path in range(n_paths):
+            a, b = shifted(shift_a, shift_b, points[:, :2], path)
+            c, d = shifted(shift_c, shift_d, points[:, 2:], path)
+            b *= total
+            i = 0
+            while i < AZIMUTHS - 1 and b >= up_to[i]:
+                i += 1
+            b = min(max((b - up_to[i] + by_azimuth[i]) / by_azimuth[i], 0.0), 1.0 - 1e-15)
+            a *= by_azimuth[i]
+            j = 0
+            while j < ELEVATIONS - 1 and a >= share[i, j]:
+                a -= share[i, j]
+                j += 1
+            a = min(a / share[i, j], 1.0 - 1e-15)
+            row = p * n_paths + path
+            out[row, 0], out[row, 1] = _in_cell(i, j, a, b)
+            out[row, 2], out[row, 3] = c, d
+            weights[p, path] = (2 * j + 1) / (ELEVATIONS**2 * AZIMUTHS * share[i, j])
+    return out, weights
