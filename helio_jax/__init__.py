@@ -164,6 +164,7 @@ inverse/              MicrographStack -> Reconstruction (JAX, optimistix)
   correlated_errors   errors that agree between neighbours: predicted data, edges at kinks
   samples             posterior samples of the heights
   noise_bias          bias that the noise of the data causes
+  dead_detectors      detectors that show no signal where the others do
   quality             why a height is not valid
   anchors             what is known of many heights together
   anchor_settings     what a user knows of the heights: tables [[reconstruct.anchor]]

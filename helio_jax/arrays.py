@@ -27,6 +27,8 @@ BORDER_WIDTH = 0.06
 """Width of an image's border, as a fraction of each side, of which `substrate_level` takes the lowest part."""
 SUBSTRATE_QUANTILE = 0.05
 """Quantile of the border's heights that is taken as the substrate."""
+LEAST_SIGNAL = 1e-3
+"""Least typical signal of an image, over that of the brightest one."""
 _STD_OVER_MEDIAN = 1.4826
 """Standard deviation of normal noise divided by the median of its absolute value."""
 
@@ -78,11 +80,19 @@ def robust_std(residuals: np.ndarray, axes: tuple[int, ...] | None = None) -> np
     return _STD_OVER_MEDIAN * np.nanmedian(np.abs(residuals), axis=axes, keepdims=axes is not None)
 
 
-def typical_signal(image: np.ndarray) -> float:
-    """Return the median of an image's finite values [y, x]; the mean where that is not positive, else 1."""
-    known = image[np.isfinite(image)]
-    of_size = (float(f(known)) for f in (np.median, np.mean) if known.size)
-    return next((size for size in of_size if size > 0.0), 1.0)
+def typical_signals(images: np.ndarray) -> np.ndarray:
+    """Return the median of every image's finite values [image], of images [image, y, x].
+
+    The mean stands for a median that is not positive. None is below `LEAST_SIGNAL` of the largest, so that an image of
+    background alone has a size, too; all are 1 where none has any signal.
+    """
+    found = np.zeros(len(images))
+    for k, image in enumerate(images):
+        known = image[np.isfinite(image)]
+        of_size = (float(f(known)) for f in (np.median, np.mean) if known.size)
+        found[k] = next((size for size in of_size if size > 0.0), 0.0)
+    largest = found.max(initial=0.0)
+    return np.maximum(found, LEAST_SIGNAL * largest) if largest > 0.0 else np.ones(len(images))
 
 
 def pitch(axis: np.ndarray) -> float:

@@ -130,9 +130,9 @@ def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | Non
 
     Valid to 0.05 in slope on a Gaussian hill 0.8 steep whose standard deviation is 2.75 pixels, to 0.13 where it is 2;
     beside a kink to half of its change of slope, at one pixel; beside a step of half a pixel or more to 0.04, a lower
-    one to 0.1. In a level slot two pixels wide, or on such a tread, to 0.6 where it is 0.2 to 2 pixels deep, else to
+    one to 0.1. In a level slot two pixels wide, or on such a tread, to 0.6 where it is 0.2 to 3 pixels deep, else to
     0.15; on steep ground such a slot is not distinguished from the ground. On a feature one pixel wide the slope is
-    meaningless. A height that is not finite spoils three pixels to either side. Where slopes or normals are known,
+    meaningless. A height that is not finite spoils two pixels to either side. Where slopes or normals are known,
     make the `Surface` from them.
 
     Args:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from scipy.ndimage import gaussian_filter, median_filter
 
-from helio_jax.arrays import border_mask
+from helio_jax.arrays import border_mask, typical_signals
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
 from helio_jax.forward.render import Corrections, single_scattering
@@ -93,7 +93,7 @@ def rescale_to_border(data: np.ndarray, reference: np.ndarray, settings: Reconst
     if settings.border != "flat":
         return data
     frame = border_mask(data.shape[1:], settings.border_fraction)
-    wanted, own = (np.nanmedian(d[:, frame], axis=1) for d in (reference, data))
+    wanted, own = (typical_signals(d[:, None, frame]) for d in (reference, data))
     return data * (wanted / own)[:, None, None]
 
 
@@ -117,7 +117,7 @@ def _drawn_reading(
 ) -> np.ndarray:
     """Draw data [detector, y, x] as they might have been read, in the same units."""
     s, n = settings.refine, len(data)
-    usual = np.nanmedian(data, axis=(1, 2))
+    usual = typical_signals(data)
     offset = (usual * s.offset_std * rng.standard_normal(n))[:, None, None]
     gain = np.exp(s.gain_std * rng.standard_normal(n))[:, None, None]
     return gain * data + offset + noise * rng.standard_normal(data.shape)
@@ -128,7 +128,7 @@ def _drawn_discrepancy(
 ) -> np.ndarray:
     """Draw smooth errors of data [detector, y, x], as `refine` has them for unknowns."""
     n = settings.refine.discrepancy_modes
-    std = discrepancy * np.nanmedian(data, axis=(1, 2))
+    std = discrepancy * typical_signals(data)
     return np.asarray(smooth_images(rng.standard_normal((len(data), n, n)), data.shape[1:], std))
 
 

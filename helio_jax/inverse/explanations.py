@@ -465,8 +465,12 @@ class _Fits:
         if self.settings.border != "flat":
             return False
         frame = border_mask(self.stack.shape[1:], self.settings.border_fraction)
-        level = np.nanmedian(signal_of(self.by_cosine_law)[0][:, frame], axis=1)
-        ratio = float(np.median(level / substrate_signal(Optics.of(self.stack.instrument))))
+        of_border = signal_of(self.by_cosine_law)[0][:, frame]
+        is_known = np.isfinite(of_border).any(1)
+        if not is_known.any():
+            return False
+        expected = substrate_signal(Optics.of(self.stack.instrument))
+        ratio = float(np.median(np.nanmedian(of_border[is_known], axis=1) / expected[is_known]))
         return ratio < math.exp(-max(LEAST_COMMON, UNLIKELY_GAIN * self.settings.refine.gain_std))
 
     def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
@@ -560,18 +564,20 @@ class _Fits:
         fits: list[tuple[float, Explanation]] = []
         is_interrupted = False
         for attempt in attempts:
+            found = None
             try:
                 if (found := attempt()) is None:
                     continue
-                misfit = self.traced_misfit(found.fit) - self.instrument_improvement(before.fit, found.fit)
-                fits.append((misfit, found))
                 is_interrupted = found.fit.is_interrupted
+                fits.append((self.traced_misfit(found.fit) - self.instrument_improvement(before.fit, found.fit), found))
             except PredictionError as e:
                 self.say(f"these {what} are given up: {e}")
             except KeyboardInterrupt:
-                if not fits:
-                    raise
                 is_interrupted = True
+                if not fits:
+                    if found is None:
+                        raise
+                    fits.append((math.inf, found))  # the only one: there is nothing to compare it with
             if is_interrupted:
                 break
         if not fits:

@@ -82,6 +82,8 @@ class Fit:
         geometry_score: what the data say of a geometry that is stated as exact, where another one is likely.
         rival_change: by how much another instrument that explains the data about as well changes the heights [y, x],
             um; None: no other one was fitted, or none does.
+        is_rival_contained: whether the error bars contain `rival_change`; of changes by other instruments they contain
+            one (`instrument_change`).
     """
 
     problem: FitProblem
@@ -108,6 +110,7 @@ class Fit:
     prior_widths: Mapping[str, float] = field(default_factory=dict)
     geometry_score: GeometryScore | None = None
     rival_change: np.ndarray | None = None
+    is_rival_contained: bool = False
 
     @property
     def is_geometry_fitted(self) -> bool:
@@ -116,7 +119,7 @@ class Fit:
 
     @property
     def instrument_change(self) -> np.ndarray | None:
-        """Change of the heights by an instrument that may be right as well [y, x], um: what the error bars contain.
+        """Change of the heights by an instrument that may be right as well [y, x], um: for the error bars to contain.
 
         That of a geometry that the data ask for and that was not fitted, or that of another fit: the one with the
         larger mean square, as both may be one and the same. None: there is none.
@@ -385,10 +388,11 @@ def with_posterior(fit: Fit, sums: Anchors | None = None) -> Fit:
     n_samples = fit.problem.settings.samples
     if fit.is_interrupted or not n_samples:
         return fit
-    posterior = posterior_at(fit.problem, fit.state, n_samples, sums).with_common_mode(fit.remaining)
-    if fit.instrument_change is not None:
-        posterior = posterior.with_common_mode(fit.instrument_change)
-    return replace(fit, posterior=posterior)
+    posterior, change = posterior_at(fit.problem, fit.state, n_samples, sums), fit.instrument_change
+    posterior = posterior.with_common_mode(fit.remaining)
+    if change is not None:
+        posterior = posterior.with_common_mode(change)
+    return replace(fit, posterior=posterior, is_rival_contained=change is not None and change is fit.rival_change)
 
 
 def largest_change(changes: Sequence[np.ndarray]) -> np.ndarray:

@@ -52,6 +52,10 @@ RIVAL = (
 """Warning of a fit with a `Fit.rival_change`."""
 
 
+NOTABLE = 0.25
+"""Heights that another instrument changes by a smaller share of its largest change are not looked at."""
+
+
 def geometry_warnings(fit: Fit) -> tuple[str, ...]:
     """Say what the data of a fit say of the geometry, where they ask for another one than is stated as exact, and
     whether other instruments explain them about as well."""
@@ -59,16 +63,18 @@ def geometry_warnings(fit: Fit) -> tuple[str, ...]:
 
 
 def _of_rival(fit: Fit) -> tuple[str, ...]:
-    """Warn of another instrument; not where the error bars are wider than the heights differ most without it, too."""
+    """Warn of another instrument; not where the error bars without it are wider than the heights differ."""
     rival, contained = fit.rival_change, ""
     if rival is None:
         return ()
-    at = np.unravel_index(np.argmax(np.abs(rival)), rival.shape)
+    size = np.abs(rival)
+    counts = size >= NOTABLE * size.max()
     if fit.posterior is not None:
-        if fit.instrument_change is not rival or 2.0 * rival[at] ** 2 <= fit.posterior.height_std[at] ** 2:
+        if not fit.is_rival_contained:
             return ()
+        counts &= 2.0 * rival**2 > fit.posterior.height_std**2
         contained = "; the error bars contain the difference"
-    return (RIVAL.format(most=abs(float(rival[at])), contained=contained),)
+    return (RIVAL.format(most=float(size[counts].max()), contained=contained),) if counts.any() else ()
 
 
 def _of_geometry(fit: Fit) -> tuple[str, ...]:
@@ -76,7 +82,7 @@ def _of_geometry(fit: Fit) -> tuple[str, ...]:
     if score is None:
         return ()
     if not fit.is_geometry_fitted:
-        is_held = fit.posterior is not None and fit.instrument_change is score.height_change
+        is_held = fit.posterior is not None and not fit.is_rival_contained
         held = ", but the error bars hold what it would change" if is_held else ""
         return (DOUBTFUL.format(named=largest_changes(score.values), held=held),)
     if fit.posterior is None:

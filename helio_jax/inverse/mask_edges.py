@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
-from helio_jax.arrays import nearest_known, robust_std
+from helio_jax.arrays import nearest_known, robust_std, typical_signals
 
 MIN_LENGTH = 4.0
 """Shortest edge [pixels]."""
@@ -69,7 +69,7 @@ def find_levels(signal: np.ndarray, variance: np.ndarray, floor_known: bool) -> 
         floor_known: whether the signal is zero where no atom is detected. Otherwise the floor lies between zero and the
             darkest pixels, which multiple scattering fills.
     """
-    lit = np.nanmedian(signal, axis=(1, 2))
+    lit = typical_signals(signal)
     floor, std = np.zeros_like(lit), np.zeros_like(lit)
     if not floor_known:
         dark = np.nanquantile(signal, 0.005, axis=(1, 2))

@@ -16,6 +16,7 @@ from helio_jax.forward.optics import Optics, Raster
 from helio_jax.inverse.albedo_patches import AlbedoPatches
 from helio_jax.inverse.albedo_search import search_albedo_patches
 from helio_jax.inverse.convergence import has_converged
+from helio_jax.inverse.dead_detectors import dead_detectors
 from helio_jax.inverse.linear import MIN_IMAGES
 from helio_jax.inverse.misfit_errors import with_path_error
 from helio_jax.inverse.nearfield import photometric_heights
@@ -87,7 +88,7 @@ def reconstruct_stack(
         start: heights that `refine` starts from [y, x], um; default: the photometric solution.
 
     Raises:
-        GuardError: fewer than 3 images, no pixel recorded in 3 of them, a detector that counted nothing, or a height
+        GuardError: fewer than 3 images, no pixel recorded in 3 of them, a detector without signal, or a height
             that is not finite.
     """
     n_usable = stack.is_observed.sum(0)
@@ -96,12 +97,11 @@ def reconstruct_stack(
             f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
             f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
         )
-    for name, counts, is_observed in zip(stack.instrument.detector_names, stack.counts, stack.is_observed, strict=True):
-        if is_observed.any() and not counts[is_observed].any():
-            raise GuardError(
-                f"detector {name!r} counted 0 in every pixel: if it was off, leave its image out or set it to NaN, "
-                "which stands for pixels without data"
-            )
+    if dead := dead_detectors(stack):
+        raise GuardError(
+            f"detector {dead[0]!r} shows no signal in any pixel, where the others do: if it was off, leave its image "
+            "out or set it to NaN, which stands for pixels without data"
+        )
     if settings.method == "refine":
         result, misfit_of, anchors, region, off_substrate = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)

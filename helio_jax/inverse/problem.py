@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from helio_jax.arrays import border_mask, typical_signal
+from helio_jax.arrays import border_mask, typical_signals
 from helio_jax.forward.laws import Law
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.readout import ScanOrder, drift_modes
@@ -128,7 +128,7 @@ class FitProblem:
         is_free = settings.border == "free"
         is_held = is_free and s.level_std_um is not None
         modes = drift_modes(shape, order, s.drift_degrees) if s.drift_std else np.zeros((1, 0, *shape))
-        median = np.array([typical_signal(image) for image in signal])
+        median = typical_signals(signal)
         noise = float(np.clip(np.sqrt(np.nanmedian(variance / median[:, None, None] ** 2)), 1e-3, 1.0))
         problem = cls(
             signal, variance, optics, math.radians(stated.tilt_deg), stated.discrepancy, geometry, raster, settings,

@@ -10,6 +10,7 @@ from scipy.ndimage import binary_erosion, uniform_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from helio_jax.arrays import typical_signals
 from helio_jax.forward.surface import along
 from helio_jax.inverse.edges import ranked, trapezoid_gap
 from helio_jax.inverse.linear import MIN_IMAGES, signal_of
@@ -44,7 +45,7 @@ def reasons_from_data(stack: MicrographStack, min_images: int = MIN_IMAGES) -> n
     """
     reason = np.zeros(stack.shape[1:], np.uint8)
     signal, _ = signal_of(stack)
-    flat = np.nanmedian(signal, axis=(1, 2), keepdims=True)
+    flat = typical_signals(signal)[:, None, None]
     n_images = stack.is_observed.sum(0)
     n_dark = np.sum(np.nan_to_num(signal, nan=np.inf) < MASK_LIMIT * flat, axis=0)
     reason[n_images - n_dark < FACET_IMAGES] = _MASKED

@@ -7,10 +7,13 @@ from pydantic import Field, model_validator
 from helio_jax.inverse.anchor_settings import AnchorSettings
 from helio_jax.settings import Settings
 
-PATHS_PER_PIXEL, LEAST_PATHS = 50, 500_000
-"""Default paths per prediction of the multiple scattering. Their noise is 0.1 to 0.6 % of the signal in each pixel of a
-31 x 31 raster of a pyramid, a ball and a cap, and 0.8 % on sphere A with 121 x 121 pixels."""
-START_THRIFT = 4
+PATHS_PER_PIXEL, LEAST_PATHS = 150, 500_000
+MANY_PATHS, OF_MANY = 2_000_000, 50
+"""Default paths per prediction of the multiple scattering: so many per pixel, within so many at least and at most; but
+the most is not below the last number per pixel. In each pixel of a raster of 31 x 31 their noise is 0.1 to 0.6 % of the
+signal about a pyramid, a ball and a cap. With a quarter of the most, heights of sphere B (121 x 121) are twice as far
+off where they are valid."""
+START_THRIFT = 2
 """So many times fewer for photometric solutions, but not fewer than the least number: from a noisier start the rim of
 sphere B is 7 % worse."""
 SEARCH_THRIFT = 4
@@ -101,11 +104,14 @@ class RefineSettings(Settings):
     (`forward/radiosity.py`), so it differs by some per cent beside depth jumps."""
     rays: int | None = Field(default=None, ge=1000, le=10**10)
     """Paths per traced prediction of the multiple scattering, over the whole image (at least one per pixel); default:
-    50 per pixel, but 500 000 at least."""
+    150 per pixel, from 500 000 to 2 million, and 50 per pixel where that is more."""
 
     def paths(self, n_pixels: int) -> int:
         """Number of paths of a prediction for so many pixels."""
-        return max(LEAST_PATHS, PATHS_PER_PIXEL * n_pixels) if self.rays is None else self.rays
+        if self.rays is not None:
+            return self.rays
+        most = max(MANY_PATHS, OF_MANY * n_pixels)
+        return min(max(LEAST_PATHS, PATHS_PER_PIXEL * n_pixels), most)
 
     def start_paths(self, n_pixels: int) -> int:
         """Number of paths of a prediction on a photometric solution."""

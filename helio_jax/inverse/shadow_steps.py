@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from helio_jax.arrays import robust_std, typical_signal
+from helio_jax.arrays import robust_std, typical_signals
 from helio_jax.forward.optics import Raster
 from helio_jax.inverse.dash_lines import Line
 
@@ -87,7 +87,7 @@ def find_shadow_step(
     if not any(beam_shift) or not is_live.any():
         return None
     signal, variance = signal[is_live], variance[is_live]
-    unit = np.array([typical_signal(image) for image in signal])[:, None, None]
+    unit = typical_signals(signal)[:, None, None]
     share, spread = signal / unit, _with_relief(signal, variance) / unit**2
     side = np.sqrt(float(raster.dx) * float(raster.dy))
     place = np.moveaxis(np.asarray(raster.centred_positions()), 0, -1) / side

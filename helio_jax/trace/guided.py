@@ -120,8 +120,8 @@ def make_guide(
     parts = list(in_order(workers or n_cpus(), _tasks(shoot, chosen.size, pixels_per_block(e))))
     met, back = (np.concatenate(of_kind) for of_kind in zip(*parts, strict=True))
     fates = np.zeros(len(FATES))
-    fates[LOST] = round(float((back @ AREA.ravel()).sum()))
-    check_rays(fates, 0, chosen.size, max_lost)
+    fates[LOST] = round(float((back @ AREA.ravel()).sum()) * AREA.size)
+    check_rays(fates, 0, back.size, max_lost)
     met = met.reshape(rows.size, columns.size, AZIMUTHS, ELEVATIONS)
     pixels, cells = NEIGHBOURS
     beyond: Any = ("nearest", "nearest", "wrap", "nearest")

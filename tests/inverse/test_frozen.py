@@ -103,7 +103,7 @@ CASES = {
         refine={"drift_std": 0.05, "drift_degrees": (2, 1), "line_std": 0.02, "albedo_std": 0.02, "albedo_modes": 2}
         | {"law": "power", "law_std": 0.05},
     ),
-    "traced": Case("sphere", "refine", "flat", {"rays": 10_000}, 1e-3, 2, False),
+    "traced": Case("sphere", "refine", "flat", {"rays": 100_000}, 1e-3, 2, False),
     "radiosity": Case("sphere", "nearfield", "flat", {"multiple": "radiosity"}, 2e-2, 0, False),
 }
 

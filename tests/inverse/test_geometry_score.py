@@ -1,6 +1,7 @@
 """A geometry that is stated as exact and is wrong: what the data say of it, by closed form, by refit and in a scan."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -236,7 +237,7 @@ def test_error_bars_count_one_doubt_once(bshem, factor):
 
 
 def test_an_anchor_settles_which_instrument_is_right(bshem):
-    """A known top: the other instrument's heights go through it as well, and nothing is left to warn of.
+    """A known top, which is that of the fit: the other instrument's heights go through it, and nothing is warned of.
 
     Without it the warning names the difference, which the error bars contain.
     """
@@ -246,10 +247,47 @@ def test_an_anchor_settles_which_instrument_is_right(bshem):
     assert f"{0.6 * np.abs(fit.surface.height).max():.3g} um; the error bars contain" in warned
     x, y = np.meshgrid(fit.problem.raster.x, fit.problem.raster.y)
     top = np.unravel_index(np.argmax(fit.surface.height), x.shape)
-    known = {"at_um": (float(x[top]), float(y[top])), "height_um": float(fit.surface.height[top]), "std_um": 1.0}
+    height = float(fit.surface.height[top])
+    at = (float(p[top]) - height * shift for p, shift in zip((x, y), bshem.beam_shift, strict=True))
+    known = {"at_um": tuple(at), "height_um": height, "std_um": 1.0}
     settings = fit.problem.reconstruct_settings.changed(anchor=(AnchorSettings(**known, radius_um=20.0),))
     anchored = with_anchors(replace(rival, problem=replace(fit.problem, reconstruct_settings=settings))).fit
+    assert abs(anchored.surface.height[top] - height) < 1.0
     assert np.abs(anchored.rival_change[top]) < 2.0 and not geometry_warnings(anchored)
+
+
+def test_the_error_bars_of_an_anchored_fit_are_said_to_contain_what_they_do(bshem):
+    """An anchor can make the smaller one of two changes the larger one; the error bars still contain the other.
+
+    Catches the choice made anew after the anchors.
+    """
+    fit = fitted(bshem, bshem, 0)
+    bump = np.zeros_like(fit.surface.height)
+    bump[3, 3] = 5.0
+    score = score_geometry(fitted(bshem, bshem.moved(np.radians([[3.0, 0.0]] * 3), 0.0), 0))
+    both = with_posterior(
+        replace(fit, geometry_score=replace(score, height_change=20.0 * fit.surface.height), rival_change=bump)
+    )
+    assert not both.is_rival_contained
+    after = replace(both, geometry_score=replace(both.geometry_score, height_change=0.0 * bump))
+    assert after.instrument_change is bump
+    assert all("contain the difference" not in w for w in geometry_warnings(after))
+
+
+def test_a_rival_is_named_where_the_data_miss_its_largest_change(bshem):
+    """A hole in the data at the top, where the error bars are wide anyway: the warning is of the heights around it.
+
+    Catches a comparison at the pixel of the largest change alone.
+    """
+    fit = with_posterior(replace(fitted(bshem, bshem, 0), rival_change=None))
+    rival = 0.2 * fit.surface.height
+    top = np.unravel_index(np.argmax(rival), rival.shape)
+    wide = fit.posterior.height_std.copy()
+    wide[top] = 10.0 * rival[top]
+    about = replace(fit, rival_change=rival, is_rival_contained=True)
+    posterior = SimpleNamespace(height_std=np.where(wide < rival, np.hypot(wide, rival), wide))
+    (warned,) = geometry_warnings(replace(about, posterior=posterior))
+    assert "the error bars contain" in warned and f"{rival[top]:.3g} um" not in warned
 
 
 def test_misfit_grows_with_data_that_are_far_off(bshem):

@@ -52,6 +52,24 @@ def test_the_fit_so_far_is_kept(monkeypatch, place):
     assert was_interrupted(f"contradicts the data: 20 %; {found.fit.status}") and not was_interrupted(StandIn().status)
 
 
+@pytest.mark.parametrize("n_before", [0, 1])
+def test_the_first_of_several_attempts_is_kept(monkeypatch, n_before):
+    """Interrupted while an attempt is tested: the only one is returned, or the one that was tested before it."""
+    attempts = [Explanation(StandIn(f"converged: attempt {i}"), np.zeros(SHAPE, bool)) for i in range(2)]  # type: ignore[arg-type]
+    tested = iter(range(n_before))
+
+    def traced_misfit(self, fit):
+        if next(tested, None) is None:
+            raise KeyboardInterrupt
+        return 2.0
+
+    monkeypatch.setattr(explanations._Fits, "traced_misfit", traced_misfit)
+    monkeypatch.setattr(explanations._Fits, "instrument_improvement", lambda self, before, fit: 0.0)
+    fits = object.__new__(explanations._Fits)
+    found = fits.best_of([lambda one=one: one for one in attempts], attempts[0], "outlines")
+    assert found is not None and found.fit.is_interrupted and "attempt 0" in found.fit.status
+
+
 def test_an_interrupted_fit_keeps_its_own_words():
     """The sentence of its last iteration stays; the fit is not said to have been interrupted twice."""
     fit = StandIn("interrupted: best so far", True)

@@ -65,18 +65,18 @@ def test_steps_blur(depth, most):
     assert np.abs(slopes(depth * STEP * (GX > 5.0))).max() < most
 
 
-@pytest.mark.parametrize(("depth", "most"), [(0.2, 0.15), (0.5, 0.6), (1.0, 0.6), (2.0, 0.6), (4.0, 0.15)])
+@pytest.mark.parametrize(("depth", "most"), [(0.2, 0.15), (0.5, 0.6), (1.0, 0.6), (2.5, 0.6), (3.0, 0.15), (4.0, 0.15)])
 def test_narrow_slots_blur(depth, most):
     """Two pixels wide, by no more than the docstring says; depth in pixels."""
     assert np.abs(slopes(-depth * STEP * (np.abs(GX - 5.0) < STEP))).max() < most
 
 
-def test_a_height_that_is_not_finite_spoils_three_pixels():
+def test_a_height_that_is_not_finite_spoils_two_pixels():
     """To either side in its row and column. Catches differences that go round the raster's border."""
     height = 0.1 * GX
-    height[3, 2] = np.nan
-    assert set(np.flatnonzero(np.isnan(slopes(height)[0][3]))) <= set(range(6))
-    assert set(np.flatnonzero(np.isnan(slopes(height)[1][:, 2]))) <= set(range(7))
+    height[0, 0] = np.nan
+    assert set(np.flatnonzero(np.isnan(slopes(height)[0][0]))) <= set(range(3))
+    assert set(np.flatnonzero(np.isnan(slopes(height)[1][:, 0]))) <= set(range(3))
 
 
 def test_fourth_order():
