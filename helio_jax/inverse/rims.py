@@ -76,6 +76,8 @@ HIDING = 0.2, 0.3
 second, its foot may be hidden behind the limb: edges there may be depth jumps and count as no rims."""
 LOW_FOOT = 0.2
 """A hidden foot that is lower is no depth jump [pixels]."""
+FOOT_ERROR = 0.3
+"""Standard deviation of the height of a hidden foot, over the height."""
 DECISIVE = 0.75
 """Least logarithm of the evidence for a rim against a parabola and a constant slope."""
 
@@ -254,6 +256,17 @@ class _Candidates(NamedTuple):
     falls: np.ndarray
     shear: np.ndarray
 
+    @property
+    def steepness(self) -> np.ndarray:
+        """c^2 of a tangent that is vertical at the rim, by the second pixel, 1.5 within on average [candidate]."""
+        t = 1.5 / (self.crest + 0.5)
+        return 1.5 * self.slope[:, 1] ** 2 * (1.0 - 0.5 * t) / (1.0 - t) ** 2
+
+    @property
+    def foot(self) -> np.ndarray:
+        """Height that a vertical tangent, sheared by k, hides behind the limb: 2 c^2 k [candidate], pixels."""
+        return np.where(self.falls, 2.0 * self.steepness * np.abs(self.shear), 0.0)
+
     def only(self, which: np.ndarray) -> "_Candidates":
         """Keep some of them [candidate]."""
         return _Candidates(*(values[which] for values in self))
@@ -377,17 +390,12 @@ class _Side(NamedTuple):
 
     @property
     def may_hide_its_foot(self) -> bool:
-        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen.
-
-        A vertical tangent sheared by k hides 2 c^2 k behind the limb. Near the rim the slope is c / sqrt(t), and the
-        second pixel lies at t = 1.5 on average.
-        """
+        """Whether the side falls along the beam, and perhaps so steeply that its foot is not seen."""
         if not all(c.falls.all() for c in self.mine.values()):
             return False
         root, probability = HIDING
         is_steep = self.probability[np.sqrt(OFFSETS) < root].sum() > probability
-        foot = np.concatenate([2.0 * (1.5 * c.slope[:, 1] ** 2) * np.abs(c.shear) for c in self.mine.values()])
-        return bool(is_steep and np.median(foot) > LOW_FOOT)
+        return bool(is_steep and np.median(np.concatenate([c.foot for c in self.mine.values()])) > LOW_FOOT)
 
     @property
     def gain(self) -> float:
@@ -402,7 +410,7 @@ class _Side(NamedTuple):
             first, second, level = c.slope[:, 0], c.slope[:, 1], np.zeros((len(OFFSETS), len(c.y)))
             parts = (
                 (-1, c.outer, level, level + c.outer**2 / 12.0),
-                (0, c.outer + first, b.rise, b.variance),
+                (0, c.outer + first, *_with_hidden_foot(b, c)),
                 (1, first + second, b.next_rise, b.next_variance),
             )
             for step, sum_of_ends, rise, variance in parts:
@@ -410,6 +418,19 @@ class _Side(NamedTuple):
                 move = step - 1 if sign > 0 else -step
                 place = (c.y + move * (axis == 0), c.x + move * (axis == 1))
                 out[axis].fill(place, number, sign, 0.5 * sum_of_ends, probability, rise, variance)
+
+
+def _with_hidden_foot(beside: RimEdges, c: _Candidates) -> tuple[np.ndarray, np.ndarray]:
+    """Add to the rises in the edge of the rim, and to their variances, what the limb hides [offset, edge].
+
+    Seen along the beam, a section with the root of r below c k begins at the limb with a vertical tangent, as if its r
+    were 0, and hides 2 c (c k - sqrt(r)). Of its r is known what the prior says: that it is 0, or any other.
+    """
+    vertical, others = _RANGES[0], np.sqrt(c.steepness) * np.abs(c.shear)
+    first, second = ((vertical + others / (power + 1)) / (vertical + others) for power in (1, 2))
+    mean, variance = c.foot * first, c.foot**2 * (second - first**2 + (FOOT_ERROR * first) ** 2)
+    is_limb = (OFFSETS == 0.0)[:, None]
+    return beside.rise + is_limb * mean, beside.variance + is_limb * variance
 
 
 def _candidates(
