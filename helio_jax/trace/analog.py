@@ -63,7 +63,7 @@ def _emit_all(
     is_stratified = event == 0 and per_replicate > 0
     for i in range(pixel.size):
         if is_stratified:
-            shift_a, shift_b = first_bounce_shift(seed, ids[pixel[i]], path[i] * n_branches // per_replicate)
+            shift_a, shift_b, _, _ = first_bounce_shift(seed, ids[pixel[i]], path[i] * n_branches // per_replicate)
         for branch in range(n_branches):
             of_pixel[m], of_path[m] = pixel[i], path[i] * n_branches + branch
             if leaving.size and not leaves_surface(leaving[surface[i]], seed, ids[pixel[i]], of_path[m], event):

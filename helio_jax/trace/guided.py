@@ -22,7 +22,7 @@ from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import MISS, Hits
 from helio_jax.trace.random import low_discrepancy_points
 from helio_jax.trace.run import RAYS_PER_BLOCK, check_rays, in_order, pixels_per_block
-from helio_jax.trace.source import Sampling, bounce_number, first_bounce_shifts, shifted
+from helio_jax.trace.source import Sampling, bounce_number, first_bounce_shift, shifted
 from helio_jax.trace.tally import FATES, LOST, STOPPED, Tally
 from helio_jax.trace.transport import follow, launch_paths, scatter
 
@@ -188,7 +188,7 @@ def _guided_numbers(ids, n_paths, points, seed, shares, of_pixel):
                 by_azimuth[i] += share[i, j]
             total += by_azimuth[i]
             up_to[i] = total
-        shift_a, shift_b, shift_c, shift_d = first_bounce_shifts(seed, ids[p])
+        shift_a, shift_b, shift_c, shift_d = first_bounce_shift(seed, ids[p], 0)
         for path in range(n_paths):
             a, b = shifted(shift_a, shift_b, points[:, :2], path)
             c, d = shifted(shift_c, shift_d, points[:, 2:], path)

@@ -129,17 +129,9 @@ def bounce_number(seed, pixel_id, path, event):
 
 @kernel
 def first_bounce_shift(seed, pixel_id, replicate):
-    """Compute the random shift of the low-discrepancy points of first bounces of one replicate of a pixel."""
+    """Compute four random shifts of one replicate of a pixel: of its first bounces 2, of their aperture points 2."""
     zero = np.uint64(0)
-    a, b, _, _ = philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), np.uint64(replicate), zero, zero)
-    return a, b
-
-
-@kernel
-def first_bounce_shifts(seed, pixel_id):
-    """Compute four random shifts: of the points of first bounces of a pixel, and of those of their aperture points."""
-    zero = np.uint64(0)
-    return philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), zero, zero, zero)
+    return philox(np.uint64(seed), _BRANCH_STREAM, np.uint64(pixel_id), np.uint64(replicate), zero, zero)
 
 
 @kernel
@@ -160,7 +152,7 @@ def bounce_numbers(pixel_ids, path, per_replicate, bounces, event, seed):
     for i in range(path.size):
         a, b, c, d = bounce_number(seed, pixel_ids[i], path[i], event)
         if event == 0 and per_replicate > 0:
-            a, b = first_bounce_shift(seed, pixel_ids[i], path[i] // per_replicate)
+            a, b, _, _ = first_bounce_shift(seed, pixel_ids[i], path[i] // per_replicate)
             a, b = shifted(a, b, bounces, path[i] % per_replicate)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = a, b, c, d
     return out

@@ -29,8 +29,6 @@ from helio_jax.trace.intersect import Hits, Intersector
 from helio_jax.trace.run import make_experiment
 from helio_jax.trace.settings import TraceSettings
 
-MAX_EVENTS = 16
-"""Scatterings after which a path ends: what goes on is shut in below a wall, where no aperture sees it."""
 LIFT = {"multiple": 0.01, "masks": 0.1}
 """How far off the surface multiply scattered atoms start, and rays that test whether a detector is masked [pitches].
 Atoms that start off it see what stands around lower by as much: 0.1 made the multiple scattering about a pyramid of 4.7
@@ -117,7 +115,7 @@ class SurfaceHypothesis:
             intersector, laws, own = self.intersector, {}, 1.0
         else:
             intersector, laws, own = self._with_materials(np.ones(r.x.shape) if albedo is None else albedo, law)
-        experiment = make_experiment(intersector, r.instrument, TraceSettings(seed=seed, max_events=MAX_EVENTS), laws)
+        experiment = make_experiment(intersector, r.instrument, TraceSettings(seed=seed), laws)
         try:
             first = self._lifted("multiple")
             found = trace_multiple(experiment, first, self.beam_x, self.beam_y, n_paths, workers, max_buried)
