@@ -29,6 +29,20 @@ def border_signal(optics: Optics, law: LawPrior | None = None) -> np.ndarray:
     return substrate_signal(optics) * (1.0 if law is None else level_ratio(law.mean, optics))
 
 
+def border_ratios(signal: np.ndarray, expected: np.ndarray, border_fraction: float) -> np.ndarray:
+    """Compute the median signal on the border over what is expected [detector], NaN for a detector without data there.
+
+    Args:
+        signal: of every pixel [detector, y, x], NaN where not observed.
+        expected: signal of the level substrate [detector].
+        border_fraction: width of the border.
+    """
+    of_border = signal[:, border_mask(signal.shape[1:], border_fraction)]  # type: ignore[arg-type]
+    found, is_known = np.full(len(signal), np.nan), np.isfinite(of_border).any(1)
+    found[is_known] = np.nanmedian(of_border[is_known], axis=1) / expected[is_known]
+    return found
+
+
 def border_levels(
     signal: np.ndarray,
     optics: Optics,
@@ -51,10 +65,9 @@ def border_levels(
     none = np.ones(len(signal))
     if settings.border != "flat":
         return none
-    of_border = signal[:, border_mask(signal.shape[1:], settings.border_fraction)]  # type: ignore[arg-type]
-    expected = border_signal(optics, law)
-    found, is_known = none.copy(), np.isfinite(of_border).any(1)
-    found[is_known] = np.clip(np.nanmedian(of_border[is_known], axis=1) / expected[is_known], 1.0 / MOST, MOST)
+    ratios = border_ratios(signal, border_signal(optics, law), settings.border_fraction)
+    is_known = np.isfinite(ratios)
+    found = np.where(is_known, np.clip(ratios, 1.0 / MOST, MOST), none)
     if is_known.any() and not is_albedo_known:
         found[is_known] /= np.exp(np.mean(np.log(found[is_known])))
     return found if np.abs(found - 1.0).max() > OFF else none

@@ -19,7 +19,6 @@ import jax
 import numpy as np
 from scipy.ndimage import binary_opening, maximum_filter, minimum_filter
 
-from helio_jax.arrays import border_mask
 from helio_jax.errors import PredictionError, SceneError
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics, Raster
@@ -30,6 +29,7 @@ from helio_jax.inverse.albedo_patches import LEAST_COMMON, AlbedoPatches
 from helio_jax.inverse.albedo_search import AlbedoSearch, search_albedo
 from helio_jax.inverse.anchors import Anchors
 from helio_jax.inverse.backtracking import with_backtracking
+from helio_jax.inverse.border_level import border_ratios
 from helio_jax.inverse.fit import (
     Fit,
     Report,
@@ -464,14 +464,11 @@ class _Fits:
         """
         if self.settings.border != "flat":
             return False
-        frame = border_mask(self.stack.shape[1:], self.settings.border_fraction)
-        of_border = signal_of(self.by_cosine_law)[0][:, frame]
-        is_known = np.isfinite(of_border).any(1)
-        if not is_known.any():
-            return False
         expected = substrate_signal(Optics.of(self.stack.instrument))
-        ratio = float(np.median(np.nanmedian(of_border[is_known], axis=1) / expected[is_known]))
-        return ratio < math.exp(-max(LEAST_COMMON, UNLIKELY_GAIN * self.settings.refine.gain_std))
+        ratios = border_ratios(signal_of(self.by_cosine_law)[0], expected, self.settings.border_fraction)
+        ratios = ratios[np.isfinite(ratios)]
+        limit = math.exp(-max(LEAST_COMMON, UNLIKELY_GAIN * self.settings.refine.gain_std))
+        return bool(ratios.size and np.median(ratios) < limit)
 
     def start(self, patches: AlbedoPatches) -> tuple[Surface, Surface]:
         """Find the photometric solution that a fit starts from, and a smoother one."""

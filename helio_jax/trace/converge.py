@@ -14,7 +14,7 @@ import numpy as np
 from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.run import N_REPLICATES, check_rays, pixels_per_block
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.source import Sampling
+from helio_jax.trace.source import PILOT, Sampling
 from helio_jax.trace.tally import Estimate
 from helio_jax.trace.transport import trace_block
 
@@ -22,7 +22,6 @@ SAFETY = 1.4
 """Factor on the rays that the pilot's variance suggests, which is known to 50 % only (7 degrees of freedom)."""
 PILOT_BRANCHES = 4
 """Factor by which the pilot has fewer branches per beam ray."""
-_PILOT = 1 << 62  # offset of the pixel numbers, which key the random numbers
 
 
 def trace_to_target(
@@ -43,7 +42,7 @@ def trace_to_target(
     """
     n_rays, n_branches = experiment.sampling.n_rays, max(1, settings.branches // PILOT_BRANCHES)
     pilot = trace_block(
-        replace(experiment, sampling=_sampling(n_rays, n_branches, settings.seed)), ids + _PILOT, x, y
+        replace(experiment, sampling=_sampling(n_rays, n_branches, settings.seed)), ids + PILOT, x, y
     ).estimate()
     check_rays(np.zeros(len(pilot.fates)), pilot.n_unaccounted, 1)
     doublings = doublings_needed(pilot, settings, n_branches / settings.branches)

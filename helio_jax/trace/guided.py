@@ -9,20 +9,18 @@ Source: guiding in the space of random numbers: Guo, Bauszat, Bikker and Eiseman
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from helio_jax.cpus import n_cpus
 from helio_jax.kernel import kernel
 from helio_jax.trace.experiment import Experiment
 from helio_jax.trace.intersect import MISS, Hits
 from helio_jax.trace.random import low_discrepancy_points
-from helio_jax.trace.run import RAYS_PER_BLOCK, check_rays, in_order, pixels_per_block
-from helio_jax.trace.source import Sampling, bounce_number, first_bounce_shift, shifted
+from helio_jax.trace.run import RAYS_PER_BLOCK, by_blocks, check_rays
+from helio_jax.trace.source import PILOT, Sampling, bounce_number, first_bounce_shift, shifted
 from helio_jax.trace.tally import FATES, LOST, STOPPED, Tally
 from helio_jax.trace.transport import follow, launch_paths, scatter
 
@@ -35,7 +33,6 @@ MOST_PILOT = 0.5
 """Largest number of rays of the pilot, per path: it leaves out pixels where it would have more."""
 NEIGHBOURS = 0.6, 0.4
 """Gaussian width over which the cells met are averaged: in pixels of the pilot, and in cells."""
-_PILOT = 1 << 62  # offset of the pixel numbers, which key the random numbers
 AREA = np.tile((2.0 * np.arange(ELEVATIONS) + 1.0) / (ELEVATIONS**2 * AZIMUTHS), (AZIMUTHS, 1))
 """Area of each cell of the unit square [azimuth, elevation]."""
 
@@ -73,14 +70,14 @@ def trace_multiple(
     of_each = min(max(1, round(n_paths / x.size)), RAYS_PER_BLOCK)
     flat = np.ascontiguousarray(x.ravel()), np.ascontiguousarray(y.ravel())
     guide = make_guide(experiment, first, *flat, x.shape, of_each, workers, max_lost)
-    e = replace(experiment, sampling=Sampling.make(1, of_each, 1, experiment.sampling.seed))
+    e = replace(experiment, sampling=Sampling.make(1, of_each, 1, experiment.sampling.seed), n_orders=2)
+    ids, points = np.arange(x.size), low_discrepancy_points(of_each, 4)
 
     def trace(part: slice) -> tuple[np.ndarray, int]:
-        ids = np.arange(x.size)[part]
-        tally = _trace_block(e, ids, flat[0][part], flat[1][part], first.take(part), guide)
+        tally = _trace_block(e, ids[part], flat[0][part], flat[1][part], first.take(part), guide, points)
         return tally.sums[1:].sum((0, 1)), int(np.abs(tally.fates.sum(0) - of_each).sum())
 
-    parts = list(in_order(workers or n_cpus(), _tasks(trace, x.size, pixels_per_block(e))))
+    parts = by_blocks(e, x.size, trace, workers)
     check_rays(np.zeros(len(FATES)), sum(n_unaccounted for _, n_unaccounted in parts), 1)
     return np.concatenate([found for found, _ in parts], -1).reshape(-1, *x.shape)
 
@@ -108,7 +105,7 @@ def make_guide(
 
     def shoot(part: slice) -> tuple[np.ndarray, np.ndarray]:
         at = chosen[part]
-        ids = at + _PILOT
+        ids = at + PILOT
         paths, u = launch_paths(e, ids, x[at], y[at]), _cell_numbers(ids, e.sampling.seed)
         paths = scatter(e, 0, ids, first.take(at), paths, np.zeros(at.size, np.int64), u)
         hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
@@ -117,7 +114,7 @@ def make_guide(
         is_back[paths.pixel, paths.path] = hits.is_back
         return is_met, is_back
 
-    parts = list(in_order(workers or n_cpus(), _tasks(shoot, chosen.size, pixels_per_block(e))))
+    parts = by_blocks(e, chosen.size, shoot, workers)
     met, back = (np.concatenate(of_kind) for of_kind in zip(*parts, strict=True))
     fates = np.zeros(len(FATES))
     fates[LOST] = round(float((back @ AREA.ravel()).sum()) * AREA.size)
@@ -136,22 +133,16 @@ def make_guide(
     return Guide(shares, (y_guide[:, None] * columns.size + x_guide).ravel())
 
 
-def _tasks(work: Callable, n: int, size: int):
-    """Yield the calls of `work` for blocks of so many pixels."""
-    for start in range(0, n, size):
-        yield lambda part=slice(start, start + size): work(part)
-
-
-def _trace_block(e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray, first: Hits, guide: Guide) -> Tally:
-    """Trace the paths of some pixels from their second scattering on."""
+def _trace_block(
+    e: Experiment, ids: np.ndarray, x: np.ndarray, y: np.ndarray, first: Hits, guide: Guide, points: np.ndarray
+) -> Tally:
+    """Trace the paths of some pixels from their second scattering on; `points`: low-discrepancy points [path, 4]."""
     s = e.sampling
-    u, weights = _guided_numbers(
-        ids, s.n_branches, low_discrepancy_points(s.n_branches, 4), s.seed, guide.shares, guide.of_pixel[ids]
-    )
-    tally = Tally.zeros(2, len(e.apertures), len(ids), 1, s.n_rays, s.n_branches, weights)
+    u, weights = _guided_numbers(ids, points, s.seed, guide.shares, guide.of_pixel[ids])
+    tally = Tally.zeros(e.n_orders, len(e.apertures), len(ids), 1, s.n_rays, s.n_branches, weights)
     paths = scatter(e, 0, ids, first, launch_paths(e, ids, x, y), tally.fates[STOPPED], u)
     offset = np.stack(e.instrument.sample_origin(x, y)[:2], -1)
-    follow(replace(e, n_orders=2), 1, ids, paths, offset, tally)
+    follow(e, 1, ids, paths, offset, tally)
     return tally
 
 
@@ -175,8 +166,9 @@ def _in_cell(azimuth, elevation, a, b):
 
 
 @kernel
-def _guided_numbers(ids, n_paths, points, seed, shares, of_pixel):
+def _guided_numbers(ids, points, seed, shares, of_pixel):
     """Compute the random numbers of the first bounces [pixels * paths, 4] and their weights [pixels, paths]."""
+    n_paths, of_bounce, of_aperture = points.shape[0], points[:, :2], points[:, 2:]
     out, weights = np.empty((ids.size * n_paths, 4)), np.empty((ids.size, n_paths))
     by_azimuth, up_to = np.empty(AZIMUTHS), np.empty(AZIMUTHS)
     for p in range(ids.size):
@@ -190,8 +182,8 @@ def _guided_numbers(ids, n_paths, points, seed, shares, of_pixel):
             up_to[i] = total
         shift_a, shift_b, shift_c, shift_d = first_bounce_shift(seed, ids[p], 0)
         for path in range(n_paths):
-            a, b = shifted(shift_a, shift_b, points[:, :2], path)
-            c, d = shifted(shift_c, shift_d, points[:, 2:], path)
+            a, b = shifted(shift_a, shift_b, of_bounce, path)
+            c, d = shifted(shift_c, shift_d, of_aperture, path)
             b *= total
             i = 0
             while i < AZIMUTHS - 1 and b >= up_to[i]:

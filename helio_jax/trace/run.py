@@ -7,6 +7,7 @@ bit the same for any number of threads. `scan` traces whole scans.
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -159,6 +160,16 @@ def pixels_per_block(experiment: Experiment) -> int:
     return max(1, RAYS_PER_BLOCK // (experiment.sampling.n_rays * experiment.sampling.n_branches))
 
 
+def by_blocks(experiment: Experiment, n_pixels: int, work: Callable[[slice], T], workers: int | None = None) -> list[T]:
+    """Call `work` for every block of pixels, on threads; return its results in the order of the blocks.
+
+    `workers`: number of threads; default: one per CPU.
+    """
+    size = pixels_per_block(experiment)
+    tasks = (partial(work, slice(start, start + size)) for start in range(0, n_pixels, size))
+    return list(in_order(workers or n_cpus(), tasks))
+
+
 def trace_pixels(
     experiment: Experiment,
     x: np.ndarray,
@@ -174,14 +185,13 @@ def trace_pixels(
     Raises:
         GuardError: rays are unaccounted for, or a larger share than `max_lost` was lost.
     """
-    size = pixels_per_block(experiment)
+    ids = np.arange(len(x))
 
-    def task(start: int) -> Callable[[], Estimate]:
-        part = slice(start, start + size)
-        ids = np.arange(len(x))[part]
-        return lambda: trace_block(experiment, ids, x[part], y[part], first.take(part) if first else None).estimate()
+    def trace(part: slice) -> Estimate:
+        hits = first.take(part) if first else None
+        return trace_block(experiment, ids[part], x[part], y[part], hits).estimate()
 
-    estimate = Estimate.join(list(in_order(workers or n_cpus(), map(task, range(0, len(x), size)))))
+    estimate = Estimate.join(by_blocks(experiment, len(x), trace, workers))
     check_rays(estimate.fates.sum(1), estimate.n_unaccounted, int(np.sum(estimate.fates)), max_lost)
     return estimate
 

@@ -15,6 +15,8 @@ from helio_jax.instrument import Instrument
 from helio_jax.kernel import kernel
 from helio_jax.trace.random import N_BEAM_DIMENSIONS, low_discrepancy_points, philox
 
+PILOT = 1 << 62
+"""Offset of the pixel numbers, which key the random numbers, for a pilot run: its numbers are others than the run's."""
 _MODELS = {"pencil": 0, "uniform": 1, "gaussian": 2, "effusive": 3, "rays": 4}
 _SHIFT_STREAM, _RAY_STREAM, _BOUNCE_STREAM, _BRANCH_STREAM = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 

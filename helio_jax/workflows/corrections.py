@@ -31,7 +31,7 @@ from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
 DEGREE: Literal[1, 2] = 2
 """Degree of the polynomials that smooth the traced image."""
 SMOOTH_PATHS = 8
-"""The traced image is averaged over neighbours until this many paths count in every pixel."""
+"""The traced image is averaged over neighbours until this many guided paths count in every pixel."""
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
 for the test of a result, which is to be traced even where it is bad."""

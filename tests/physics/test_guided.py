@@ -107,7 +107,7 @@ def test_a_wrong_guide_costs_noise_only(bshem, monkeypatch):
 
 
 def test_atoms_that_start_below_the_surface_are_refused(bshem):
-    """A ball's own normals reversed: all atoms meet it from behind."""
+    """First points that lie inside the ball and the substrate: atoms meet them from behind."""
     make, x, y = ball(bshem)
     first = first_hits(make(0).intersector, bshem, x.ravel(), y.ravel())
     inside = replace(first, point=first.point - 1e-2 * first.normal, surface=np.zeros_like(first.surface))

@@ -65,7 +65,9 @@ def test_steps_blur(depth, most):
     assert np.abs(slopes(depth * STEP * (GX > 5.0))).max() < most
 
 
-@pytest.mark.parametrize(("depth", "most"), [(0.2, 0.15), (0.5, 0.6), (1.0, 0.6), (2.5, 0.6), (3.0, 0.15), (4.0, 0.15)])
+@pytest.mark.parametrize(
+    ("depth", "most"), [(0.2, 0.15), (0.5, 0.6), (1.0, 0.6), (2.0, 0.6), (2.5, 0.6), (3.0, 0.15), (4.0, 0.15)]
+)
 def test_narrow_slots_blur(depth, most):
     """Two pixels wide, by no more than the docstring says; depth in pixels."""
     assert np.abs(slopes(-depth * STEP * (np.abs(GX - 5.0) < STEP))).max() < most
