@@ -7,10 +7,10 @@ error bar says whether masks or the near field fix it; a region that something e
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -35,6 +35,9 @@ _LEVEL_STEPS = 5
 HOPELESS = 2.0
 """... unless its misfit is so many times that of the best kind."""
 
+_NEAR, _LEAST_NEAR = 0.25, 3
+"""A parabola goes through the places within this share of the range from the best one, if there are more than so
+many."""
 _UNPREDICTED = 1e100
 """Stands for an infinite misfit, of which no parabola can be made."""
 
@@ -199,8 +202,8 @@ class _RegionSearch:
             best = tried[i]
             if len(tried) > 1 and misfits[kind][i] < limit:
                 at = lambda level, kind=kind: self.misfit_at(level, kind)  # noqa: E731
-                _, found = least_between(at, tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)], _LEVEL_STEPS)
-                best = min((best, found), key=at)
+                low, high, known = tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)], {best: misfits[kind][i]}
+                _, best = least_between(at, low, high, _LEVEL_STEPS, known)
             surface = self.trial(best, kind)
             out.setdefault(surface.height.tobytes(), (self.misfit_at(best, kind), surface))
         return list(out.values())
@@ -269,13 +272,35 @@ def search_levels(
     return Levels(found, moved, undecided)
 
 
-def least_between(misfit: Callable[[float], float], low: float, high: float, evaluations: int) -> tuple[float, float]:
-    """Find the least misfit between two places in so many evaluations: the misfit, and where it is."""
-    options = {"maxiter": evaluations}
-    found: Any = minimize_scalar(
-        lambda at: min(misfit(at), _UNPREDICTED), bounds=(low, high), method="bounded", options=options
-    )
-    return float(found.fun), float(found.x)
+def least_between(
+    misfit: Callable[[float], float],
+    low: float,
+    high: float,
+    evaluations: int,
+    known: Mapping[float, float] | None = None,
+) -> tuple[float, float]:
+    """Find the least misfit between two places: the misfit, and where it is, in one evaluation more than so many.
+
+    Predictions are noisy, and the least value is that of a lucky place. So the place is that of the least of a parabola
+    through all that is tried near it, where that explains the images no worse than by `GAIN`. `known`: misfits by
+    place, of places tried before.
+    """
+    tried = dict(known or {})
+
+    def at(place: float) -> float:
+        tried[place] = min(misfit(place), _UNPREDICTED)
+        return tried[place]
+
+    minimize_scalar(at, bounds=(low, high), method="bounded", options={"maxiter": evaluations})
+    least = min(tried, key=lambda place: tried[place])
+    is_near = lambda place: abs(place - least) <= _NEAR * (high - low) and tried[place] < _UNPREDICTED  # noqa: E731
+    near = np.array([place for place in tried if is_near(place)])
+    if near.size > _LEAST_NEAR:
+        second, first, _ = np.polyfit(near - least, [tried[place] for place in near], 2)
+        vertex = least - 0.5 * first / second if second > 0.0 else least
+        if near.min() < vertex < near.max() and at(float(vertex)) < tried[least] + GAIN:
+            least = float(vertex)
+    return tried[least], least
 
 
 def covered(regions: Sequence[Region], numbers: Iterable[int]) -> np.ndarray:

@@ -5,6 +5,7 @@ substrate does not explain are the pit, to the pixel; a pit in a pit is what the
 explain. The level of a floor is the one whose masks, wall and multiple scattering explain the micrographs.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -246,10 +247,11 @@ class _Region:
             return 0.5 * float(np.sum(self.squares(depth), where=is_weighed))
 
         tried = [misfit(depth) for depth in self.depths]
-        value, depth = min(zip(tried, self.depths, strict=True))
+        found = []
         for place in minima(tried)[:MOST_MINIMA]:
             low, high = self.depths[max(place - 1, 0)], self.depths[min(place + 1, len(tried) - 1)]
-            value, depth = min((value, depth), least_between(misfit, low, high, REFINEMENTS))
+            found.append(least_between(misfit, low, high, REFINEMENTS, {self.depths[place]: tried[place]}))
+        _, depth = min(found, default=(math.inf, self.depths[0]))
         number = np.where(self.inside, self.pits.number.max() + 1, self.pits.number)
         pits, level = Pits(self.at(depth), number, self.squares(depth)), self.above - depth
         floor = floor_of(pits.surface, self.inside)

@@ -157,10 +157,11 @@ def test_errors_of_a_straight_rim_do_not_average():
 def test_a_traced_pit_has_its_level(tmp_path):
     """A square pit, 14 pixels wide and 10 deep, turned, seen from above: outline and level by search alone, no fit.
 
-    The level to 8 %, which is a pixel of a mask's end; measured 1 to 5 %. Rejects the flat substrate and other depths.
+    The level to 8 %, which is a pixel of a mask's end; measured over eight draws, 4.6 to 7.2 % too deep, as the outline
+    takes pixels that the rim cuts. Rejects the flat substrate and other depths.
     """
     fixed = {"outline": "square", "n": 35, "pixel": 10.0, "incidence": 0.0, "width": 140.0, "height": -100.0}
-    member = terraces.draw(np.random.default_rng(4), **fixed, turn=20.0, snr=60.0)
+    member = terraces.draw(np.random.default_rng(9), **fixed, turn=20.0, snr=60.0)
     stack = terraces.trace(member, tmp_path, rays=64)
     settings = ReconstructSettings(border="flat")
     fits = _Fits(stack, settings, lambda n: make_predictor(stack, n, settings.refine.substrate_um), None)
