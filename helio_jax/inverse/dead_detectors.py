@@ -8,27 +8,33 @@ from helio_jax.inverse.linear import signal_of
 from helio_jax.micrograph import MicrographStack
 
 SEEN, NOTHING = 10.0, 3.0
-"""A detector is dead whose whole signal would be so many standard deviations, by the others, and is below so many."""
+"""A detector is dead whose signal would be so many standard deviations, by the others, and is below so many ..."""
+LEAST_SHARE = 0.005
+"""... or below this share of what it would be: a background is not known better than that."""
 
 
 def dead_detectors(stack: MicrographStack) -> list[str]:
     """Name the detectors whose signal, summed over the observed pixels, is no more than noise.
 
     What it would be is taken from the median of the other detectors, each by the signal of a level substrate; its noise
-    from the stated variance, with that of one atom added, as zero counts have a Poisson variance of zero.
+    from the stated variance, with that of one atom added, as zero counts have a Poisson variance of zero. Where no
+    detector has counts, all are named.
     """
+    names = stack.instrument.detector_names
+    if not np.any(stack.counts[stack.is_observed]):
+        return list(names)
     signal, variance = signal_of(stack)
     of_level = substrate_signal(Optics.of(stack.instrument))
     is_known = np.isfinite(signal)
     n = is_known.sum((1, 2))
     total, spread = (np.where(is_known, image, 0.0).sum((1, 2)) for image in (signal, variance))
     dead = []
-    for k, name in enumerate(stack.instrument.detector_names):
+    for k, name in enumerate(names):
         others = (np.arange(len(n)) != k) & (n > 0) & (total > 0.0)
         if n[k] and others.any():
             expected = n[k] * of_level[k] * np.median(total[others] / (n * of_level)[others])
             of_one = np.median(spread[others] / total[others])  # what an atom adds to the variance, over the signal
             is_seen = expected > SEEN * np.sqrt(spread[k] + of_one * expected)
-            if is_seen and total[k] < NOTHING * np.sqrt(spread[k] + of_one**2):
+            if is_seen and total[k] < max(NOTHING * np.sqrt(spread[k] + of_one**2), LEAST_SHARE * expected):
                 dead.append(name)
     return dead

@@ -99,8 +99,11 @@ def reconstruct_stack(
         )
     if dead := dead_detectors(stack):
         raise GuardError(
-            f"detector {dead[0]!r} shows no signal in any pixel, where the others do: if it was off, leave its image "
-            "out or set it to NaN, which stands for pixels without data"
+            "no detector counts anything: were these data read from the right file and channels?"
+            if len(dead) == stack.shape[0]
+            else f"detector {dead[0]!r} shows no signal beyond its background, where the others do: if it was off, or "
+            "below the horizon of all that was scanned, leave its image out or set it to NaN, which stands for pixels "
+            "without data; if not, its background is too high"
         )
     if settings.method == "refine":
         result, misfit_of, anchors, region, off_substrate = _refined(stack, settings, make_predict, report, start)

@@ -26,12 +26,13 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.trace.denoise import passes_for
+from helio_jax.trace.guided import LEAST_PATHS
 from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
 
 DEGREE: Literal[1, 2] = 2
 """Degree of the polynomials that smooth the traced image."""
-SMOOTH_PATHS = 8
-"""The traced image is averaged over neighbours until this many guided paths count in every pixel."""
+SMOOTH_PATHS = 40
+"""The traced image is averaged over neighbours until this many plain paths count in every pixel."""
 MAX_BURIED = {"horizon": 0.05, "rays": 0.3}
 """Largest share of atoms that may start below a neighbouring facet of a reconstructed (noisy) surface: for a fit, and
 for the test of a result, which is to be traced even where it is bad."""
@@ -124,7 +125,7 @@ def make_predictor(
         either_way = [raster.sides(smooth, smooth_normals, hidden, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         n_paths = round(n_rays / n_traced)
-        passes, limit = passes_for(max(n_paths / height.size, 1.0), SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
+        passes, limit = passes_for(max(n_paths / height.size, LEAST_PATHS), SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
         terms = COSINE_LAW if law is None else law.terms()
         multiple = [[s.multiple(n_paths, seed, limit, albedo, terms, workers) for s in way] for way in either_way]
         images = np.array(

@@ -35,8 +35,29 @@ def test_a_channel_that_was_off(bshem):
     dark = np.random.default_rng(2).poisson(5.0, (15, 15))
     background = np.array([0.0, 5.0, 0.0])
     assert dead_detectors(with_counts(stack, dark, background=background)) == [bshem.detector_names[1]]
-    with pytest.raises(GuardError, match="shows no signal"):
+    with pytest.raises(GuardError, match="shows no signal beyond its background"):
         pipeline.reconstruct(with_counts(stack, dark, background=background), "linear")
+
+
+@pytest.mark.parametrize("size", [15, 121])
+def test_a_background_that_is_slightly_wrong_does_not_revive_it(bshem, size):
+    """Dark counts of 5 with a background of 4.9 and 5.1, 0.01 % of the level's signal.
+
+    Rejects a limit in standard deviations alone, which such a difference passes in many pixels.
+    """
+    stack = flat(bshem, size=size)
+    dark = np.random.default_rng(4).poisson(5.0, (size, size))
+    for stated in (4.9, 5.1):
+        background = np.array([0.0, stated, 0.0])
+        assert dead_detectors(with_counts(stack, dark, background=background)) == [bshem.detector_names[1]]
+
+
+def test_nothing_counted_at_all(bshem):
+    """An error that says so, not one of the solver."""
+    stack = flat(bshem)
+    empty = stack.replace(counts=np.zeros(stack.shape), variance=np.zeros(stack.shape))
+    with pytest.raises(GuardError, match="no detector counts anything"):
+        pipeline.reconstruct(empty, "linear")
 
 
 def test_what_is_not_dead(bshem):

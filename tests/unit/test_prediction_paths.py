@@ -8,8 +8,6 @@ from helio_jax.forward.render import Corrections
 from helio_jax.inverse.methods import reconstruct_stack
 from helio_jax.inverse.settings import (
     LEAST_PATHS,
-    MANY_PATHS,
-    OF_MANY,
     PATHS_PER_PIXEL,
     SEARCH_THRIFT,
     START_THRIFT,
@@ -23,8 +21,7 @@ from helio_jax.workflows.corrections import make_predictor
 def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():
     """A large image has a least number per pixel: a fixed number for all drowned sphere A's ring in noise."""
     large = 351 * 304
-    assert RefineSettings().paths(large) == OF_MANY * large > 5_000_000
-    assert RefineSettings().paths(10_000) == PATHS_PER_PIXEL * 10_000 < MANY_PATHS == RefineSettings().paths(20_000)
+    assert RefineSettings().paths(large) == PATHS_PER_PIXEL * large > 10_000_000
     assert RefineSettings().paths(100) == LEAST_PATHS
     assert RefineSettings(rays=20_000).paths(large) == 20_000
 
@@ -38,7 +35,7 @@ def test_a_tiny_raster_takes_no_more_paths_than_the_tracer_has(bshem):
 
 
 def test_only_the_start_is_predicted_with_fewer_paths(bshem):
-    """Photometric solutions with half of the paths, the round of the fit with all, its test with a quarter."""
+    """Photometric solutions with a quarter of the paths, the round of the fit with all, its test with an eighth."""
     n_paths = 4 * LEAST_PATHS
     axis = 40.0 * np.arange(8.0)
     counts = 35e3 * form_factor(Optics.of(bshem), np.zeros((8, 8)))[:, 2]
