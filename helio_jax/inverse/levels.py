@@ -232,8 +232,8 @@ def search_levels(
     fit is kept.
 
     A fit that bridged jumps raised the surroundings, and their masks and multiple scattering let it stay so: the foot
-    of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions of measured levels are also tried
-    on a flat substrate: at height 0, or with a free border on the plane of the slopes around.
+    of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions are also tried on a flat
+    substrate: at height 0, or on the plane of the slopes around where the border is free or the level is not measured.
 
     Args:
         regions: one after the other; they may overlap.
@@ -253,14 +253,13 @@ def search_levels(
         base, name = without_skirt(region, done, found), f"region {i + 1} of {len(regions)}, {inside.sum()} pixels"
         search = _RegionSearch(name, region, base, pitch, max_width, beam_shift, misfit, report)
         trials = search.search()
-        if region.step is not None:
-            if is_substrate_flat:
-                plane, kept = Surface(*np.zeros((3, *inside.shape))), done | inside
-            else:
-                plane, kept = plane_around(region, done, found if moved else surface, pitch), done
-            flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
-            trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
-            trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
+        if is_substrate_flat and region.step is not None:
+            plane, kept = Surface(*np.zeros((3, *inside.shape))), done | inside
+        else:
+            plane, kept = plane_around(region, done, found if moved else surface, pitch), done
+        flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
+        trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
+        trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
         explanations = [(best, found), *(short_fit(trial) for _, trial in trials)]
         value, better = min(explanations, key=lambda entry: entry[0])
         if value < best - GAIN:
