@@ -33,6 +33,9 @@ UNGUIDED = 0.2
 """Share of the paths that take all cells alike: where the pilot met nothing, weights are up to 1 / UNGUIDED."""
 MOST_PILOT = 0.25
 """Largest number of rays of the pilot, per plain path: it leaves out pixels where it would have more."""
+MOST_GAIN = 10.0
+"""So many times fewer paths than plain ones at most: on an almost level surface, where the pilot meets next to nothing,
+what it missed would stand out in single pixels."""
 LEAST_PATHS = 8
 """Paths of each pixel at least: with 2 of them single pixels of a 351 x 304 raster were off by 80 % of the signal."""
 NEIGHBOURS = 0.6, 0.4
@@ -49,7 +52,7 @@ class Guide:
         shares: probability that a path takes a cell [guide, azimuth, elevation].
         of_pixel: number of each pixel's guide [pixel].
         gain: variance of plain paths over that of as many guided ones, mean of the raster, by second moments of what
-            the pilot met; measured gains are 0.4 to 1.8 times it. Infinite where no atom meets the surface.
+            the pilot met, up to `MOST_GAIN`; measured gains are 0.4 to 1.8 times it.
     """
 
     shares: np.ndarray
@@ -151,7 +154,7 @@ def make_guide(
         np.minimum(np.arange(n) // stride, m.size - 1) for n, m in zip(shape, (rows, columns), strict=True)
     )
     of_pixel = (y_guide[:, None] * columns.size + x_guide).ravel()
-    return Guide(shares, of_pixel, plain / guided if guided > 0.0 else math.inf)
+    return Guide(shares, of_pixel, min(plain / guided, MOST_GAIN) if guided > 0.0 else MOST_GAIN)
 
 
 def _trace_block(
