@@ -29,7 +29,7 @@ GAIN = 30.0
 """By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
 worse may be true as well."""
 MOST_FITS = 2
-"""So many surfaces with a region at its measured level are fitted shortly."""
+"""So many surfaces with a region at the best levels are fitted shortly."""
 _LEVEL_STEPS = 5
 """Evaluations by which the best level of a kind of relief is refined ..."""
 HOPELESS = 2.0

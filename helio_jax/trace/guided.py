@@ -36,7 +36,7 @@ MOST_PILOT = 0.25
 MOST_GAIN = 10.0
 """So many times fewer paths than plain ones at most: on an almost level surface, where the pilot meets next to nothing,
 what it missed would stand out in single pixels."""
-LEAST_PATHS = 8
+LEAST_PER_PIXEL = 8
 """Paths of each pixel at least: with 2 of them single pixels of a 351 x 304 raster were off by 80 % of the signal."""
 NEIGHBOURS = 0.6, 0.4
 """Gaussian width over which the cells met are averaged: in pixels of the pilot, and in cells."""
@@ -76,7 +76,7 @@ def trace_multiple(
         first: first scattering points and the normals there, pixels in the order of the raster [y * x].
         x, y: beam positions at which the points are illuminated [y, x] [um].
         n_paths: plain paths, of all pixels together, whose noise is wanted. Guided ones are so many times fewer as the
-            pilot finds, but each pixel has `LEAST_PATHS` at least, and 65536 at most.
+            pilot finds, but each pixel has `LEAST_PER_PIXEL` at least, and 65536 at most.
         workers: number of threads; default: one per CPU.
         max_lost: largest share of atoms that may meet the surface from behind; of the first flights by the pilot alone.
 
@@ -85,7 +85,7 @@ def trace_multiple(
     """
     flat = np.ascontiguousarray(x.ravel()), np.ascontiguousarray(y.ravel())
     guide = make_guide(experiment, first, *flat, x.shape, n_paths / x.size, workers, max_lost)
-    of_each = min(max(LEAST_PATHS, round(n_paths / x.size / guide.gain)), RAYS_PER_BLOCK)
+    of_each = min(max(LEAST_PER_PIXEL, round(n_paths / x.size / guide.gain)), RAYS_PER_BLOCK)
     e = replace(experiment, sampling=Sampling.make(1, of_each, 1, experiment.sampling.seed), n_orders=2)
     ids, points = np.arange(x.size), low_discrepancy_points(of_each, 4)
 
@@ -114,7 +114,7 @@ def make_guide(
     Raises:
         GuardError: a larger share than `max_lost` of the atoms meets the surface from behind.
     """
-    stride = math.ceil(math.sqrt(AREA.size / (MOST_PILOT * max(of_each, LEAST_PATHS))))
+    stride = math.ceil(math.sqrt(AREA.size / (MOST_PILOT * max(of_each, LEAST_PER_PIXEL))))
     rows, columns = (np.arange(min(stride // 2, n - 1), n, stride) for n in shape)
     numbers = np.arange(x.size).reshape(shape)
     chosen = numbers[np.ix_(rows, columns)].ravel()

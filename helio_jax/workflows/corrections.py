@@ -26,7 +26,7 @@ from helio_jax.instrument import Instrument
 from helio_jax.micrograph import MicrographStack
 from helio_jax.scene.scattering import COSINE_LAW
 from helio_jax.trace.denoise import passes_for
-from helio_jax.trace.guided import LEAST_PATHS
+from helio_jax.trace.guided import LEAST_PER_PIXEL
 from helio_jax.workflows.surface_hypotheses import LIMB, ScanRaster
 
 DEGREE: Literal[1, 2] = 2
@@ -125,7 +125,10 @@ def make_predictor(
         either_way = [raster.sides(smooth, smooth_normals, hidden, way) for way in raster.continuations]
         sides, n_traced = either_way[0], n_beams * len(either_way) * len(either_way[0])
         n_paths = round(n_rays / n_traced)
-        passes, limit = passes_for(max(n_paths / height.size, LEAST_PATHS), SMOOTH_PATHS, DEGREE), MAX_BURIED[masks_by]
+        passes, limit = (
+            passes_for(max(n_paths / height.size, LEAST_PER_PIXEL), SMOOTH_PATHS, DEGREE),
+            MAX_BURIED[masks_by],
+        )
         terms = COSINE_LAW if law is None else law.terms()
         multiple = [[s.multiple(n_paths, seed, limit, albedo, terms, workers) for s in way] for way in either_way]
         images = np.array(

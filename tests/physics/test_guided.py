@@ -41,8 +41,21 @@ def runs(make, x, y, n_paths: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unguided(n_pixels: int) -> Guide:
-    """Return a guide that all cells are alike to."""
+    """Return a guide by which paths take all cells alike."""
     return Guide(guided.AREA[None].copy(), np.zeros(n_pixels, int), 1.0)
+
+
+def noted_gains(monkeypatch) -> list[float]:
+    """Return a list to which the gain of every further guide is added."""
+    of_pilot, gains = guided.make_guide, []
+
+    def noted(*args):
+        guide = of_pilot(*args)
+        gains.append(guide.gain)
+        return guide
+
+    monkeypatch.setattr(guided, "make_guide", noted)
+    return gains
 
 
 @pytest.mark.parametrize("name", ["sphere", "slot"])
@@ -120,13 +133,7 @@ def test_lobes_are_as_noisy_as_without_a_guide(bshem, monkeypatch):
     """
     monkeypatch.setitem(LAWS, "power", {COSINE: CosinePowerLaw(exponent=0.5).terms()})
     make, x, y = ball(bshem, "power")
-    of_pilot, gains = guided.make_guide, []
-
-    def noted(*args):
-        gains.append(of_pilot(*args).gain)
-        return of_pilot(*args)
-
-    monkeypatch.setattr(guided, "make_guide", noted)
+    gains = noted_gains(monkeypatch)
     found, variance = runs(make, x, y, 64)
     monkeypatch.setattr(guided, "make_guide", lambda *args: unguided(x.size))
     plain, of_plain = runs(make, x, y, 64)
@@ -141,13 +148,7 @@ def test_fewer_paths_have_the_noise_of_plain_ones(bshem, monkeypatch):
     Catches a gain that is 1, or that of the numbers of atoms that meet the surface.
     """
     make, x, y = ball(bshem)
-    of_pilot, gains = guided.make_guide, []
-
-    def noted(*args):
-        gains.append(of_pilot(*args).gain)
-        return of_pilot(*args)
-
-    monkeypatch.setattr(guided, "make_guide", noted)
+    gains = noted_gains(monkeypatch)
     _, variance = runs(make, x, y, 1024)
     monkeypatch.setattr(guided, "make_guide", lambda *args: unguided(x.size))
     _, plain = runs(make, x, y, 1024)

@@ -19,7 +19,7 @@ from helio_jax.workflows.corrections import make_predictor
 
 
 def test_paths_follow_the_pixels_but_for_small_images_and_given_numbers():
-    """A large image has a least number per pixel: a fixed number for all drowned sphere A's ring in noise."""
+    """A large image gets as many paths per pixel as any other: a fixed number drowned sphere A's ring in noise."""
     large = 351 * 304
     assert RefineSettings().paths(large) == PATHS_PER_PIXEL * large > 10_000_000
     assert RefineSettings().paths(100) == LEAST_PATHS
