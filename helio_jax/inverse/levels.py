@@ -29,7 +29,7 @@ GAIN = 30.0
 """By how much another level must lower the misfit [half chi-square] to be kept; what explains the images less than that
 worse may be true as well."""
 MOST_FITS = 2
-"""So many surfaces with a region at the best levels are fitted shortly."""
+"""So many surfaces with a region at the best levels are fitted shortly, and a rival that puts the region elsewhere."""
 _LEVEL_STEPS = 5
 """Evaluations by which the best level of a kind of relief is refined ..."""
 HOPELESS = 2.0
@@ -228,8 +228,8 @@ def search_levels(
 ) -> Levels:
     """Find the surface with all regions at the levels that explain the images best.
 
-    For every kind of relief the best level is found with nothing fitted. What explains the images best after a short
-    fit is kept.
+    For every kind of relief the best level is found with nothing fitted. The best of these are fitted shortly, and one
+    that puts a region elsewhere whose level is not measured. What then explains the images best is kept.
 
     A fit that bridged jumps raised the surroundings, and their masks and multiple scattering let it stay so: the foot
     of a mesa came to rest at 15 % of its height, at twice the chi-square. So regions are also tried on a flat
@@ -258,9 +258,11 @@ def search_levels(
         else:
             plane, kept = plane_around(region, done, found if moved else surface, pitch), done
         flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
-        trials += replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
-        trials = sorted(trials, key=lambda entry: entry[0])[:MOST_FITS]
-        explanations = [(best, found), *(short_fit(trial) for _, trial in trials)]
+        on_flat = replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
+        starts = _best_surfaces(trials + on_flat)[:MOST_FITS]
+        if region.step is None:
+            starts += _rivals(_best_surfaces(trials), starts, inside, search.surroundings)[:1]
+        explanations = [(best, found), *map(short_fit, starts)]
         value, better = min(explanations, key=lambda entry: entry[0])
         if value < best - GAIN:
             best, found = value, better
@@ -351,6 +353,16 @@ def _beyond_skirt(region: Region, others: np.ndarray) -> np.ndarray:
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     """Grow a mask [y, x] by so many pixels."""
     return np.asarray(binary_dilation(mask, np.ones((3, 3)), iterations=pixels))
+
+
+def _best_surfaces(trials: list[tuple[float, Surface]]) -> list[Surface]:
+    """Sort the surfaces of trials by their misfits."""
+    return [surface for _, surface in sorted(trials, key=lambda entry: entry[0])]
+
+
+def _rivals(trials: list[Surface], chosen: list[Surface], inside: np.ndarray, surroundings: float) -> list[Surface]:
+    """Select the trials that put a region elsewhere than all that are chosen."""
+    return [trial for trial in trials if all(_differ(trial, other, inside, surroundings) for other in chosen)]
 
 
 def _differ(surface: Surface, other: Surface, inside: np.ndarray, surroundings: float) -> bool:
