@@ -91,20 +91,7 @@ def reconstruct_stack(
         GuardError: fewer than 3 images, no pixel recorded in 3 of them, a detector without signal, or a height
             that is not finite.
     """
-    n_usable = stack.is_observed.sum(0)
-    if stack.shape[0] < MIN_IMAGES or not (n_usable >= MIN_IMAGES).any():
-        raise GuardError(
-            f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
-            f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
-        )
-    if dead := dead_detectors(stack):
-        raise GuardError(
-            "no detector counts anything: were these data read from the right file and channels?"
-            if len(dead) == stack.shape[0]
-            else f"detector {dead[0]!r} shows no signal beyond its background, where the others do: if it was off, or "
-            "below the horizon of all that was scanned, leave its image out or set it to NaN, which stands for pixels "
-            "without data; if not, its background is too high"
-        )
+    check_images(stack)
     if settings.method == "refine":
         result, misfit_of, anchors, region, off_substrate = _refined(stack, settings, make_predict, report, start)
         _check_finite(result)
@@ -124,6 +111,24 @@ def reconstruct_stack(
         why = f"method {settings.method!r} takes none, refine does"
         result = result.replace(warnings=(UNUSED.format(n=len(settings.anchor), why=why), *result.warnings))
     return result
+
+
+def check_images(stack: MicrographStack) -> None:
+    """Raise GuardError where heights cannot be had: too few images of every pixel, or a detector without signal."""
+    n_usable = stack.is_observed.sum(0)
+    if stack.shape[0] < MIN_IMAGES or not (n_usable >= MIN_IMAGES).any():
+        raise GuardError(
+            f"heights need {MIN_IMAGES} or more images of a pixel, got at most {int(n_usable.max())} from "
+            f"{stack.shape[0]} detectors: add detector directions, or align rotated scans (helio align)"
+        )
+    if dead := dead_detectors(stack):
+        raise GuardError(
+            "no detector counts anything: were these data read from the right file and channels?"
+            if len(dead) == stack.shape[0]
+            else f"detector {dead[0]!r} shows no signal beyond its background, where the others do: if it was off, or "
+            "below the horizon of all that was scanned, leave its image out or set it to NaN, which stands for pixels "
+            "without data; if not, its background is too high"
+        )
 
 
 def _tested(

@@ -10,7 +10,7 @@ from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.forward.form_factor import substrate_signal
 from helio_jax.forward.optics import Optics
 from helio_jax.inverse.linear import MIN_IMAGES
-from helio_jax.inverse.methods import reconstruct_stack
+from helio_jax.inverse.methods import check_images, reconstruct_stack
 from helio_jax.inverse.settings import ReconstructSettings
 from helio_jax.inverse.state import Predict
 from helio_jax.micrograph import MicrographSet, MicrographStack
@@ -240,6 +240,7 @@ class _Reconstructing:
         """Fit the heights without error bars."""
         from helio_jax.inverse.explanations import explain
 
+        check_images(stack)
         return explain(stack, self.settings, self._make_predict(stack), report, stack.parallax_height).fit
 
     def predict(self, stack: MicrographStack) -> Predict:

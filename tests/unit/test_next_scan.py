@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import helio_jax as hx
 import helio_jax.__main__
 from helio_jax.commands.app import app
-from helio_jax.errors import SceneError
+from helio_jax.errors import GuardError, SceneError
 from helio_jax.inverse.settings import ReconstructSettings, RefineSettings
 from helio_jax.micrograph import ScanAlignment
 from helio_jax.workflows import pipeline
@@ -140,6 +140,17 @@ def test_scans_without_noise_or_time_of_their_own_are_refused(first):
         hx.next_scan(first.replace(noise="expected"), 10.0)
     with pytest.raises(SceneError, match="aligned or joined"):
         hx.next_scan(first.replace(alignment=ScanAlignment()), 10.0)
+
+
+def test_images_that_give_no_heights_are_refused(first):
+    """Two images, and a detector that was off. Catches a list from a fit of nothing."""
+    nan = np.where(np.arange(3)[:, None, None] == 2, np.nan, first.counts)
+    with pytest.raises(GuardError, match="heights need 3 or more images"):
+        hx.next_scan(first.replace(counts=nan), SECONDS, settings=QUICK)
+    counts = first.counts * np.array([1.0, 0.0, 1.0])[:, None, None]
+    off = first.replace(counts=counts, variance=np.maximum(counts, 1.0), background=np.zeros(3))
+    with pytest.raises(GuardError, match=f"detector '{first.instrument.detector_names[1]}' shows no signal"):
+        hx.next_scan(off, SECONDS, settings=QUICK)
 
 
 def test_page(tmp_path, monkeypatch):
