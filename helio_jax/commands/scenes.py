@@ -1,4 +1,4 @@
-"""Commands about scene and instrument files: scenes, init, validate, schema."""
+"""Commands about scene, instrument and study files: scenes, init, validate, schema."""
 
 import json
 from dataclasses import asdict
@@ -22,7 +22,7 @@ def scenes(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the scenes and instruments that come with helio; copy one with the files that it reads, to change it."""
+    """List the scenes, instruments, studies that come with helio; copy one with the files it reads, to change it."""
     if action == "copy":
         _copy(name, folder or Path(), force, as_json)
         return
@@ -35,7 +35,9 @@ def scenes(
     width = max(map(len, names), default=0)
     for called, file in zip(names, files, strict=True):
         print(f"{called:<{width}}  {file.kind:<10}  {file.about}")
-    print("\nhelio run NAME; helio import --instrument NAME; helio scenes copy NAME: a copy to change")
+    print(
+        "\nhelio run NAME; helio import --instrument NAME; helio study NAME; helio scenes copy NAME: a copy to change"
+    )
 
 
 def _copy(name: str | None, folder: Path, force: bool, as_json: bool) -> None:

@@ -38,7 +38,7 @@ from helio_jax.commands.door import Force, Reads, Writes, keep_existing
 
 RUN = ("micrographs.h5", "height.h5", "scores.json", "report.html", "report.png")
 """What `run` writes in its folder (pipeline.py)."""
-STUDY = ("study.json", "index.json", "index.csv", "index.png")
+STUDY = ("study.json", "index.json", "index.csv", "index.png", "table.md")
 """What `study` writes in its folder beside the points (study.py)."""
 
 
@@ -216,7 +216,9 @@ def rerun(
 @app.command()
 def study(
     file: Annotated[
-        Path, typer.Argument(help="Study file (TOML): a scene and what is varied.", metavar="STUDY.toml"), Reads()
+        Path,
+        typer.Argument(help="Study file (TOML), or a name that helio scenes lists.", metavar="STUDY"),
+        Reads(),
     ],
     output: Annotated[
         Path,
@@ -230,13 +232,17 @@ def study(
     scheduler: Scheduler = None,
     as_json: AsJson = False,
 ) -> None:
-    """Vary values of a scene: each point in its own folder, with an index of values and scores."""
+    """Vary values of a scene: each point in its own folder, an index, a table and a figure of the scores."""
     from helio_jax.workflows.pipeline import Executor, SimulateOptions
     from helio_jax.workflows.study import run_study
 
     options = SimulateOptions(executor=Executor(workers, processes, scheduler), shard=shard, say=say)
-    index = str(run_study(file, output, resume=go_on, options=options))
-    print_result(as_json, {"index": index}, index)
+    index = run_study(file, output, resume=go_on, options=options)
+    files = {"index": index, "table": index.with_name("table.md"), "figure": index.with_name("index.png")}
+    written = {what: str(path) for what, path in files.items() if path.is_file()}
+    if not as_json and "table" in written:
+        print(files["table"].read_text(encoding="utf-8"))
+    print_result(as_json, written, *written.values())
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Copy a scene or instrument that comes with the program, with every file that it reads."""
+"""Copy a scene, instrument or study that comes with the program, with every file that it reads."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ def copy_shipped(name: str, folder: Path, *, force: bool = False) -> list[Path]:
     """Copy a shipped file and what it extends; files that are there already, byte for byte, are left as they are.
 
     Args:
-        name: of the scene or instrument.
+        name: of the scene, instrument or study; the scene of a study is found by its name.
         folder: where it goes; it is made, with the folders within that the file names.
         force: replace files that differ.
 

@@ -116,9 +116,9 @@ def _of_hdf5(path: Path) -> Found:
 
 def _of_toml(path: Path) -> Found:
     tables = read_tables(path)
-    if "vary" in tables:
+    if "vary" in tables or "case" in tables:
         study = load_study(path)
-        varied = ", ".join(study.vary)
+        varied = ", ".join([*study.vary, *(["cases: " + ", ".join(study.case)] if study.case else [])])
         rows = [("study", study.name), ("scene", study.scene), ("varies", varied)]
         rows.append(("points", f"{len(study.points())} ({study.design})"))
         return "study", rows, {"settings": study.model_dump(mode="json")}

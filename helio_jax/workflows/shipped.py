@@ -1,4 +1,4 @@
-"""Scenes and instruments that come with the program, found by name.
+"""Scenes, instruments and studies that come with the program, found by name.
 
 They stand in one place, `scenes/` of the repository; a wheel holds that folder inside the package (pyproject.toml).
 """
@@ -11,8 +11,8 @@ from typing import Literal
 from helio_jax.errors import SceneError
 from helio_jax.spelling import did_you_mean
 
-Kind = Literal["scene", "instrument"]
-"""What a file describes; a scene contains an instrument."""
+Kind = Literal["scene", "instrument", "study"]
+"""What a file describes; a scene contains an instrument, a study varies a scene."""
 ALIASES = {"bshem": "bshem_wd3", "ashem": "ashem_normal"}
 """Short names of the instruments that measured scans come from."""
 
@@ -45,14 +45,14 @@ def shipped_folder() -> Path:
 
 
 def list_shipped() -> tuple[Shipped, ...]:
-    """List the scenes, then the instruments, each by name."""
-    folder = shipped_folder()
-    scenes = [Shipped(path.stem, "scene", path) for path in sorted(folder.glob("*.toml"))]
-    return (*scenes, *(Shipped(p.stem, "instrument", p) for p in sorted(folder.glob("instruments/*.toml"))))
+    """List the scenes, then the instruments, then the studies, each by name."""
+    kinds: dict[Kind, str] = {"scene": "*.toml", "instrument": "instruments/*.toml", "study": "studies/*.toml"}
+    found = {kind: sorted(shipped_folder().glob(pattern)) for kind, pattern in kinds.items()}
+    return tuple(Shipped(path.stem, kind, path) for kind, paths in found.items() for path in paths)
 
 
 def find_shipped(name: str) -> Shipped:
-    """Return the scene or instrument of a name.
+    """Return the scene, instrument or study of a name.
 
     Raises:
         SceneError: there is none; the message names the nearest.
@@ -61,11 +61,13 @@ def find_shipped(name: str) -> Shipped:
     if found := files.get(ALIASES.get(name, name)):
         return found
     question = did_you_mean(name, [*files, *ALIASES], most=3) or "choose another name"
-    raise SceneError(f"no scene or instrument called {name!r} comes with helio: {question} (helio scenes lists all)")
+    raise SceneError(
+        f"no scene, instrument or study called {name!r} comes with helio: {question} (helio scenes lists all)"
+    )
 
 
 def locate(name: str | os.PathLike, folder: Path = Path()) -> Path:
-    """Return the path of a scene or instrument file that is given by its path or by its name.
+    """Return the path of a scene, instrument or study that is given by its path or by its name.
 
     A file that is there always wins. A name has neither a folder nor a suffix; it is looked up among those that come
     with the program.

@@ -1,9 +1,9 @@
 """Parameter studies: one scene with varied values, each point in its own folder.
 
-A study file names a scene, values set for all points, and varied values: all combinations (`grid`), lists of equal
-length (`list`) or Sobol points in ranges (`sobol`). The folder of a point holds its scene as TOML (which `helio run`
-repeats), its micrographs and optionally height map and scores; index.csv and index.json list all points. Tracing stores
-finished units, so a killed study loses seconds.
+A study file names a scene, values set for all points, named cases and varied values: all combinations (`grid`), lists
+of equal length (`list`) or Sobol points in ranges (`sobol`). The folder of a point holds its scene as TOML (which
+`helio run` repeats), its micrographs and optionally height map and scores; index.csv and index.json list all points,
+index.png shows them. Tracing stores finished units, so a killed study loses seconds.
 """
 
 import csv
@@ -17,11 +17,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from helio_jax.cpus import peak_memory_gb
 from helio_jax.errors import GuardError, HelioError, InterruptedRun, ResumeError, SceneError, StoppedRun
 from helio_jax.figures.sweep import save_sweep
+from helio_jax.figures.wording import duration
 from helio_jax.formats.safe import atomic_path, check_outputs, files_within, make_folder
 from helio_jax.formats.toml import to_toml
-from helio_jax.micrograph import MicrographStack
 from helio_jax.reconstruction import end_if_interrupted
 from helio_jax.scene.files import read_bytes
 from helio_jax.texts import parse_json
@@ -30,16 +31,17 @@ from helio_jax.workflows.checkpoint import Shard
 from helio_jax.workflows.scene_file import files_read, load_scene, resolved, with_files
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import MAX_STUDY_MB, Study, load_study
+from helio_jax.workflows.study_table import averaged, chosen_scores, image_scores, possible_scores, score_label, table
 
 INDEX_SECONDS = 5.0
 """Minimum time between two updates of the index [s]."""
-WRITTEN = ("study.json", "index.json", "index.csv", "index.png")
+WRITTEN = ("study.json", "index.json", "index.csv", "index.png", "table.md")
 """Files in a study's folder, beside those of its points."""
 
 
 @dataclass(frozen=True)
 class _Point:
-    """One point: number from 1, varied values, folder."""
+    """One point: number from 1, what tells it from the others, folder."""
 
     number: int
     values: dict[str, Any]
@@ -63,7 +65,7 @@ def run_study(
     """Run a study; return the path of index.csv.
 
     Args:
-        path: study file.
+        path: study file, or the name of one that comes with the program.
         folder: output folder of the points and the index.
         resume: continue the study in `folder`: finished points are kept, failed ones repeated.
         options: executor of the tracer; with a shard, every N-th point is run.
@@ -73,25 +75,31 @@ def run_study(
         ResumeError: the folder holds a study and `resume` is false, or another study.
         GuardError: some points failed; the index lists the reasons.
     """
-    path, folder = Path(path), Path(folder)
+    path, folder = locate(path), Path(folder)
     study = load_study(path)
     points = [_Point(i, v, folder / f"point_{i:05d}") for i, v in enumerate(study.points(), start=1)]
     scene_path = locate(study.scene, path.parent)
     inputs = [("the study", path), *files_read(scene_path, "its scene", study.set)]
     check_outputs(inputs, files_within("-o", folder, WRITTEN))
-    scenes = [_scene_text(scene_path, study.set | p.values, f"{path}: point {p.number}") for p in points]
+    scenes = [_scene_text(scene_path, study.overrides(p.values), f"{path}: point {p.number}") for p in points]
+    _check_scores(study, points[0], scene_path, path)
     _begin(folder, path, scenes, is_shared=resume or options.shard is not None)
     shard = Shard.parse(options.shard) if options.shard else Shard(1, 1)
     options = replace(options, shard=None)
-    written = -math.inf
-    for point, text in list(zip(points, scenes, strict=True))[shard.number - 1 :: shard.of]:
-        row = point.row()
-        if row is None or row["status"] == "failed":
-            options.say(f"point {point.number} of {len(points)}: {_short(point.values)}")
-            _run_point(study, point, text, options)
-            if time.monotonic() - written > INDEX_SECONDS:
-                _write_index(study, folder, points)
-                written = time.monotonic()
+    mine = list(zip(points, scenes, strict=True))[shard.number - 1 :: shard.of]
+    todo = [(point, text) for point, text in mine if (row := point.row()) is None or row["status"] == "failed"]
+    start, written = time.monotonic(), -math.inf
+    for i, (point, text) in enumerate(todo):
+        left = f"{len(mine) - len(todo) + i} done, {len(todo) - i} left"
+        if i:
+            each = (time.monotonic() - start) / i
+            memory = peak_memory_gb()
+            left += f", about {duration(each * (len(todo) - i))}" + (f"; {memory:.1f} GB of memory" if memory else "")
+        options.say(f"point {point.number} of {len(points)} ({left}): {_short(point.values)}")
+        _run_point(study, point, text, options)
+        if time.monotonic() - written > INDEX_SECONDS:
+            _write_index(study, folder, points)
+            written = time.monotonic()
     return _write_index(study, folder, points, is_last=True)
 
 
@@ -130,6 +138,15 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
         raise ResumeError(
             f"{folder} holds another study, or {path} or its scene has changed since: choose another folder"
         )
+
+
+def _check_scores(study: Study, first: _Point, scene_path: Path, path: Path) -> None:
+    """Raise SceneError if the index will have no column that the study asks for."""
+    scene = load_scene(scene_path, study.overrides(first.values))
+    possible = possible_scores(study.reconstruct, scene.instrument.detector_names, scene.scan.n_views)
+    for pattern in [study.score] if isinstance(study.score, str) else study.score or []:
+        if not chosen_scores(pattern, possible):
+            raise SceneError(f"{path}: score must be among {', '.join(possible)} (* for any text), got {pattern!r}")
 
 
 def _scene_text(path: Path, overrides: dict[str, Any], place: str) -> str:
@@ -171,21 +188,8 @@ def _run_point(study: Study, point: _Point, text: str, options: pipeline.Simulat
         part.write_text(json.dumps(row) + "\n", encoding="utf-8")
 
 
-def image_scores(stack: MicrographStack) -> dict[str, float]:
-    """Compute mean counts, contrast (std_dev / mean) and share of multiple scattering of each micrograph."""
-    out: dict[str, float] = {}
-    multiple = stack.multiple
-    for k, name in enumerate(stack.instrument.detector_names):
-        mean = float(stack.counts[k].mean())
-        out[f"mean_{name}"] = mean
-        out[f"contrast_{name}"] = float(stack.counts[k].std()) / mean if mean else 0.0
-        if multiple is not None:
-            out[f"multiple_{name}"] = float(multiple[k].mean()) / mean if mean else 0.0
-    return out
-
-
 def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: bool = False) -> Path:
-    """Write index.json, index.csv and, if `is_last`, the plot; return the path of index.csv."""
+    """Write index.json, index.csv and, if `is_last`, table and figure; return the path of index.csv."""
     blank = {"status": "not run", "problem": ""}
     rows = [p.row() or {"point": p.number, **p.values, **blank} for p in points]
     columns = list(dict.fromkeys(key for row in rows for key in row))
@@ -196,19 +200,25 @@ def _write_index(study: Study, folder: Path, points: list[_Point], *, is_last: b
     for name, content in (("index.json", json.dumps(rows, indent=1) + "\n"), ("index.csv", text.getvalue())):
         with atomic_path(folder / name) as part:
             part.write_text(content, encoding="utf-8")
-    failed = [row for row in rows if row["status"] == "failed"]
     if is_last:
-        if study.score and study.score not in columns:
-            raise SceneError(f"{study.name}: score must be one of {', '.join(columns)}, got {study.score!r}")
-        score = study.score or next(
-            (c for c in columns if c.startswith(("rms_region", "rms_image", "multiple_"))), None
-        )
-        if score:
-            save_sweep(rows, list(study.vary), score, study.name, folder / "index.png")
-        if failed:
+        _write_summary(study, folder, rows)
+        if failed := [row for row in rows if row["status"] == "failed"]:
             first = f"the first, point {failed[0]['point']}: {failed[0]['problem']}"
             raise GuardError(f"{len(failed)} of {len(rows)} points failed ({folder / 'index.csv'}); {first}")
     return folder / "index.csv"
+
+
+def _write_summary(study: Study, folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Write the table and the figure of what is done."""
+    scores = chosen_scores(study.score, list(dict.fromkeys(key for row in rows for key in row)))
+    keys = (["case"] if study.case else []) + list(study.vary)
+    labels = {key: study.label.get(key, key) for key in keys}
+    points = averaged(rows, keys, scores)
+    if not scores or not points:
+        return
+    with atomic_path(folder / "table.md") as part:
+        part.write_text(table(points, labels, scores), encoding="utf-8")
+    save_sweep(points, labels, {score: score_label(score) for score in scores}, study.name, folder / "index.png")
 
 
 def _short(values: dict[str, Any]) -> str:

@@ -80,7 +80,7 @@ def test_copy_keeps_what_is_there():
     [
         (("scenes", "copy"), "helio scenes lists their names"),
         (("scenes", "copy", "spher_a"), "did you mean 'sphere_a'"),
-        (("scenes", "copy", "../sphere_a"), "no scene or instrument called '../sphere_a'"),
+        (("scenes", "copy", "../sphere_a"), "no scene, instrument or study called '../sphere_a'"),
         (("scenes", "move", "sphere_a"), "'copy'"),
         (("scenes", "copy", "sphere_a", "file"), "FOLDER: cannot write file: file is a file"),
         (("init", "scene", "there.toml"), "there.toml exists and is kept"),

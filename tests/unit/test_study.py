@@ -1,7 +1,9 @@
 """Studies: which points a design makes, what a point's folder holds, and going on."""
 
 import csv
+import itertools
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -10,11 +12,14 @@ import pytest
 
 import helio_jax as hx
 from helio_jax.errors import GuardError, InterruptedRun, ResumeError, SceneError
+from helio_jax.figures import sweep
 from helio_jax.formats.toml import to_toml
 from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_scene, resolved
+from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study import load_study, resume_study, run_study
+from helio_jax.workflows.study_table import Averaged, averaged, chosen_scores, image_scores, possible_scores, table
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 SMALL = """
@@ -71,6 +76,11 @@ def test_designs(tmp_path):
         ("colour = 1\n[vary]\na = [1]", "colour"),
         ('[vary]\n"scan.nx" = [12, -3]', "point 2.*scan.nx"),
         ('[vary]\n"sample.spheres.4.radius_um" = [1.0]', "spheres"),
+        ("name = 'nothing'", "vary: is empty"),
+        ('score = ["rms_region", "rms_*x"]\n[vary]\n"scan.nx" = [12]', r"score must be among .*rms_image.*'rms_\*x'"),
+        ('score = "rms_image"\nreconstruct = false\n[vary]\n"scan.nx" = [12]', "score must be among mean_forward"),
+        ('repeat = 100\ndesign = "sobol"\nn_points = 2000\n[vary]\na = { low = 1, high = 2 }', "200000 points"),
+        ('[case.a]\n"scan.nx" = -3', "point 1.*scan.nx"),
     ],
 )
 def test_wrong_studies_are_refused_before_anything_runs(tmp_path, text, words):
@@ -80,14 +90,85 @@ def test_wrong_studies_are_refused_before_anything_runs(tmp_path, text, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_documented_study_is_valid():
-    """Catches an example that the program refuses."""
-    path = SCENES.parent / "docs" / "study_cap_height.toml"
-    study = load_study(path)
+def test_cases_and_repetitions(tmp_path):
+    """Each case with each value and each seed; a varied value wins over its case, that over what is set.
+
+    Catches a case that reaches other points, and repetitions with the same noise.
+    """
+    text = 'repeat = 2\n[set]\n"scan.nx" = 5\n"scan.ny" = 6\n[case.one]\n"scan.nx" = 7\nscan.z = 3\n[case."a b"]\n'
+    study = load_study(write(tmp_path, text + '"scan.nx" = 8\n[vary]\nscan.z = [1, 2]'))
     points = study.points()
-    assert len(points) == 10
-    for values in points:
-        load_scene(path.parent / study.scene, study.set | values)
+    assert [tuple(p.values()) for p in points] == list(itertools.product(("one", "a b"), (1, 2), (1, 2)))
+    seeds = {"trace.seed": 2, "noise.seed": 2}
+    assert study.overrides(points[1]) == {"scan.nx": 7, "scan.ny": 6, "scan.z": 1} | seeds
+    assert study.overrides(points[7]) == {"scan.nx": 8, "scan.ny": 6, "scan.z": 2} | seeds
+    alone = load_study(write(tmp_path, '[case.x]\n"scan.nx" = 7'))
+    assert alone.points() == [{"case": "x"}] and alone.overrides({"case": "x"}) == {"scan.nx": 7}
+
+
+EXAMPLES = [SCENES.parent / "docs" / "study_cap_height.toml", *sorted(SCENES.glob("studies/*.toml"))]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_studies_that_come_with_the_program_are_valid(path):
+    """Every point's scene; every score that is shown. Catches an example that the program refuses after an hour."""
+    study = load_study(path)
+    scenes = [load_scene(locate(study.scene, path.parent), study.overrides(p)) for p in study.points()]
+    assert 8 <= len(scenes) <= 60 and set(study.label) <= {"case", *study.vary}
+    names = scenes[-1].instrument.detector_names
+    for pattern in [study.score] if isinstance(study.score, str) else study.score:
+        assert chosen_scores(pattern, possible_scores(study.reconstruct, names, 1))
+
+
+def test_averages(tmp_path):
+    """Mean and standard deviation of runs, by hand; failed runs and other cases do not count.
+
+    Catches units that are not those shown, and a standard deviation of one.
+    """
+    rows = [{"case": "a", "repeat": i, "status": "done", "rms_image": v} for i, v in ((1, 0.01), (2, 0.03))]
+    rows += [{"case": "b", "status": "done", "rms_image": 0.5}, {"case": "b", "status": "failed"}]
+    points = averaged(rows, ["case"], ["rms_image"])
+    assert [p.n for p in points] == [2, 1] and points[1].std["rms_image"] is None
+    assert points[0].mean["rms_image"] == pytest.approx(2.0)
+    assert points[0].std["rms_image"] == pytest.approx(math.sqrt(2.0))
+    lines = table(points, {"case": "sample"}, ["rms_image"]).splitlines()
+    assert lines[0].split("|")[1:3] == [" sample ", " RMS error, whole image [%] "]
+    assert "2 +- 1.4" in lines[2] and lines[3].split("|")[2].strip() == "50"
+
+
+def test_scores_of_micrographs(bshem):
+    """A border of 10 counts, a middle of 25, all else 0; half multiple scattering. Catches means of other pixels."""
+    counts = np.zeros((3, 9, 11))
+    counts[:, [0, -1], :] = counts[:, :, [0, -1]] = 10.0
+    counts[:, 4, 5] = 25.0
+    by_order = np.stack([0.5 * counts, 0.5 * counts])
+    masked = np.arange(3.0)[:, None, None] / 4 * np.ones((9, 11))
+    axes = {"x": np.arange(11.0), "y": np.arange(9.0), "instrument": bshem}
+    found = image_scores(hx.MicrographStack(counts, by_order=by_order, masked=masked, **axes))
+    first, last = bshem.detector_names[0], bshem.detector_names[2]
+    assert found[f"middle_{first}"] == 2.5 and found[f"multiple_{first}"] == 0.5 and found[f"masked_{last}"] == 0.5
+    assert found[f"mean_{first}"] == pytest.approx((36 * 10 + 25) / 99) and f"plate_{first}" not in found
+
+
+def test_figure_has_a_curve_for_each_case(tmp_path, monkeypatch):
+    """Values side by side share an axis: two cases are two curves; points at random are a panel for each value.
+
+    Catches a curve of its own for each point of a list, and a legend that hides the plot.
+    """
+    figures = []
+    monkeypatch.setattr(sweep, "save_figure", lambda figure, path: figures.append(figure))
+    labels = {"case": "method", "a": "a [um]", "b": "b"}
+    rows = [({"case": case, "a": a, "b": 2.0 * a}, a) for case in ("x", "y") for a in (1.0, 10.0, 100.0)]
+    many = [({"case": "x", "a": i * 7 % 20, "b": i * 3 % 20}, i) for i in range(20)]
+    for made in (rows, many):
+        points = [Averaged(values, {"s": mean}, {"s": 0.1}, 2) for values, mean in made]
+        sweep.save_sweep(points, labels, {"s": "score"}, "title", tmp_path / "f.png")
+    first, second = figures
+    assert len(first.axes) == 1 and first.axes[0].get_xscale() == "log" and first.axes[0].get_xlabel() == "a [µm]"
+    assert [text.get_text() for text in first.axes[0].get_legend().get_texts()] == ["x", "y"]
+    assert [ax.get_xlabel() for ax in second.axes] == ["a [µm]", "b"] and all(
+        ax.get_legend() is None for ax in second.axes
+    )
 
 
 @pytest.mark.parametrize("name", ["sphere_a", "step", "trench", "pyramid", "measured_sphere_a"])
@@ -112,6 +193,7 @@ def test_points_index_and_going_on(tmp_path):
     assert [r["sample.spheres.0.cap_height_um"] for r in rows] == ["300.0", "300.0", "700.0", "700.0"]
     assert {r["status"] for r in rows} == {"done"} and (out / "index.png").stat().st_size > 5000
     assert json.loads((out / "index.json").read_text())[2]["trace.seed"] == 1
+    assert len((out / "table.md").read_text().splitlines()) == 2 + 4
     point = out / "point_00003"
     stack = hx.read(point / "micrographs.h5")
     alone = hx.simulate(hx.load_scene(point / "scene.toml"))
@@ -169,7 +251,7 @@ def test_interrupted_and_failed_points(tmp_path, monkeypatch):
     monkeypatch.undo()
     said: list[str] = []
     resume_study(out, say=said.append)
-    assert len(said) == 1 and said[0].startswith("point 2 of 4")
+    assert len(said) == 1 and said[0].startswith("point 2 of 4 (3 done, 1 left)")
 
 
 def test_heights_are_scored(tmp_path):
