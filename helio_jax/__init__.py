@@ -333,6 +333,7 @@ workflows/            what joins the stages
   steps               what helio measure --steps prints
   study               sweeps of scene values
   study_file          the study file
+  study_table         scores of a study, averaged, as a table
   plan                hx.plan: time and expected errors of acquisitions
   design              hx.design: layouts of apertures
   design_result       layouts that a design has found: records, ranking, files

@@ -70,9 +70,10 @@ _OWN = pytest.StashKey[str]()
 def pytest_configure(config: pytest.Config) -> None:
     """Compile quickly, and let all processes of this run share what JAX compiles: most of the time of a small fit.
 
-    Linear algebra takes one thread in each of several processes: waiting threads cost them a tenth of their time.
+    Linear algebra takes one thread in each of several processes: waiting threads cost them a tenth of their time. It is
+    set before they start, for NumPy reads it when it is imported.
     """
-    if "PYTEST_XDIST_WORKER" in os.environ:
+    if getattr(config.option, "numprocesses", None):
         os.environ.setdefault("OMP_NUM_THREADS", "1")
     if version("jaxlib").startswith(_QUICK_JAXLIB):
         os.environ.setdefault("XLA_FLAGS", QUICK_XLA)

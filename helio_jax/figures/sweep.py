@@ -10,8 +10,10 @@ from helio_jax.figures.canvas import Axes, label_axes, new_figure, save_figure
 from helio_jax.figures.wording import typeset
 
 _MOST_CURVES = 10
-"""More curves than this cannot be told apart: single points are drawn."""
+"""Of more curves than this nobody knows which is which: single points are drawn."""
 _COLUMNS = 3
+_LONG = 8
+"""Texts on the horizontal axis that are longer than so many letters are slanted."""
 
 
 def save_sweep(
@@ -45,7 +47,7 @@ def save_sweep(
         panels = [(key, score, {"": points}) for score in scores for key in labels if different[key] > 1]
     else:
         panels = [(across, score, groups) for score in scores]
-    n_columns = min(len(panels), _COLUMNS)
+    n_columns = 2 if len(panels) == 4 else min(len(panels), _COLUMNS)
     n_rows = -(-len(panels) // n_columns)
     fig = new_figure(4.6 * n_columns, 3.6 * n_rows)
     axes = fig.subplots(n_rows, n_columns, squeeze=False).ravel()
@@ -74,9 +76,10 @@ def _draw(ax: Axes, key: str, score: str, curves: Mapping[str, Sequence[Any]], s
     else:
         texts = list(dict.fromkeys(map(str, everything)))
         place = {repr(value): texts.index(str(value)) for value in everything}
-        ax.set_xticks(range(len(texts)), texts, rotation=20, ha="right")
+        long = {"rotation": 20, "ha": "right"} if max(map(len, texts)) > _LONG else {}
+        ax.set_xticks(range(len(texts)), texts, **long)
         ax.set_xlim(-0.5, len(texts) - 0.5)
-    lowest = 0.0
+    drawn: list[float] = []
     for name, points in curves.items():
         known = [point for point in points if score in point.mean]
         if is_number:
@@ -84,8 +87,8 @@ def _draw(ax: Axes, key: str, score: str, curves: Mapping[str, Sequence[Any]], s
         mean = [point.mean[score] for point in known]
         std = [point.std[score] or 0.0 for point in known]
         ax.errorbar([place[repr(p.values[key])] for p in known], mean, std, fmt=style, ms=4, capsize=2, label=name)
-        lowest = min([lowest, *mean])
-    if lowest >= 0.0:
+        drawn += mean
+    if drawn and 0.0 <= min(drawn) < 0.5 * max(drawn):  # not where all is about 100 %
         ax.set_ylim(bottom=0.0)
 
 

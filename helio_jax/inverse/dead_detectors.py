@@ -18,10 +18,10 @@ def dead_detectors(stack: MicrographStack) -> list[str]:
 
     What it would be is taken from the median of the other detectors, each by the signal of a level substrate; its noise
     from the stated variance, with that of one atom added, as zero counts have a Poisson variance of zero. Where no
-    detector has counts, all are named.
+    detector shows more than noise, all are named.
     """
     names = stack.instrument.detector_names
-    if not np.any(stack.counts[stack.is_observed]):
+    if _are_all_dead(stack):
         return list(names)
     signal, variance = signal_of(stack)
     of_level = substrate_signal(Optics.of(stack.instrument))
@@ -38,3 +38,14 @@ def dead_detectors(stack: MicrographStack) -> list[str]:
             if is_seen and total[k] < max(NOTHING * np.sqrt(spread[k] + of_one**2), LEAST_SHARE * expected):
                 dead.append(name)
     return dead
+
+
+def _are_all_dead(stack: MicrographStack) -> bool:
+    """Whether nothing was counted, or in no detector more than the noise of its background."""
+    seen = stack.is_observed
+    if not np.any(stack.counts[seen]):
+        return True
+    if stack.variance is None or np.array_equal(stack.signal[seen], stack.counts[seen]):
+        return False
+    total, spread = (np.where(seen, image, 0.0).sum((1, 2)) for image in (stack.signal, stack.variance))
+    return bool(np.all(total <= NOTHING * np.sqrt(spread)))

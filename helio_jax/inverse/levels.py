@@ -149,7 +149,7 @@ class Region:
 
 @dataclass(frozen=True)
 class _RegionSearch:
-    """Levels tried for one region; `tried` maps the heights of each trial to its misfit."""
+    """Levels tried for one region; `tried` maps the surface of each trial to its misfit."""
 
     name: str
     region: Region
@@ -183,7 +183,7 @@ class _RegionSearch:
     def misfit_at(self, level: float, kind: str) -> float:
         """Compute the misfit with the region at a level above the surroundings, um."""
         trial = self.trial(level, kind)
-        key = trial.height.tobytes()  # deeper than the beam reaches, levels are one surface
+        key = _key(trial)  # deeper than the beam reaches, levels are one surface
         if key not in self.tried:
             self.report(f"{self.name}: trying the level {level:+.0f} um, {kind}")
             self.tried[key] = self.misfit(trial)
@@ -205,7 +205,7 @@ class _RegionSearch:
                 low, high, known = tried[max(i - 1, 0)], tried[min(i + 1, len(tried) - 1)], {best: misfits[kind][i]}
                 _, best = least_between(at, low, high, _LEVEL_STEPS, known)
             surface = self.trial(best, kind)
-            out.setdefault(surface.height.tobytes(), (self.misfit_at(best, kind), surface))
+            out.setdefault(_key(surface), (self.misfit_at(best, kind), surface))
         return list(out.values())
 
     def shifts(self, levels: list[float]) -> list[float]:
@@ -258,7 +258,7 @@ def search_levels(
         else:
             plane, kept = plane_around(region, done, found if moved else surface, pitch), done
         flat = jax.tree.map(lambda f, p, kept=kept: np.where(kept, f, p), found, plane)
-        on_flat = replace(search, name=f"{name}, on a flat substrate", base=flat, tried={}).search()
+        on_flat = replace(search, name=f"{name}, on a flat substrate", base=flat).search()
         starts = _best_surfaces(trials + on_flat)[:MOST_FITS]
         if region.step is None:
             starts += _rivals(_best_surfaces(trials), starts, inside, search.surroundings)[:1]
@@ -356,8 +356,14 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def _best_surfaces(trials: list[tuple[float, Surface]]) -> list[Surface]:
-    """Sort the surfaces of trials by their misfits."""
-    return [surface for _, surface in sorted(trials, key=lambda entry: entry[0])]
+    """Sort the surfaces of trials by their misfits, each surface once."""
+    ordered = sorted(trials, key=lambda entry: entry[0])
+    return list({_key(surface): surface for _, surface in ordered}.values())
+
+
+def _key(surface: Surface) -> bytes:
+    """Return what tells a surface from others."""
+    return b"".join(np.asarray(field).tobytes() for field in jax.tree.leaves(surface))
 
 
 def _rivals(trials: list[Surface], chosen: list[Surface], inside: np.ndarray, surroundings: float) -> list[Surface]:

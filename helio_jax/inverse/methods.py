@@ -123,7 +123,8 @@ def check_images(stack: MicrographStack) -> None:
         )
     if dead := dead_detectors(stack):
         raise GuardError(
-            "no detector counts anything: were these data read from the right file and channels?"
+            "no detector shows a signal beyond its background: were these data read from the right file and channels, "
+            "and is the background right?"
             if len(dead) == stack.shape[0]
             else f"detector {dead[0]!r} shows no signal beyond its background, where the others do: if it was off, or "
             "below the horizon of all that was scanned, leave its image out or set it to NaN, which stands for pixels "

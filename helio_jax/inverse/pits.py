@@ -183,8 +183,9 @@ class PitSearch:
             return pits.misfit
 
         change = NEAR * (region.above - outer.level)
-        least_between(misfit, outer.level - change, outer.level + change, REFINEMENTS)
-        best = min(found, key=lambda sunk: sunk.pits.misfit)
+        _, level = least_between(misfit, outer.level - change, outer.level + change, REFINEMENTS)
+        least = next(sunk for sunk in found[1:] if sunk.level == level)
+        best = min(found[0], least, key=lambda sunk: sunk.pits.misfit)
         return best._replace(places=inner.places + [(place, best.level) for place, _ in others])
 
 

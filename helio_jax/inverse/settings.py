@@ -101,8 +101,9 @@ class RefineSettings(Settings):
     """Model of the multiple scattering: `traced` follows paths; `radiosity` is noise-free but takes one value per pixel
     (`forward/radiosity.py`), so it differs by some per cent beside depth jumps."""
     rays: int | None = Field(default=None, ge=1000, le=10**10)
-    """Paths per traced prediction of the multiple scattering, over the whole image (at least 8 per pixel); default: 100
-    per pixel, but 3 million at least. Where guided paths have the same noise, up to ten times fewer are traced."""
+    """Paths per traced prediction of the multiple scattering, over the whole image, whose noise it shall have; default:
+    100 per pixel, but 3 million at least. Up to ten times fewer are traced where they have the same noise because they
+    are guided, but 8 from each pixel at least (for each beam and each way in which a free border is continued)."""
 
     def paths(self, n_pixels: int) -> int:
         """Number of paths of a prediction for so many pixels."""

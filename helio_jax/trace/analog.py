@@ -95,6 +95,8 @@ def _advance(
     leaving,
     fates,
     hits,
+    weights,
+    lost,
     scattered,
 ):
     """Tally the atoms that end, re-emit the others in place; return the numbers re-emitted and scattered.
@@ -125,6 +127,8 @@ def _advance(
             )  # fmt: skip
             if fate >= 0:
                 fates[fate, p] += 1
+                if fate == LOST:
+                    lost[p] += weights[p, own] if weights.size else 1.0
                 if k >= 0:
                     hits[min(event, hits.shape[0]) - 1, k, p] += 1
                 continue
@@ -174,7 +178,7 @@ def trace_fused(
         found = sample.shoot(o32[:n], d32[:n])
         n, n_scattered = _advance(
             flight, flight >= e.max_events, found, atoms, o32, d32, geometry, offset, e.instrument.sample_distance,
-            e.apertures.shapes, ids, s.seed, e.leaving, tally.fates, tally.hits, scattered,
+            e.apertures.shapes, ids, s.seed, e.leaving, tally.fates, tally.hits, tally.weights, tally.lost, scattered,
         )  # fmt: skip
         if e.is_expected and n_scattered:
             points, normals, surfaces, *paths_of = (a[:n_scattered] for a in scattered)

@@ -3,8 +3,10 @@
 Most atoms escape at once: 95 of 100 from a level substrate about a ball, and none of them adds to its multiple
 scattering. So a pilot shoots one ray through each cell of the unit square from which first bounces are drawn, and the
 paths take the cells by how much of them meets the surface. Weights keep the estimate unbiased, whatever the pilot saw.
-The pilot also tells by how much fewer paths have the noise of plain ones: a seventh about a pyramid, almost all in a
-trench. Only atoms that leave by the cosine law are guided; those of lobes draw their directions otherwise.
+A second pilot, of other rays from other pixels, says how many fewer paths have the noise of plain ones: an eighth about
+a pyramid, almost all in a trench. The first one would not do: where little is met, as on a level surface with noise,
+its guide knows just what it met itself. Only atoms that leave by the cosine law are guided; those of lobes draw their
+directions otherwise.
 
 Source: guiding in the space of random numbers: Guo, Bauszat, Bikker and Eisemann, Eurographics Symposium on Rendering
 (2018) 27; densities in proportion to the root of the second moment: Rath et al., ACM Trans. Graph. 39 (2020) 151.
@@ -29,15 +31,19 @@ from helio_jax.trace.transport import follow, launch_paths, scatter
 AZIMUTHS, ELEVATIONS = 16, 8
 """Cells of a pilot along both random numbers of a bounce: equal in azimuth and in the sine of the elevation above the
 surface, so that what lies low above a level substrate has cells of its own."""
-UNGUIDED = 0.2
-"""Share of the paths that take all cells alike: where the pilot met nothing, weights are up to 1 / UNGUIDED."""
+UNGUIDED = 0.35
+"""Share of the paths that take all cells alike: where the pilot met nothing, weights are up to 1 / UNGUIDED. With 0.2,
+an eighth fewer paths would do, but the noise of the worst pixel is 1.5 times as large."""
 MOST_PILOT = 0.25
 """Largest number of rays of the pilot, per plain path: it leaves out pixels where it would have more."""
+TEST_STRIDE = 2
+"""Every so many pixels of the pilot along both axes, the second pilot has one, half-way to the next ones."""
 MOST_GAIN = 10.0
-"""So many times fewer paths than plain ones at most: on an almost level surface, where the pilot meets next to nothing,
-what it missed would stand out in single pixels."""
+"""So many times fewer paths than plain ones at most: what both pilots missed would stand out in single pixels."""
 LEAST_PER_PIXEL = 8
 """Paths of each pixel at least: with 2 of them single pixels of a 351 x 304 raster were off by 80 % of the signal."""
+SECOND_PILOT = PILOT | 1 << 61
+"""Offset of the pixel numbers for the second pilot, as `PILOT`."""
 NEIGHBOURS = 0.6, 0.4
 """Gaussian width over which the cells met are averaged: in pixels of the pilot, and in cells."""
 AREA = np.tile((2.0 * np.arange(ELEVATIONS) + 1.0) / (ELEVATIONS**2 * AZIMUTHS), (AZIMUTHS, 1))
@@ -52,7 +58,7 @@ class Guide:
         shares: probability that a path takes a cell [guide, azimuth, elevation].
         of_pixel: number of each pixel's guide [pixel].
         gain: variance of plain paths over that of as many guided ones, mean of the raster, by second moments of what
-            the pilot met, up to `MOST_GAIN`; measured gains are 0.4 to 1.8 times it.
+            the second pilot met; 1 to `MOST_GAIN`.
     """
 
     shares: np.ndarray
@@ -78,24 +84,25 @@ def trace_multiple(
         n_paths: plain paths, of all pixels together, whose noise is wanted. Guided ones are so many times fewer as the
             pilot finds, but each pixel has `LEAST_PER_PIXEL` at least, and 65536 at most.
         workers: number of threads; default: one per CPU.
-        max_lost: largest share of atoms that may meet the surface from behind; of the first flights by the pilot alone.
+        max_lost: largest share of atoms that may meet the surface from behind.
 
     Raises:
         GuardError: rays are unaccounted for, or a larger share than `max_lost` was lost.
     """
     flat = np.ascontiguousarray(x.ravel()), np.ascontiguousarray(y.ravel())
-    guide = make_guide(experiment, first, *flat, x.shape, n_paths / x.size, workers, max_lost)
+    guide = make_guide(experiment, first, *flat, x.shape, n_paths / x.size, workers)
     of_each = min(max(LEAST_PER_PIXEL, round(n_paths / x.size / guide.gain)), RAYS_PER_BLOCK)
     e = replace(experiment, sampling=Sampling.make(1, of_each, 1, experiment.sampling.seed), n_orders=2)
     ids, points = np.arange(x.size), low_discrepancy_points(of_each, 4)
 
-    def trace(part: slice) -> tuple[np.ndarray, np.ndarray, int]:
+    def trace(part: slice) -> tuple[np.ndarray, float, int]:
         tally = _trace_block(e, ids[part], flat[0][part], flat[1][part], first.take(part), guide, points)
-        return tally.sums[1:].sum((0, 1)), tally.fates.sum(1), int(np.abs(tally.fates.sum(0) - of_each).sum())
+        return tally.sums[1:].sum((0, 1)), tally.lost.sum(), int(np.abs(tally.fates.sum(0) - of_each).sum())
 
-    found, fates, n_unaccounted = zip(*by_blocks(e, x.size, trace, workers), strict=True)
-    as_plain = np.sum(fates, axis=0) / guide.gain  # guided paths meet the surface so many times more often
-    check_rays(as_plain, sum(n_unaccounted), of_each * x.size, max_lost)
+    found, lost, n_unaccounted = zip(*by_blocks(e, x.size, trace, workers), strict=True)
+    fates = np.zeros(len(FATES))
+    fates[LOST] = sum(lost)  # by weight: of as many plain paths
+    check_rays(fates, sum(n_unaccounted), of_each * x.size, max_lost)
     return np.concatenate(found, -1).reshape(-1, *x.shape)
 
 
@@ -107,54 +114,74 @@ def make_guide(
     shape: tuple[int, int],
     of_each: float,
     workers: int | None = None,
-    max_lost: float = 1e-4,
 ) -> Guide:
-    """Shoot a pilot; arguments as those of `trace_multiple`, `of_each`: plain paths of each pixel.
-
-    Raises:
-        GuardError: a larger share than `max_lost` of the atoms meets the surface from behind.
-    """
+    """Shoot both pilots; arguments as those of `trace_multiple`, `of_each`: plain paths of each pixel."""
     stride = math.ceil(math.sqrt(AREA.size / (MOST_PILOT * max(of_each, LEAST_PER_PIXEL))))
-    rows, columns = (np.arange(min(stride // 2, n - 1), n, stride) for n in shape)
+    places = [np.arange(min(stride // 2, n - 1), n, stride) for n in shape]
     numbers = np.arange(x.size).reshape(shape)
-    chosen = numbers[np.ix_(rows, columns)].ravel()
     e = replace(experiment, sampling=Sampling.make(1, AREA.size, 1, experiment.sampling.seed))
+    met, _ = _shoot(e, first, x, y, numbers[np.ix_(*places)].ravel(), PILOT, workers)
+    shares = _shares(met.reshape(*(at.size for at in places), AZIMUTHS, ELEVATIONS))
+    y_guide, x_guide = (np.minimum(np.arange(n) // stride, at.size - 1) for n, at in zip(shape, places, strict=True))
+    of_pixel = (y_guide[:, None] * places[1].size + x_guide).ravel()
+    others = [np.minimum(at[::TEST_STRIDE] + stride // 2, n - 1) for n, at in zip(shape, places, strict=True)]
+    chosen = numbers[np.ix_(*others)].ravel()
+    gain = _gain(shares[of_pixel[chosen]], *_shoot(e, first, x, y, chosen, SECOND_PILOT, workers))
+    if gain < 1.0:
+        return Guide(AREA[None], np.zeros(x.size, int), 1.0)
+    return Guide(shares, of_pixel, min(gain, MOST_GAIN))
 
-    def shoot(part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+
+def _shoot(
+    e: Experiment, first: Hits, x: np.ndarray, y: np.ndarray, chosen: np.ndarray, key: int, workers: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shoot one ray through each cell of some pixels.
+
+    Returns:
+        Which of those that can be guided scatter again, and which of those of lobes [pixel, azimuth, elevation].
+    """
+
+    def shoot(part: slice) -> tuple[np.ndarray, np.ndarray]:
         at = chosen[part]
-        ids = at + PILOT
+        ids = at + key
         paths, u = launch_paths(e, ids, x[at], y[at]), _cell_numbers(ids, e.sampling.seed)
         paths = scatter(e, 0, ids, first.take(at), paths, np.zeros(at.size, np.int64), u)
         hits = e.intersector.nearest(paths.origin, paths.direction, paths.skip)
-        is_met, is_met_by_lobe, is_back = np.zeros((3, at.size, AREA.size), np.float32)
+        is_met, is_met_by_lobe = np.zeros((2, at.size, AREA.size), np.float32)
         is_scattered = (hits.surface != MISS) | (e.plate is not None)  # a plate sends atoms back
         is_guided = paths.density == 0.0
         is_met[paths.pixel, paths.path] = is_scattered & is_guided
         is_met_by_lobe[paths.pixel, paths.path] = is_scattered & ~is_guided
-        is_back[paths.pixel, paths.path] = hits.is_back
-        return is_met, is_met_by_lobe, is_back
+        return is_met, is_met_by_lobe
 
-    parts = by_blocks(e, chosen.size, shoot, workers)
-    met, met_by_lobe, back = (np.concatenate(of_kind) for of_kind in zip(*parts, strict=True))
-    fates = np.zeros(len(FATES))
-    fates[LOST] = round(float((back @ AREA.ravel()).sum()) * AREA.size)
-    check_rays(fates, 0, back.size, max_lost)
-    met = met.reshape(rows.size, columns.size, AZIMUTHS, ELEVATIONS)
+    parts = zip(*by_blocks(e, chosen.size, shoot, workers), strict=True)
+    met, met_by_lobe = (np.concatenate(of_kind).reshape(-1, AZIMUTHS, ELEVATIONS) for of_kind in parts)
+    return met, met_by_lobe
+
+
+def _shares(met: np.ndarray) -> np.ndarray:
+    """Return the shares of the cells by what was met in them [y, x, azimuth, elevation], as [guide, ...]."""
     pixels, cells = NEIGHBOURS
     beyond: Any = ("nearest", "nearest", "wrap", "nearest")
     met = gaussian_filter(met, (pixels, pixels, cells, cells), mode=beyond)
-    met = np.maximum(met.reshape(-1, AZIMUTHS, ELEVATIONS), 0.0)
-    wanted = AREA * np.sqrt(met)
+    wanted = AREA * np.sqrt(np.maximum(met.reshape(-1, AZIMUTHS, ELEVATIONS), 0.0))
     total = wanted.sum((1, 2), keepdims=True)
     wanted = np.where(total > 0.0, wanted / np.where(total > 0.0, total, 1.0), AREA)
-    shares = (1.0 - UNGUIDED) * wanted + UNGUIDED * AREA
-    by_lobes = float((met_by_lobe @ AREA.ravel()).sum())
+    return (1.0 - UNGUIDED) * wanted + UNGUIDED * AREA
+
+
+def _gain(shares: np.ndarray, met: np.ndarray, met_by_lobe: np.ndarray) -> float:
+    """Return the second moment of plain paths over that of guided ones, of rays that did not make the guide.
+
+    One more ray is counted as met in a cell that only unguided paths take: rays that meet something are few on an
+    almost level surface. Where none is met there is no noise to speak of. All arrays: [pixel, azimuth, elevation].
+    """
+    if not (met.any() or met_by_lobe.any()):
+        return MOST_GAIN
+    by_lobes = float((AREA * met_by_lobe).sum())
     plain, guided = (float((AREA * met * weight).sum()) + by_lobes for weight in (1.0, AREA / shares))
-    y_guide, x_guide = (
-        np.minimum(np.arange(n) // stride, m.size - 1) for n, m in zip(shape, (rows, columns), strict=True)
-    )
-    of_pixel = (y_guide[:, None] * columns.size + x_guide).ravel()
-    return Guide(shares, of_pixel, min(plain / guided, MOST_GAIN) if guided > 0.0 else MOST_GAIN)
+    unseen = 1.0 / AREA.size if met.any() else 0.0
+    return (plain + unseen) / (guided + unseen / UNGUIDED)
 
 
 def _trace_block(

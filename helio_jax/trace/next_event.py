@@ -22,7 +22,7 @@ from helio_jax.trace.tally import Tally
 def _path_data(s: Sampling, paths: Paths, n_branches: int, tally: Tally) -> tuple[np.ndarray, ...]:
     """Return pixel, order, met_plate, replicate and weight of each path, for `n_branches` paths per beam ray."""
     replicate = paths.path // (s.n_rays * n_branches // s.n_replicates)
-    weight = np.ones(len(replicate)) if tally.weights is None else tally.weights[paths.pixel, paths.path]
+    weight = tally.weights[paths.pixel, paths.path] if tally.weights.size else np.ones(len(replicate))
     return paths.pixel, paths.order, paths.met_plate, replicate, weight
 
 

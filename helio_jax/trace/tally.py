@@ -23,7 +23,8 @@ class Tally:
             that a plate has scattered.
         n_rays: beam rays per pixel.
         n_branches: paths from the first hit of each beam ray.
-        weights: of the paths in `sums` [pixels, path]; None: all are 1.
+        weights: of the paths in `sums` [pixels, path]; length 0: all are 1.
+        lost: sum of the weights of lost paths [pixels].
     """
 
     fates: np.ndarray
@@ -32,8 +33,9 @@ class Tally:
     plate_hits: np.ndarray
     plate_sums: np.ndarray
     n_rays: int
-    n_branches: int = 1
-    weights: np.ndarray | None = None
+    n_branches: int
+    weights: np.ndarray
+    lost: np.ndarray
 
     @classmethod
     def zeros(
@@ -55,7 +57,8 @@ class Tally:
             np.zeros((n_replicates, n_detectors, n_pixels)),
             n_rays,
             n_branches,
-            weights,
+            np.zeros((0, 0)) if weights is None else weights,
+            np.zeros(n_pixels),
         )
 
     def estimate(self) -> "Estimate":

@@ -18,13 +18,13 @@ from helio_jax.trace.meshplate import count_caught
 from helio_jax.trace.next_event import add_hits, add_next_event
 from helio_jax.trace.plate import PLATE
 from helio_jax.trace.source import beam_numbers, bounce_numbers, launch_rays
-from helio_jax.trace.tally import STOPPED, Tally
+from helio_jax.trace.tally import LOST, STOPPED, Tally
 
 
 @kernel
 def _tally_flight(
-    event, max_events, n_branches, origin, direction, pixel, order, met_plate, surface, is_back, offset, plate_z,
-    shapes, fates, hits, plate_hits,
+    event, max_events, n_branches, origin, direction, pixel, path, order, met_plate, surface, is_back, offset, plate_z,
+    shapes, fates, hits, plate_hits, weights, lost,
 ):  # fmt: skip
     """Tally the rays that end after this flight; return the indices of those that scatter.
 
@@ -45,6 +45,8 @@ def _tally_flight(
             m += 1
         else:
             fates[fate, p] += share
+            if fate == LOST:
+                lost[p] += weights[p, path[i]] if weights.size else share
             if k >= 0:
                 hits[min(order[i], hits.shape[0]) - 1, k, p] += 1
                 if met_plate[i]:
@@ -156,9 +158,9 @@ def follow(
                 count_caught(tally, caught[ends], paths.pixel[ends], paths.order[ends], paths.met_plate[ends])
                 hits, paths = hits.take(~ends), paths.take(~ends)
         keep = _tally_flight(
-            event, e.max_events, n_branches, paths.origin, paths.direction, paths.pixel, paths.order, paths.met_plate,
-            hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes, tally.fates, tally.hits,
-            tally.plate_hits,
+            event, e.max_events, n_branches, paths.origin, paths.direction, paths.pixel, paths.path, paths.order,
+            paths.met_plate, hits.surface, hits.is_back, offset, e.instrument.sample_distance, table.shapes,
+            tally.fates, tally.hits, tally.plate_hits, tally.weights, tally.lost,
         )  # fmt: skip
         if e.is_expected and event > start:
             add_hits(e, event, tally, hits.surface, paths, offset)

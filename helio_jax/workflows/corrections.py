@@ -59,9 +59,9 @@ def make_predictor(
     difference is one more unknown of the fit. `masks_by` rays, all masks are traced on the mesh, for a test of the
     result; a fit computes them by the horizon march, but shares those of the mesh where the surface has walls.
 
-    Seeds are fixed, so that successive predictions differ by the surface, not by noise. All of the sample scatters by
-    the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law. Radiosity knows
-    the cosine law only.
+    Seeds are fixed, so that predictions on nearly the same surface have nearly the same noise. All of the sample
+    scatters by the law that a prediction is given; a scattering plate is part of what is traced, by the cosine law.
+    Radiosity knows the cosine law only.
 
     Images of several beams are predicted beam by beam on the same surface, with masks by rays.
 

@@ -47,8 +47,8 @@ def shipped_folder() -> Path:
 def list_shipped() -> tuple[Shipped, ...]:
     """List the scenes, then the instruments, then the studies, each by name."""
     kinds: dict[Kind, str] = {"scene": "*.toml", "instrument": "instruments/*.toml", "study": "studies/*.toml"}
-    found = {kind: sorted(shipped_folder().glob(pattern)) for kind, pattern in kinds.items()}
-    return tuple(Shipped(path.stem, kind, path) for kind, paths in found.items() for path in paths)
+    folder = shipped_folder()
+    return tuple(Shipped(p.stem, kind, p) for kind, pattern in kinds.items() for p in sorted(folder.glob(pattern)))
 
 
 def find_shipped(name: str) -> Shipped:

@@ -18,7 +18,7 @@ scan = { nx = 21, ny = 21, pixel_size_um = 60.0 }
 trace = { rays = 16 }
 reconstruct = { method = "nearfield" }
 """
-PAGES = ("tutorial", "howto_mat", "howto_instrument", "howto_plate", "howto_cluster", "howto_steps")
+PAGES = ("tutorial", "howto_mat", "howto_instrument", "howto_plate", "howto_cluster", "howto_steps", "howto_studies")
 PAGES += ("from_matlab", "from_gwyddion")
 
 
@@ -55,6 +55,9 @@ def test_page(name, tmp_path, monkeypatch):
     if name == "howto_cluster":
         one, two, cores = (hx.read(f"{name}.h5").counts for name in ("big", "slurm", "cores"))
         assert np.array_equal(one, two) and np.array_equal(one, cores)
+    if name == "howto_studies":
+        rows = Path("walls/table.md").read_text(encoding="utf-8").splitlines()[2:]
+        assert len(rows) == 4 and all(row.count("+-") == 6 for row in rows)
     if name == "howto_steps":
         heights = [step.height_um for step in names["steps"].steps]
         assert len(heights) == 4 and heights == pytest.approx([60.0] * 4, abs=3.0)

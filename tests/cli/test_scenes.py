@@ -17,6 +17,7 @@ from helio_jax.workflows import pipeline
 from helio_jax.workflows.scene_file import load_instrument, load_scene
 from helio_jax.workflows.shipped import list_shipped
 from helio_jax.workflows.starting_file import INSTRUMENT, SCENE
+from helio_jax.workflows.study_file import load_study
 
 
 @pytest.fixture(autouse=True)
@@ -52,8 +53,9 @@ def test_copy_is_complete(file, empty):
     code, text = helio("scenes", "copy", file.name, empty / "sub")
     copies = [Path(line) for line in text.splitlines()]
     assert code == 0 and copies[0] == empty / "sub" / file.path.name
-    load = load_scene if file.kind == "scene" else load_instrument
-    assert load(copies[0]).model_dump(mode="json") == load(file.name).model_dump(mode="json")
+    load = {"scene": load_scene, "instrument": load_instrument, "study": load_study}[file.kind]
+    original = file.path if file.kind == "study" else file.name
+    assert load(copies[0]).model_dump(mode="json") == load(original).model_dump(mode="json")
     extended = tomllib.loads(copies[0].read_text(encoding="utf-8")).get("extends")
     assert extended is None or copies[0].parent / extended in copies
 

@@ -53,11 +53,14 @@ def test_a_background_that_is_slightly_wrong_does_not_revive_it(bshem, size):
 
 
 def test_nothing_counted_at_all(bshem):
-    """An error that says so, not one of the solver."""
+    """Zeros, or dark counts of a known background in all detectors: an error that says so, not one of the solver."""
     stack = flat(bshem)
     empty = stack.replace(counts=np.zeros(stack.shape), variance=np.zeros(stack.shape))
-    with pytest.raises(GuardError, match="no detector counts anything"):
-        pipeline.reconstruct(empty, "linear")
+    dark = np.random.default_rng(5).poisson(5.0, stack.shape).astype(float)
+    counts = stack.replace(counts=dark, variance=dark, background=np.full(3, 5.0))
+    for nothing in (empty, empty.replace(n_rays=None), counts, counts.replace(n_rays=None)):
+        with pytest.raises(GuardError, match="no detector shows a signal beyond its background"):
+            pipeline.reconstruct(nothing, "linear")
 
 
 def test_what_is_not_dead(bshem):
