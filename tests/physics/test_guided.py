@@ -17,9 +17,10 @@ from helio_jax.scene.scattering import BroadSpecularLaw, CosineLaw, CosinePowerL
 from helio_jax.scene.shapes import Sphere, SpheresSample
 from helio_jax.trace import guided
 from helio_jax.trace.guided import Guide, trace_multiple
+from helio_jax.trace.intersect import MISS
 from helio_jax.trace.run import first_hits, make_experiment, trace_pixels
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.trace.tally import ESCAPED
+from helio_jax.trace.tally import ESCAPED, LOST
 
 SEEDS = range(8)
 FINE = 35, 27
@@ -212,3 +213,32 @@ def test_lost_atoms_count_by_their_weight(bshem):
     trace_multiple(make(0), inside, x, y, 64 * x.size, max_lost=0.031)
     with pytest.raises(GuardError, match="from behind"):
         trace_multiple(make(0), inside, x, y, 64 * x.size, max_lost=0.026)
+
+
+def test_lost_atoms_are_those_of_plain_paths(bshem, monkeypatch):
+    """A ball and a substrate that atoms meet from behind: the share lost is that of plain paths, 5 %.
+
+    Rejects a sum of guided paths without their weights: twice as many.
+    """
+    make, x, y = ball(bshem, n=FINE)
+    first = first_hits(make(0).intersector, bshem, x.ravel(), y.ravel())
+
+    class Inverted:
+        def __init__(self, intersector):
+            self.intersector = intersector
+
+        def __getattr__(self, name):
+            return getattr(self.intersector, name)
+
+        def nearest(self, *rays):
+            hits = self.intersector.nearest(*rays)
+            return replace(hits, is_back=hits.surface != MISS)
+
+    shares = []
+    monkeypatch.setattr(guided, "check_rays", lambda fates, missing, n, limit: shares.append(fates[LOST] / n))
+    of_pilot = guided.make_guide
+    for guide in (lambda *args: replace(of_pilot(*args), gain=1.0), lambda *args: unguided(x.size)):
+        monkeypatch.setattr(guided, "make_guide", guide)
+        experiment = replace(make(0), intersector=Inverted(make(0).intersector))
+        trace_multiple(experiment, first, x, y, 64 * x.size)
+    assert shares[0] == pytest.approx(shares[1], rel=0.05) and 0.02 < shares[1] < 0.5
