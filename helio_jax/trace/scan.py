@@ -7,10 +7,10 @@ All kinds of `Executor` run the same code, so the counts do not depend on it. Re
 import os
 import signal
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from concurrent import futures
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -115,7 +115,7 @@ def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
         n_before = len(left)
         pool = ProcessPoolExecutor(min(workers, n_before), get_context("spawn"), _begin_worker)
         try:
-            with pool, closing(_submit(pool, workers + 1, job, list(left.values()))) as results:
+            with _ended(pool), closing(_submit(pool, workers + 1, job, list(left.values()))) as results:
                 for unit, unit_result in results:
                     del left[unit.number]
                     yield unit, unit_result
@@ -126,6 +126,38 @@ def _on_processes(workers: int, job: Job, units: list[Unit]) -> Results:
                     f"worker processes died {MAX_DEATHS} times without finishing a unit (killed, or out of memory?): "
                     f"use fewer than {workers} workers or more memory"
                 ) from None
+
+
+@contextmanager
+def _ended(pool: ProcessPoolExecutor) -> Iterator[None]:
+    """End the workers of a pool on the way out: when they are done, or at once after an error or an interrupt.
+
+    However often Ctrl-C is pressed: a pool that is left alone keeps the program from ending.
+    """
+    is_done = False
+    try:
+        yield
+        is_done = True
+    finally:
+        with _interrupts_held():
+            workers = list((pool._processes or {}).values())
+            pool.shutdown(wait=is_done, cancel_futures=True)
+            for worker in workers if not is_done else ():
+                worker.terminate()
+                worker.join()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C wait until the block has ended; processes that start within never heed it."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker() -> None:
@@ -169,7 +201,8 @@ def _submit(pool: futures.Executor, n_ahead: int, job: Job, units: list[Unit]) -
     try:
         while True:
             for unit in islice(todo, n_ahead - len(waiting)):
-                waiting[pool.submit(trace_unit, job, unit)] = unit
+                with _interrupts_held():  # starts workers
+                    waiting[pool.submit(trace_unit, job, unit)] = unit
             if not waiting:
                 return
             done, _ = futures.wait(waiting, return_when=futures.FIRST_COMPLETED)

@@ -1,9 +1,13 @@
 """Runs that are killed, damaged or changed half-way: what was finished is kept, the result is the same."""
 
+import contextlib
+import functools
 import os
 import random
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from multiprocessing import get_context
 
@@ -377,3 +381,43 @@ def test_manifest_of_an_older_version_is_refused(half):
     with pytest.raises(ResumeError, match=r"manifest\.json is damaged .*executor"):
         pipeline.resume(half.output)
     assert n_kept(half) == N_UNITS // 2
+
+
+def ends_within(group: int, seconds: float) -> bool:
+    """Whether a group of processes has ended, workers included."""
+    start = time.monotonic()
+    while time.monotonic() - start < seconds:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("delay", [0.0, 2.0])
+def test_ctrl_c_twice_ends_worker_processes(tmp_path, delay):
+    """Before the first unit and later, to the whole process group, as a terminal sends it: ended within 20 s.
+
+    Catches a pool that waits for workers that never began, with which the program had to be killed.
+    """
+    words = ["simulate", "sphere_a_full", "-o", str(tmp_path / "out.h5"), "--processes", "--workers", "2"]
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "helio_jax", *words], stderr=subprocess.PIPE, text=True, preexec_fn=heed,
+        start_new_session=True, cwd=SCENE.parents[1],
+    )  # fmt: skip
+    try:
+        assert process.stderr and "tracing" in process.stderr.readline()
+        time.sleep(delay)
+        for _ in range(2):
+            os.killpg(process.pid, signal.SIGINT)
+            time.sleep(0.25)
+        _, text = process.communicate(timeout=20.0)
+        assert ends_within(process.pid, 5.0)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode in (130, -signal.SIGINT) and "Traceback" not in text
+    assert text.count("interrupted") == 1
