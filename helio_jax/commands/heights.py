@@ -108,19 +108,29 @@ def reconstruct_files(
 def evaluate(
     height: Annotated[Path, typer.Argument(help="Height map (.h5)."), Reads()],
     truth: Annotated[
-        Path, typer.Option(help="Scene file, or a height map (.h5) on the same raster."), Reads(names_files=True)
-    ],
+        Path | None,
+        typer.Option(help="Scene file, or a height map (.h5) on the same raster (default: the scene simulated)."),
+        Reads(names_files=True),
+    ] = None,
     fit_center: Annotated[bool, typer.Option(help="Fit the position of the scene's sphere first.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Score a height map against the true heights of the same beam positions."""
+    from helio_jax.errors import InputFileError
     from helio_jax.figures.trust import trust_lines
     from helio_jax.formats.hdf5 import read_height
     from helio_jax.workflows import pipeline
-    from helio_jax.workflows.truth import load_truth
+    from helio_jax.workflows.truth import load_truth, simulated_scene, true_height
 
     rec = read_height(height)
-    found = load_truth(truth, rec, fit_center=fit_center)
+    if truth is None:
+        try:
+            found = true_height(simulated_scene(rec, height), rec)
+        except InputFileError as e:
+            raise InputFileError(f"{e}; to score it, give its true heights by --truth") from None
+    else:
+        found = load_truth(truth, rec, fit_center=fit_center)
+    _warn_of_truth(truth, found, rec)
     scores = pipeline.evaluate(rec, found)
     if as_json:
         center = list(found.region.center) if found.region else None
@@ -132,6 +142,16 @@ def evaluate(
     print_table(scores.as_table())
     print("\n".join(trust_lines(rec.trust)))
     warn(rec.trust)
+
+
+def _warn_of_truth(path: Path | None, truth: Any, rec: Any) -> None:
+    """Print in what a scene is not the one that was simulated, and a height in [truth] that is not the sample's."""
+    from helio_jax.formats.suffixes import HDF5_SUFFIXES
+    from helio_jax.workflows.truth import odd_height, other_sample
+
+    other = other_sample(path, rec) if path and path.suffix.lower() not in HDF5_SUFFIXES else None
+    for text in filter(None, (other, odd_height(truth))):
+        say(f"warning: {text}")
 
 
 @app.command()
@@ -156,6 +176,8 @@ def report(
 
     rec, images = read_height(height), read_stack(stack) if stack else None
     known = load_truth(truth, rec, fit_center=fit_center) if truth else None
+    if known:
+        _warn_of_truth(truth, known, rec)
     scores = pipeline.evaluate(rec, known) if known else None
     title = images.name if images else height.stem
     drawn = pipeline.write_report_files(

@@ -53,6 +53,7 @@ def plan(
     draws: Annotated[
         int, typer.Option("--check", min=0, help="Simulate and reconstruct the chosen candidate so often.")
     ] = 0,
+    changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
     """Plan an acquisition: time, SNR and expected errors of the heights by dwell, pixel and rotations."""
@@ -62,7 +63,7 @@ def plan(
     from helio_jax.workflows.plan import plan as plan_scene
     from helio_jax.workflows.scene_file import load_scene
 
-    loaded = load_scene(scene)
+    loaded = load_scene(scene, scene_overrides(changes))
     stage = measured_timing(timing) if timing else stated_timing(loaded)
     even = [[360.0 * i / n for i in range(n)] for n in map(int, _numbers("--views", views, whole=True))]
     found = plan_scene(

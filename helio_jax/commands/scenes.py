@@ -9,7 +9,7 @@ import typer
 
 from helio_jax.commands.app import TOML, AsJson, Set, app, print_result, scene_overrides
 from helio_jax.commands.door import Force, Reads, Writes
-from helio_jax.workflows.shipped import Kind, list_shipped
+from helio_jax.workflows.shipped import list_shipped
 
 
 @app.command()
@@ -52,7 +52,7 @@ def _copy(name: str | None, folder: Path, force: bool, as_json: bool) -> None:
 
 @app.command()
 def init(
-    kind: Annotated[Kind, typer.Argument(help="What to begin.", show_default=False)],
+    kind: Annotated[Literal["scene", "instrument"], typer.Argument(help="What to begin.", show_default=False)],
     file: Annotated[
         Path | None, typer.Argument(help="File to write (default: scene.toml or instrument.toml)."), TOML
     ] = None,
@@ -71,13 +71,13 @@ def init(
 def validate(
     file: Annotated[
         Path,
-        typer.Argument(help="Scene or instrument: file (TOML), or name that helio scenes lists.", metavar="SCENE"),
+        typer.Argument(help="Scene, instrument or study: file (TOML), or name of helio scenes.", metavar="SCENE"),
         Reads(names_files=True),
     ],
     changes: Set = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a scene file and its sample, or an instrument file; list all errors with key, value, limit and remedy."""
+    """Check a scene with its sample, an instrument or a study; list all errors with key, value, limit and remedy."""
     from helio_jax.figures.summary import hole_lines, text_lines
     from helio_jax.workflows.validate import check_file
 
@@ -102,7 +102,7 @@ def validate(
         about = f"{found.image['nx']} x {found.image['ny']} pixels, {about}{views}"
     else:
         about += "; it has no [sample] and no [scan]"
-    print(f"{file}: ok, {'a scene' if found.image else 'an instrument'} ({about})")
+    print(f"{file}: ok, {'an' if found.kind == 'instrument' else 'a'} {found.kind} ({about})")
 
 
 @app.command()

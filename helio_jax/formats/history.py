@@ -32,6 +32,13 @@ class History:
     scene_text: str
 
 
+def scene_of(rec: Reconstruction) -> Mapping[str, Any] | None:
+    """Return the settings of the scene that was simulated, whatever was done since; None: measured or not known."""
+    about = rec.provenance.get("stack")
+    scene = about.get("scene") if isinstance(about, Mapping) else None
+    return scene if isinstance(scene, Mapping) else None
+
+
 def history_of(obj: MicrographStack | MicrographSet | Reconstruction, name: str) -> History:
     """Return how an object was made.
 

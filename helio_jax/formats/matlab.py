@@ -234,6 +234,13 @@ def _reference_stack(path: str, tree: dict[str, Any], instrument: Instrument) ->
     return fields, notes
 
 
+def _connected(path: str, channels: Any) -> str:
+    """Name the channels that hold data."""
+    images = [get_array(path, image, f"meas_list.image{{{i}}}", 2) for i, image in enumerate(channels, start=1)]
+    found = [str(i) for i, image in enumerate(images, start=1) if np.any(image)]
+    return f"data are in channel{'s' * (len(found) != 1)} {', '.join(found)}" if found else "no channel holds data"
+
+
 def _bshem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tuple[dict[str, Any], dict]:
     """Read a B-SHeM scan: per channel raw[::-1, ::-1].T, so that the beam travels towards +x."""
     scan = get_table(path, tree, "meas_list")
@@ -248,7 +255,10 @@ def _bshem_stack(path: str, tree: dict[str, Any], instrument: Instrument) -> tup
             )
         image = get_array(path, channels[detector.channel - 1], f"meas_list.image{{{detector.channel}}}", 2)
         if not np.any(image):
-            raise InputFileError(f"{path}: channel {detector.channel} of {where} holds only zeros: it is not connected")
+            raise InputFileError(
+                f"{path}: channel {detector.channel} of {where} holds only zeros: it is not connected; "
+                f"{_connected(path, channels)}: set `channel` in the instrument file"
+            )
         images.append(image)
     used = [d.channel for d in instrument.detector]
     if len(set(used)) != len(used) or len({i.shape for i in images}) != 1:

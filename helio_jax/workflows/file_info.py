@@ -22,13 +22,21 @@ from helio_jax.formats.points import HEADER, read_points, read_rows
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.body import Body
-from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, check_file, read_bytes, read_height_map, read_table
+from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, check_file, read_bytes, read_height_map, read_table, read_toml
 from helio_jax.scene.meshes import KINDS as MESHES
 from helio_jax.scene.meshes import load_mesh
 from helio_jax.scene.sample import MeshSample, check_body
-from helio_jax.workflows.scene_file import SceneFile, is_scene, load_instrument, load_scene, read_tables, resolved
+from helio_jax.workflows.scene_file import (
+    SceneFile,
+    is_scene,
+    is_study,
+    load_instrument,
+    load_scene,
+    read_tables,
+    resolved,
+)
 from helio_jax.workflows.shipped import locate
-from helio_jax.workflows.study_file import load_study
+from helio_jax.workflows.study_file import MAX_STUDY_MB, load_study
 
 TABLES = (".csv", ".tsv", ".txt")
 _MANY = 10
@@ -115,14 +123,13 @@ def _of_hdf5(path: Path) -> Found:
 
 
 def _of_toml(path: Path) -> Found:
-    tables = read_tables(path)
-    if "vary" in tables or "case" in tables:
+    if is_study(read_toml(path, MAX_STUDY_MB)):
         study = load_study(path)
         varied = ", ".join([*study.vary, *(["cases: " + ", ".join(study.case)] if study.case else [])])
         rows = [("study", study.name), ("scene", study.scene), ("varies", varied)]
         rows.append(("points", f"{len(study.points())} ({study.design})"))
         return "study", rows, {"settings": study.model_dump(mode="json")}
-    if not is_scene(tables):
+    if not is_scene(read_tables(path)):
         instrument = load_instrument(path)
         return "instrument", summarise(instrument), {"settings": instrument.model_dump(mode="json", exclude_none=True)}
     scene = load_scene(path)

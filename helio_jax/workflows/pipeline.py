@@ -54,7 +54,8 @@ def _silent(label: str) -> Any:
 def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> Micrographs:
     """Trace a scene's micrographs: expected counts, or analog ones with `estimator="analog"`.
 
-    A stack, or a set of stacks where the scan has several views (distances, rotations).
+    A stack, or a set of stacks where the scan has several views (distances, rotations). Its history has the scene, so
+    that `helio rerun` can repeat it.
 
     Args:
         scene: from `load_scene`.
@@ -65,7 +66,8 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
         SceneError: an unknown or impossible setting.
         GuardError: ray book-keeping failed.
     """
-    return trace_scene(scene, scene.trace.changed(**trace), progress)
+    scene = scene.model_copy(update={"trace": scene.trace.changed(**trace)})
+    return with_provenance(trace_scene(scene, scene.trace, progress), scene, "", "")
 
 
 @dataclass(frozen=True)

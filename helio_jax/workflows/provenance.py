@@ -1,5 +1,6 @@
 """Provenance: what is needed to reproduce simulated micrographs and height maps, stored in their file."""
 
+import functools
 import os
 import platform
 import subprocess
@@ -43,6 +44,7 @@ def this_run() -> dict[str, Any]:
     }
 
 
+@functools.cache
 def git_commit() -> str:
     """Return the git commit of this package's checkout, or "" outside a checkout."""
     checkout = Path(__file__).resolve().parents[2]

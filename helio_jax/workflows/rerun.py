@@ -17,7 +17,7 @@ from helio_jax.reconstruction import Reconstruction, end_if_interrupted
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_errors import explain_errors
-from helio_jax.workflows.scene_file import SceneFile, read_reconstruction
+from helio_jax.workflows.truth import simulated_scene
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,7 @@ def rerun(path: str | Path, report: Callable[[str], None] = lambda text: None) -
     """
     before = read(path)
     history = history_of(before, str(path))
-    try:
-        scene = SceneFile.model_validate(dict(history.scene), context={"read_reconstruction": read_reconstruction})
-        scene = scene.with_base_dir(Path(path).absolute().parent)
-    except ValidationError as e:
-        raise InputFileError(explain_errors(f"{path}: scene in its history", e, SceneFile, history.scene)) from None
+    scene = simulated_scene(before, Path(path))
     report("tracing")
     found: Any = pipeline.simulate(scene)
     if history.is_noisy:

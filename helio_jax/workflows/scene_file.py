@@ -132,6 +132,11 @@ def is_scene(tables: Mapping[str, Any]) -> bool:
     return not SCENE_TABLES.isdisjoint(tables)
 
 
+def is_study(tables: Mapping[str, Any]) -> bool:
+    """Whether the tables of a file are those of a study: a scene's name, and what varies."""
+    return "scene" in tables and not {"vary", "case"}.isdisjoint(tables)
+
+
 def resolved(scene: Scene) -> dict[str, Any]:
     """Return all settings of a scene, defaults included, JSON-compatible, for `SceneFile.model_validate`."""
     return scene.model_dump(mode="json")
@@ -156,9 +161,14 @@ def read_tables(path: Path) -> dict[str, Any]:
     """Read a scene or instrument file as tables, merged over the file that it extends; nothing else is checked.
 
     Raises:
-        SceneError: missing, too large, not UTF-8 or not TOML.
+        SceneError: missing, too large, not UTF-8, not TOML, or a study.
     """
     base, own, _ = _read_layers(path)
+    if is_study(own):
+        raise SceneError(
+            f"{path}: this is a study of the scene {own['scene']!r}: helio study runs it, helio info and helio "
+            "validate describe and check it"
+        )
     more = own.pop(APPEND, {})
     try:
         return append(merge(base, own), more)

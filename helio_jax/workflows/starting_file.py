@@ -6,6 +6,7 @@ What a person has to decide has a value. Every other key is a comment with its d
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 from helio_jax.calibration.noise import NoiseSettings
 from helio_jax.detector import Detector
@@ -18,8 +19,9 @@ from helio_jax.scene.shapes import Sphere, SpheresSample
 from helio_jax.scores.settings import TruthSettings
 from helio_jax.settings import Settings
 from helio_jax.trace.settings import TraceSettings
-from helio_jax.workflows.shipped import Kind
 
+Startable = Literal["scene", "instrument"]
+"""What a starting file can be of."""
 INSTRUMENT = Instrument(
     beam=Beam(incidence_deg=30.0, azimuth_deg=0.0),
     plate=Plate(kind="transparent", working_distance_um=4000.0),
@@ -64,7 +66,7 @@ extends names the instrument: a name that helio scenes lists, or a file (helio i
 _COLUMN, _WIDTH = 34, 118
 
 
-def starting_text(kind: Kind) -> str:
+def starting_text(kind: Startable) -> str:
     """Return the text of a starting file."""
     if kind == "instrument":
         first, *others = INSTRUMENT.detector
@@ -77,7 +79,7 @@ def starting_text(kind: Kind) -> str:
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
-def write_starting_file(kind: Kind, path: Path, *, force: bool = False) -> None:
+def write_starting_file(kind: Startable, path: Path, *, force: bool = False) -> None:
     """Write a starting file.
 
     Raises:

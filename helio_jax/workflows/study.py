@@ -28,7 +28,7 @@ from helio_jax.scene.files import read_bytes
 from helio_jax.texts import parse_json
 from helio_jax.workflows import pipeline
 from helio_jax.workflows.checkpoint import Shard
-from helio_jax.workflows.scene_file import files_read, load_scene, resolved, with_files
+from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene, resolved, with_files
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import MAX_STUDY_MB, Study, load_study
 from helio_jax.workflows.study_table import averaged, chosen_scores, image_scores, possible_scores, score_label, table
@@ -76,17 +76,15 @@ def run_study(
         GuardError: some points failed; the index lists the reasons.
     """
     path, folder = locate(path), Path(folder)
-    study = load_study(path)
-    points = [_Point(i, v, folder / f"point_{i:05d}") for i, v in enumerate(study.points(), start=1)]
-    scene_path = locate(study.scene, path.parent)
-    inputs = [("the study", path), *files_read(scene_path, "its scene", study.set)]
+    study, scenes = point_scenes(path)
+    inputs = [("the study", path), *files_read(locate(study.scene, path.parent), "its scene", study.set)]
     check_outputs(inputs, files_within("-o", folder, WRITTEN))
-    scenes = [_scene_text(scene_path, study.overrides(p.values), f"{path}: point {p.number}") for p in points]
-    _check_scores(study, points[0], scene_path, path)
-    _begin(folder, path, scenes, is_shared=resume or options.shard is not None)
+    points = [_Point(i, v, folder / f"point_{i:05d}") for i, v in enumerate(study.points(), start=1)]
+    texts = list(map(_scene_text, scenes))
+    _begin(folder, path, texts, is_shared=resume or options.shard is not None)
     shard = Shard.parse(options.shard) if options.shard else Shard(1, 1)
     options = replace(options, shard=None)
-    mine = list(zip(points, scenes, strict=True))[shard.number - 1 :: shard.of]
+    mine = list(zip(points, texts, strict=True))[shard.number - 1 :: shard.of]
     todo = [(point, text) for point, text in mine if (row := point.row()) is None or row["status"] == "failed"]
     start, written = time.monotonic(), -math.inf
     for i, (point, text) in enumerate(todo):
@@ -140,21 +138,29 @@ def _begin(folder: Path, path: Path, scenes: list[str], is_shared: bool) -> None
         )
 
 
-def _check_scores(study: Study, first: _Point, scene_path: Path, path: Path) -> None:
-    """Raise SceneError if the index will have no column that the study asks for."""
-    scene = load_scene(scene_path, study.overrides(first.values))
-    possible = possible_scores(study.reconstruct, scene.instrument.detector_names, scene.scan.n_views)
+def point_scenes(path: Path) -> tuple[Study, list[SceneFile]]:
+    """Load a study and the scenes of all of its points.
+
+    Raises:
+        SceneError: the study or the scene of a point is invalid, or the index will have no column that it asks for.
+    """
+    study = load_study(path)
+    scene_path, scenes = locate(study.scene, path.parent), []
+    for number, point in enumerate(study.points(), start=1):
+        try:
+            scenes.append(load_scene(scene_path, study.overrides(point)))
+        except SceneError as e:
+            raise SceneError(f"{path}: point {number}: {e}") from None
+    first = scenes[0]
+    possible = possible_scores(study.reconstruct, first.instrument.detector_names, first.scan.n_views)
     for pattern in [study.score] if isinstance(study.score, str) else study.score or []:
         if not chosen_scores(pattern, possible):
             raise SceneError(f"{path}: score must be among {', '.join(possible)} (* for any text), got {pattern!r}")
+    return study, scenes
 
 
-def _scene_text(path: Path, overrides: dict[str, Any], place: str) -> str:
+def _scene_text(scene: SceneFile) -> str:
     """Return the scene of a point as TOML, with absolute file names."""
-    try:
-        scene = load_scene(path, overrides)
-    except SceneError as e:
-        raise SceneError(f"{place}: {e}") from None
     # values that [reconstruct] does not set stay unset: a calibration may set them
     tables = resolved(scene) | {"reconstruct": scene.reconstruct.model_dump(mode="json", exclude_unset=True)}
     return to_toml(with_files(tables, lambda name: str((scene.base_dir / name).resolve())))

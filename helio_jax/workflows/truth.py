@@ -1,13 +1,18 @@
 """The true surface for scores: of a scene, or another height map. Never used by a fit."""
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from helio_jax.errors import SceneError
+from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import read_height
+from helio_jax.formats.history import history_of, scene_of
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.instrument import Beam
+from helio_jax.micrograph import Micrographs
 from helio_jax.reconstruction import Reconstruction
 from helio_jax.scene.shapes import SpheresSample
 from helio_jax.scene.surfaces import first_hit_spheres
@@ -15,8 +20,13 @@ from helio_jax.scores.metrics import Region, Truth
 from helio_jax.scores.metrics import fit_center as fit_sphere_center
 from helio_jax.trace.intersect import MISS, Intersector
 from helio_jax.trace.run import first_hits
-from helio_jax.workflows.scene_file import SceneFile, load_scene
+from helio_jax.workflows.scene_errors import explain_errors
+from helio_jax.workflows.scene_file import SceneFile, load_scene, read_reconstruction, resolved
 
+_SHOWN = 3
+"""So many differences of two scenes are named."""
+_ODD = 0.05
+"""Relative difference of two heights of a sample that is a mistake, not a raster that misses the top."""
 SUBSTRATE_RATIO = 1.35
 """Default inner radius of the scored substrate, over the radius of the scored region."""
 
@@ -77,6 +87,57 @@ def load_truth(path: str | Path, rec: Reconstruction, *, fit_center: bool = Fals
         return Truth(other.height, other.normals)
     scene = load_scene(path)
     return _fitted_truth(path, scene, rec) if fit_center else true_height(scene, rec)
+
+
+def simulated_scene(rec: Micrographs | Reconstruction, path: Path) -> SceneFile:
+    """Return the scene in the history of simulated data, with files where it names them, relative ones beside `path`.
+
+    Raises:
+        InputFileError: not simulated, or this version does not accept the scene.
+    """
+    history = history_of(rec, str(path))
+    try:
+        scene = SceneFile.model_validate(dict(history.scene), context={"read_reconstruction": read_reconstruction})
+    except ValidationError as e:
+        raise InputFileError(explain_errors(f"{path}: scene in its history", e, SceneFile, history.scene)) from None
+    return scene.with_base_dir(path.absolute().parent)
+
+
+def other_sample(path: Path, rec: Reconstruction) -> str | None:
+    """Say in which values the sample and the beam of a scene differ from those that were simulated; None: in none.
+
+    Of data that were not simulated nothing is known, and nothing is said.
+    """
+    before = scene_of(rec)
+    if before is None:
+        return None
+    now = resolved(load_scene(path))
+    values = [dict(_values({key: tables.get(key, {}) for key in ("sample", "beam")})) for tables in (now, before)]
+    keys = [key for key in dict.fromkeys([*values[0], *values[1]]) if values[0].get(key) != values[1].get(key)]
+    if not keys:
+        return None
+    shown = [f"{key} {values[0].get(key)!r} instead of {values[1].get(key)!r}" for key in keys[:_SHOWN]]
+    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+    return f"{path} is not what was simulated: {', '.join(shown)}{more}"
+
+
+def odd_height(truth: Truth) -> str | None:
+    """Say that the height which errors are fractions of is not that of the true surface; None: it is."""
+    height = truth.region.height if truth.region else None
+    reached = float(np.nanmax(np.abs(truth.height)))
+    if height is None or abs(height - reached) <= _ODD * height:
+        return None
+    return f"truth.height_um is {height:g} um, the true heights reach {reached:.0f} um: errors in % are of the former"
+
+
+def _values(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys and values of nested tables and lists; of files their names without folders."""
+    pairs = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else None
+    if pairs is None:
+        yield above, Path(node).name if above.endswith(".file") and isinstance(node, str) else node
+        return
+    for key, value in pairs:
+        yield from _values(value, f"{above}.{key}" if above else str(key))
 
 
 def _fitted_truth(path: str | Path, scene: SceneFile, rec: Reconstruction) -> Truth:

@@ -1,4 +1,4 @@
-"""Check a scene or instrument file for `helio validate`, and summarise what it describes."""
+"""Check a scene, instrument or study file for `helio validate`, and summarise what it describes."""
 
 import math
 from collections.abc import Mapping
@@ -7,20 +7,24 @@ from pathlib import Path
 from typing import Any
 
 from helio_jax.detector import Detector
+from helio_jax.errors import SceneError
 from helio_jax.figures.summary import Rows, summarise
 from helio_jax.instrument import Instrument
 from helio_jax.scene.body import Body
+from helio_jax.scene.files import read_toml
 from helio_jax.scene.plates import check_solid
 from helio_jax.scene.sample import MeshSample, check_body
 from helio_jax.workflows.scene_file import (
     SceneFile,
     is_scene,
+    is_study,
     load_instrument,
     load_scene,
     read_tables,
     replaced_lists,
 )
 from helio_jax.workflows.shipped import Kind, locate
+from helio_jax.workflows.study_file import MAX_STUDY_MB
 
 
 @dataclass(frozen=True)
@@ -29,10 +33,10 @@ class Checked:
 
     Attributes:
         file: its path.
-        kind: "scene", or "instrument" for a file without the tables of a sample and a scan.
-        instrument: beam, plate and detectors, JSON-compatible; `about`: the same in words.
+        kind: "scene", "study", or "instrument" for a file without the tables of a sample and a scan.
+        instrument: beam, plate and detectors, JSON-compatible; `about`: the same, or the study, in words.
         image: pixels in x and y and number of views; none of an instrument.
-        body: triangles and spheres of the sample; none of an instrument.
+        body: triangles and spheres of the sample; none of an instrument or a study.
         plate: triangles of a plate of kind "mesh".
         replaced: lists that replace those of the extended file.
         warnings: probable mistakes.
@@ -50,10 +54,10 @@ class Checked:
 
 
 def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Checked:
-    """Check a scene, its sample and the files that it names, or an instrument.
+    """Check a scene, its sample and the files that it names, an instrument, or the scenes of a study.
 
     Args:
-        name: of the file, or of a scene or instrument that comes with the program.
+        name: of the file, or of one that comes with the program.
         overrides: values that override the file, as in `load_scene`.
 
     Raises:
@@ -61,6 +65,8 @@ def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
         InputFileError: a file that it names is missing or wrong.
     """
     path = locate(name)
+    if is_study(read_toml(path, MAX_STUDY_MB)):
+        return _check_study(path, overrides)
     replaced = tuple(replaced_lists(path))
     if not is_scene(read_tables(path)):
         return Checked(str(path), "instrument", *_describe(load_instrument(path, overrides)), replaced=replaced)
@@ -82,6 +88,25 @@ def check_file(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
         replaced=replaced,
         warnings=(*scene.warnings(), *scene_warnings(scene, body)),
     )
+
+
+def _check_study(path: Path, overrides: Mapping[str, Any] | None) -> Checked:
+    """Check the scenes of all points of a study; their samples are those of scenes."""
+    from helio_jax.workflows.study import point_scenes  # the tracer: seconds that a wrong file does not need
+
+    if overrides:
+        raise SceneError(f"{path}: --set {next(iter(overrides))}: a study's values stand in its tables set, case, vary")
+    study, scenes = point_scenes(path)
+    first = scenes[0]
+    about = [
+        ("study", study.name),
+        ("scene", study.scene),
+        ("varies", ", ".join([*study.vary, *(["case"] if study.case else [])])),
+        ("points", f"{len(scenes)}, each with {'heights' if study.reconstruct else 'micrographs only'}"),
+    ]
+    ny, nx = first.image_shape
+    image = {"nx": nx, "ny": ny, "views": first.scan.n_views}
+    return Checked(str(path), "study", _describe(first.instrument)[0], about, image=image)
 
 
 def _describe(instrument: Instrument) -> tuple[dict[str, Any], Rows]:

@@ -125,7 +125,7 @@ def test_log_is_no_input(tmp_path):
     assert "is the same file as" in str(done.exception) and (tmp_path / "a.h5").read_bytes() == b"measured for a week"
 
 
-SCENE_COMMANDS = ("run", "simulate", "rays", "spot", "plate", "validate", "show", "compare")
+SCENE_COMMANDS = ("run", "simulate", "rays", "spot", "plate", "validate", "show", "compare", "plan", "design")
 
 
 @pytest.mark.parametrize("name", SCENE_COMMANDS)

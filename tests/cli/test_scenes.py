@@ -179,3 +179,20 @@ def test_validate_says_what_it_read():
 def test_version():
     """Catches a version that is typed in twice."""
     assert helio("--version") == (0, f"helio_jax {helio_jax.__version__}\n")
+
+
+def test_a_study_is_no_scene(empty):
+    """`validate` checks its points, `show` and `run` name the command for it, `init` does not offer one.
+
+    Catches eight errors about unknown keys.
+    """
+    code, text = helio("validate", "trench_contrast")
+    assert code == 0 and "ok, a study" in text and "12, each with micrographs only" in text
+    for words in (
+        ("show", "aspect_ratio", "-o", "x.png"),
+        ("run", "aspect_ratio"),
+        ("simulate", "detectors", "-o", "x.h5"),
+    ):
+        code, text = helio(*words)
+        assert code == 2 and "this is a study of the scene 'sphere_a': helio study runs it" in text
+    assert helio("init", "study")[0] == 2 and not list(empty.iterdir())
