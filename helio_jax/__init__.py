@@ -17,6 +17,7 @@ Module map (one line each, complete: tests/unit/test_project_files.py):
 
 ```
 .                     nouns and rules
+  arguments           types of the arguments of public functions
   arrays              conventions of every array; checks and small array functions
   errors              typed errors and their exit codes
   spelling            near matches of a misspelt name

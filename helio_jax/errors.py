@@ -16,6 +16,10 @@ class SceneError(HelioError):
     exit_code = 2
 
 
+class WrongType(SceneError, TypeError):
+    """An argument of a public function is of another type than it takes."""
+
+
 class InputFileError(HelioError):
     """A data file is missing, corrupt, incomplete or of an unknown kind."""
 

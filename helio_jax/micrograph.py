@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from helio_jax.arguments import expect
 from helio_jax.arrays import as_float_array, as_json, check_axis, set_float_arrays
 from helio_jax.drawable import Drawable, OnRaster
 from helio_jax.errors import HelioError, InputFileError
@@ -136,6 +137,7 @@ class MicrographStack(OnRaster):
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        expect("MicrographStack: instrument", self.instrument, Instrument)
         error = InputFileError
         set_float_arrays(self, {"x": (None,), "y": (None,)}, error)
         check_axis("x", self.x, error)

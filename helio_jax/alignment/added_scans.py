@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.arrays import as_float_array, pitch
 from helio_jax.errors import InputFileError
 from helio_jax.micrograph import OF_ONE_SCAN, MicrographStack
@@ -26,6 +27,7 @@ def is_same_orientation(first: MicrographStack, other: MicrographStack) -> bool:
     return first.instrument == other.instrument and turn < _SAME_TURN
 
 
+@checked
 def add_scans(first: MicrographStack, *others: MicrographStack) -> MicrographStack:
     """Add scans of one orientation: the mean of their counts, weighted by dwell time, and the sum of their dwell times.
 
@@ -98,6 +100,7 @@ def add_by_orientation(stacks: Sequence[MicrographStack], *, only_lists: bool = 
     return tuple(add_scans(*group) if len(group) > 1 else group[0] for group in out)
 
 
+@checked
 def add_positions(
     first: MicrographStack,
     xy_um: np.ndarray,

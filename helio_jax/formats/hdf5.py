@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.child import GIB, MIB, UNPACKED_BYTES, UNPACKED_RATIO, call_in_child, check_size, check_unpacked
 from helio_jax.errors import InputFileError
 from helio_jax.formats import safe
@@ -113,6 +114,7 @@ def _fixed_text(value: str | list[str]) -> np.ndarray:
     return array[0].reshape(()) if isinstance(value, str) else array
 
 
+@checked
 def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
     """Read a helio file.
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.arrays import as_json
 from helio_jax.child import MIB, call_in_child, check_size, check_unpacked
 from helio_jax.errors import InputFileError
@@ -37,6 +38,7 @@ _EXAMPLE_INSTRUMENT = {
 }
 
 
+@checked
 def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = None) -> MicrographStack:
     """Import the micrographs of one MATLAB file (level 5 format, at most 256 MiB).
 

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.errors import SceneError
 from helio_jax.forward.masking import Slices, slice_apertures
 from helio_jax.forward.optics import Optics, Raster, cast
@@ -131,6 +132,7 @@ class Crossings(NamedTuple):
     distance: np.ndarray
 
 
+@checked
 def plan_radiosity(
     height: np.ndarray,
     normals: np.ndarray,

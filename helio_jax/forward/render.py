@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from helio_jax.arguments import checked
 from helio_jax.errors import SceneError
 from helio_jax.forward.compiling import batched_in_chunks, compiled
 from helio_jax.forward.form_factor import form_factor_at
@@ -73,6 +74,7 @@ def detection_probability(
     return albedo * single + corrections.multiple
 
 
+@checked
 @in_own_precision
 def render(
     height: Any,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from helio_jax.arguments import checked
 from helio_jax.forward.optics import Raster
 
 MIN_FACING = 0.02
@@ -120,6 +121,7 @@ def _slope_along(height: Any, step: float, axis: int) -> Any:
     return weighted / total
 
 
+@checked
 def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | None = None) -> Surface:
     """Estimate the slopes of heights alone; differentiable in the heights.
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.forward.optics import Optics, Raster
 from helio_jax.forward.radiosity import plan_radiosity
 from helio_jax.forward.render import (
@@ -50,6 +51,7 @@ class Information:
     posterior: Posterior
 
 
+@checked
 def fisher(
     height: Any,
     optics: Optics,
@@ -136,6 +138,7 @@ def pose_experiment(
     return problem, set_corrections(problem, FitState.at(problem, surface), corrections, surface)
 
 
+@checked
 def posterior_std(height: Any, optics: Optics, raster: Raster, dose: Any, **options: Any) -> np.ndarray:
     """Compute the standard deviation [y, x], um, with which an experiment would determine each height (`fisher`)."""
     return fisher(height, optics, raster, dose, **options).height_std

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
+from helio_jax.arguments import checked
 from helio_jax.arrays import pitch
 from helio_jax.detector import Aperture, Cone
 from helio_jax.errors import SceneError
@@ -100,6 +101,7 @@ def scan_of(stack: MicrographStack) -> tuple[Scan, SignalLevels]:
     return Scan(images, openings, stack, np.array(stack.instrument.beam_shift)), levels
 
 
+@checked
 def find_steps(stack: MicrographStack) -> Steps:
     """Find the steps of a surface in its micrographs and measure their heights.
 

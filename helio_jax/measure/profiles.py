@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.heightmap import HeightMap
 from helio_jax.measure.sample_surface import FLAGS, check_line, sample_surface
 from helio_jax.reconstruction import Reconstruction
@@ -66,6 +67,7 @@ def profile_table(columns: Mapping[str, Sequence[Any]]) -> str:
     return text.getvalue()
 
 
+@checked
 def measure_profile(
     heights: Reconstruction | HeightMap,
     start: tuple[float, float],

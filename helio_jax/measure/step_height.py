@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.measure.profiles import Profile
 
@@ -45,6 +46,7 @@ class StepHeight:
     errors: str
 
 
+@checked
 def measure_step_height(profile: Profile, edges: tuple[float, float] | None = None) -> StepHeight:
     """Measure the height of a ridge, or the depth of a groove, as ISO 5436-1 type A.
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from helio_jax.arguments import checked
 from helio_jax.errors import GuardError, SceneError
 from helio_jax.heightmap import HeightMap
 from helio_jax.measure.areal_filters import Form, form_surface, gaussian_mean
@@ -120,6 +121,7 @@ def scale_limited(z: np.ndarray, steps: tuple[float, float], settings: TextureSe
     return z - np.nanmean(z)
 
 
+@checked
 def measure_texture(
     heights: Reconstruction | HeightMap,
     settings: TextureSettings | None = None,

@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.detector import Detector
 from helio_jax.errors import SceneError
 from helio_jax.forward.optics import Optics
@@ -49,6 +50,7 @@ BATCH = 200
 _OF_DETECTOR = "gain", "background_per_pixel"
 
 
+@checked
 def design(
     scene: SceneFile,
     *,

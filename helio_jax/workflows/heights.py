@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from helio_jax.alignment.rigid import Rigid
+from helio_jax.arguments import checked
 from helio_jax.calibration.border import CalibrateSettings, calibrate_on_border
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.forward.form_factor import substrate_signal
@@ -77,6 +78,7 @@ def _with_priors(settings: ReconstructSettings, stack: MicrographStack, changes:
     return changes | {"refine": settings.refine.model_dump() | added | given}
 
 
+@checked
 def reconstruct(
     stack: MicrographStack | MicrographSet,
     method: str | None = None,
@@ -120,6 +122,7 @@ def reconstruct(
     return _Reconstructing(chosen, workers).finish(one, report)
 
 
+@checked
 def reconstruct_scans(
     scans: MicrographSet,
     method: str | None = None,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from helio_jax.alignment.align import AlignSettings, align_scans
+from helio_jax.arguments import checked
 from helio_jax.calibration.noise import add_noise
 from helio_jax.errors import GuardError, ResumeError, SceneError
 from helio_jax.figures.before_after import save_before_after
@@ -51,6 +52,7 @@ def _silent(label: str) -> Any:
     return nullcontext()
 
 
+@checked
 def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = None, **trace: Any) -> Micrographs:
     """Trace a scene's micrographs: expected counts, or analog ones with `estimator="analog"`.
 
@@ -172,6 +174,7 @@ def resume(path: str | Path, *, stage: Stage = _silent, say: Callable[[str], Non
     return [output]
 
 
+@checked
 def record(scene: SceneFile, stack: Micrographs) -> Micrographs:
     """Return micrographs as the scene's experiment would record them: with counting noise, if the scene asks for it.
 
@@ -209,6 +212,7 @@ def align(
     return stack, {} if found.points is None else found.points.places
 
 
+@checked
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
     """Score a reconstruction against the true heights of the same rays (docs/results.md)."""
     return evaluate_height(rec, truth)

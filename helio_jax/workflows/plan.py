@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from helio_jax.arguments import checked
 from helio_jax.arrays import border_mask
 from helio_jax.errors import GuardError, InputFileError, SceneError
 from helio_jax.formats.acquisition import read_acquisitions
@@ -138,6 +139,7 @@ class Plan:
         return found
 
 
+@checked
 def plan(
     scene: SceneFile,
     *,

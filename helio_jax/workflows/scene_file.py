@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from helio_jax.arguments import checked
 from helio_jax.calibration.noise import NoiseSettings
 from helio_jax.errors import SceneError
 from helio_jax.instrument import Instrument
@@ -50,6 +51,7 @@ class SceneFile(Scene):
         return problems + [f"noise.{key}: {text}" for key, text in self.noise.problems(len(self.detector))]
 
 
+@checked
 def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = None) -> SceneFile:
     """Read a scene file.
 
@@ -106,6 +108,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
     return read_height(path)
 
 
+@checked
 def load_instrument(path: str | os.PathLike, overrides: Mapping[str, Any] | None = None) -> Instrument:
     """Read the instrument of an instrument file, or of any scene file.
 

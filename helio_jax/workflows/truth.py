@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from helio_jax.arguments import checked
 from helio_jax.errors import InputFileError, SceneError
 from helio_jax.formats.hdf5 import read_height
 from helio_jax.formats.history import history_of, scene_of
@@ -31,6 +32,7 @@ SUBSTRATE_RATIO = 1.35
 """Default inner radius of the scored substrate, over the radius of the scored region."""
 
 
+@checked
 def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
     """Compute the true first hit for every pixel of a reconstruction's raster (see `true_surface`).
 
