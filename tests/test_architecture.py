@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1] / "helio_jax"
 LEVELS = [
     {"errors", "spelling", "validity", "texts", "cpus"},
-    {"arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
+    {"arguments", "arrays", "settings", "kernel", "robust", "block_fit", "drawable", "child"},
     {"detector", "campaign"},
     {"instrument"},
     {"micrograph", "heightmap", "reconstruction", "geometry_prior"},
