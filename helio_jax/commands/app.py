@@ -6,6 +6,7 @@ JSON object with --json), stderr progress and messages. Exit codes: errors.py.
 
 import json
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -137,12 +138,17 @@ def tell_micrographs(stack: Any, output: Path, has_picture: bool, as_json: bool)
         print(f"picture: {picture}")
 
 
+LINE_SECONDS = 30.0
+"""Time between two lines about the progress, where there is no terminal [s]."""
+
+
 class Bar:
-    """A progress bar on a terminal; one line per stage elsewhere."""
+    """A progress bar on a terminal; elsewhere one line per stage, and one every half a minute."""
 
     def __init__(self, label: str) -> None:
         self.label = label
         self.bar: Any = None
+        self.start = self.said = time.monotonic()
         say(label) if not sys.stderr.isatty() else None
 
     def __enter__(self) -> "Bar":
@@ -165,6 +171,12 @@ class Bar:
             self.bar.update(self.task, completed=done, total=total, description=f"{self.label} {note}".strip())
         elif note:
             say(f"  {self.label}: round {done + 1} of {total}, {note}")
+        elif 0 < done < total and time.monotonic() - self.said > LINE_SECONDS:
+            from helio_jax.figures.wording import duration
+
+            self.said = time.monotonic()
+            left = (self.said - self.start) * (total - done) / done
+            say(f"  {self.label}: {done / total:.0%} done, about {duration(left)} left")
 
 
 def print_result(as_json: bool, record: Any, *lines: str) -> None:

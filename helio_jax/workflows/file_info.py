@@ -18,6 +18,7 @@ from helio_jax.figures.summary import Rows, summarise
 from helio_jax.figures.wording import plural
 from helio_jax.formats import hdf5
 from helio_jax.formats.matlab import describe_matlab
+from helio_jax.formats.parts import Parts
 from helio_jax.formats.points import HEADER, read_points, read_rows
 from helio_jax.formats.suffixes import HDF5_SUFFIXES
 from helio_jax.reconstruction import Reconstruction
@@ -26,6 +27,7 @@ from helio_jax.scene.files import MAX_HEIGHT_MAP_MB, check_file, read_bytes, rea
 from helio_jax.scene.meshes import KINDS as MESHES
 from helio_jax.scene.meshes import load_mesh
 from helio_jax.scene.sample import MeshSample, check_body
+from helio_jax.texts import parse_json
 from helio_jax.workflows.scene_file import (
     SceneFile,
     is_scene,
@@ -38,6 +40,8 @@ from helio_jax.workflows.scene_file import (
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import MAX_STUDY_MB, load_study
 
+MAX_UNITS = 1_000_000
+"""Largest number of units of a run that are counted."""
 TABLES = (".csv", ".tsv", ".txt")
 _MANY = 10
 """Most columns whose contents are shown."""
@@ -87,10 +91,14 @@ class FileInfo:
 def file_info(path: str | os.PathLike) -> FileInfo:
     """Find out what a file holds, or a scene or an instrument that comes with the program, by its name.
 
+    Of a run or study that is not finished: how far it is, by its output or its folder.
+
     Raises:
         InputFileError: missing, damaged, or of a kind that the program does not read.
         SceneError: a wrong scene, instrument or study file, or an unknown name.
     """
+    if unfinished := _unfinished_run(Path(path)) or _study_folder(Path(path)):
+        return unfinished
     path = locate(path)
     suffix = path.suffix.lower()
     n_bytes = check_size(path, hdf5.MAX_BYTES)
@@ -104,6 +112,46 @@ def file_info(path: str | os.PathLike) -> FileInfo:
         )
     kind, rows, details = readers[suffix](path)
     return FileInfo(str(path), kind, n_bytes, rows, details)
+
+
+def _unfinished_run(path: Path) -> FileInfo | None:
+    """Return how far a simulation is, by its output, the folder of its parts, or the folder of a run."""
+    for output in (path, path.with_name(path.name.removesuffix(".parts")), path / "micrographs.h5"):
+        parts = Parts(output)
+        if parts.exist and not output.exists():
+            about = parts.manifest()
+            n_units = about.get("n_units")
+            n = min(n_units, MAX_UNITS) if isinstance(n_units, int) else 0
+            done = sum(parts.has(i) for i in range(n))
+            command = about.get("command")
+            scene = command.get("scene", "unknown") if isinstance(command, dict) else "unknown"
+            given = output.parent if path.is_dir() and output.name == "micrographs.h5" else output
+            rows = [
+                ("unfinished", f"{done} of {n} units of work are stored"),
+                ("scene", str(scene)),
+                ("to go on", f"helio resume {given}"),
+            ]
+            return FileInfo(str(path), "unfinished run", 0, rows, {"units": n, "done": done})
+    return None
+
+
+def _study_folder(path: Path) -> FileInfo | None:
+    """Return how far the study of a folder is."""
+    if not (path / "study.json").is_file():
+        return None
+    try:
+        index = parse_json((path / "index.json").read_text(encoding="utf-8"))
+        status = Counter(str(row["status"]) for row in index)
+    except (OSError, ValueError, TypeError, KeyError):
+        status = Counter[str]()
+    study = parse_json((path / "study.json").read_text(encoding="utf-8"))
+    rows = [
+        ("study", str(study.get("study", "unknown"))),
+        ("points", ", ".join(f"{n} {name}" for name, n in status.items()) or "none finished"),
+    ]
+    if set(status) != {"done"}:
+        rows.append(("to go on", f"helio resume {path}"))
+    return FileInfo(str(path), "folder of a study", 0, rows, dict(status))
 
 
 Found = tuple[str, Rows, dict[str, Any]]

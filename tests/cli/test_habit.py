@@ -212,3 +212,17 @@ def test_shell_completes_words(words, found):
         [sys.executable, "-c", code], env=os.environ | asked, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.stdout.split() == [found], done.stderr
+
+
+def test_progress_is_printed_where_there_is_no_terminal(capsys, monkeypatch):
+    """One line after half a minute, with the share and the time that remains; none before.
+
+    Catches a run of hours that prints "tracing" once.
+    """
+    now = [100.0]
+    monkeypatch.setattr(helio_jax.commands.app.time, "monotonic", lambda: now[0])
+    bar = helio_jax.commands.app.Bar("tracing")
+    for seconds, done in ((1.0, 5), (20.0, 10), (35.0, 25), (40.0, 30), (100.0, 100)):
+        now[0] = 100.0 + seconds
+        bar(done, 100)
+    assert capsys.readouterr().err.splitlines() == ["tracing", "  tracing: 25% done, about 2 min left"]

@@ -20,6 +20,7 @@ from helio_jax.errors import InputFileError, InterruptedRun, ResumeError, SceneE
 from helio_jax.formats.parts import Parts
 from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
+from helio_jax.workflows.file_info import file_info
 
 KILLS = 20
 UNIT_PIXELS = 360 // N_UNITS
@@ -381,6 +382,16 @@ def test_manifest_of_an_older_version_is_refused(half):
     with pytest.raises(ResumeError, match=r"manifest\.json is damaged .*executor"):
         pipeline.resume(half.output)
     assert n_kept(half) == N_UNITS // 2
+
+
+def test_info_of_an_unfinished_run(half, tmp_path):
+    """By its output and by the folder of its parts; not once it is finished. Catches "does not exist"."""
+    for path in (half.output, half.folder):
+        found = file_info(path)
+        assert found.kind == "unfinished run" and found.details == {"units": N_UNITS, "done": n_kept(half)}
+        assert dict(found.rows)["to go on"] == f"helio resume {half.output}"
+    pipeline.resume(half.output, say=lambda text: None)
+    assert file_info(half.output).kind == "micrographs"
 
 
 def ends_within(group: int, seconds: float) -> bool:

@@ -16,6 +16,7 @@ from helio_jax.figures import sweep
 from helio_jax.formats.toml import to_toml
 from helio_jax.trace.scan import Executor
 from helio_jax.workflows import pipeline
+from helio_jax.workflows.file_info import file_info
 from helio_jax.workflows.scene_file import load_scene, resolved
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study import load_study, resume_study, run_study
@@ -203,6 +204,7 @@ def test_points_index_and_going_on(tmp_path):
     with pytest.raises(ResumeError, match="--resume"):
         run_study(path, out, options=QUIET)
     shutil.rmtree(point)
+    assert dict(file_info(out).rows)["points"] == "4 done"  # as the index says
     before = {p: p.stat().st_mtime_ns for p in out.glob("point_*/micrographs.h5")}
     resume_study(out, say=lambda text: None)
     assert (point / "micrographs.h5").exists() and before == {p: p.stat().st_mtime_ns for p in before}
@@ -248,6 +250,8 @@ def test_interrupted_and_failed_points(tmp_path, monkeypatch):
     error = GuardError
     with pytest.raises(GuardError, match=r"1 of 4 points failed.*point 2: no good"):
         run_study(path, out, resume=True, options=QUIET)
+    told = dict(file_info(out).rows)
+    assert sorted(told["points"].split(", ")) == ["1 failed", "3 done"] and told["to go on"] == f"helio resume {out}"
     monkeypatch.undo()
     said: list[str] = []
     resume_study(out, say=said.append)
