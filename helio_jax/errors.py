@@ -5,7 +5,14 @@ Every message names the quantity, the value, the limit and the remedy.
 
 
 class HelioError(Exception):
-    """Base of all expected errors."""
+    """Base of all expected errors.
+
+    Example:
+        >>> try:
+        ...     hx.read("nowhere.h5")
+        ... except hx.HelioError as e:
+        ...     print(e, e.exit_code)
+    """
 
     exit_code = 1
 

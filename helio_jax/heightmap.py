@@ -21,6 +21,9 @@ class HeightMap(OnRaster):
         height_std: standard deviation of each height [y, x], um; None: unknown.
         status: one sentence on how the method that made the heights ended.
         provenance: history, on which no step depends (JSON-compatible).
+
+    Example:
+        >>> hx.HeightMap(np.zeros((5, 7)), x=np.arange(7.0), y=np.arange(5.0))
     """
 
     height: np.ndarray

@@ -203,7 +203,11 @@ class Covariance(Settings):
 
 
 class Instrument(Drawable, Settings):
-    """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians)."""
+    """Beam, plate and detectors of one scan, and the geometry derived from them (um, radians).
+
+    Example:
+        >>> hx.load_instrument("bshem_wd4").detector_names
+    """
 
     beam: Beam = Beam()
     plate: Plate

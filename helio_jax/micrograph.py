@@ -105,6 +105,9 @@ class MicrographStack(OnRaster):
         alignment: set where the images are aligned scans of a rotated sample.
         materials: kind of scattering law by name of the material, of a simulated sample.
         provenance: history: scene, files, versions, seed, ray counters (JSON-compatible).
+
+    Example:
+        >>> hx.MicrographStack(counts, x, y, hx.load_instrument("bshem_wd4"), variance=counts)
     """
 
     counts: np.ndarray
@@ -278,7 +281,11 @@ class MicrographStack(OnRaster):
 
 @dataclass(frozen=True, repr=False)
 class MicrographSet(Drawable):
-    """Several scans of one sample, each with its own raster, azimuth, rotation and instrument."""
+    """Several scans of one sample, each with its own raster, azimuth, rotation and instrument.
+
+    Example:
+        >>> hx.MicrographSet((stack, stack)).stacks[1].counts
+    """
 
     stacks: tuple[MicrographStack, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -53,6 +53,9 @@ class Reconstruction(OnRaster):
         warnings: what to know before the heights are trusted, most important first; that the data contradict the map as
             a whole, and that no height is valid, is added and removed by itself.
         provenance: history, on which no step depends (JSON-compatible).
+
+    Example:
+        >>> hx.reconstruct(stack, "nearfield").height_std
     """
 
     height: np.ndarray

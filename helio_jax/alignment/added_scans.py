@@ -45,6 +45,9 @@ def add_scans(first: MicrographStack, *others: MicrographStack) -> MicrographSta
     Raises:
         InputFileError: other instruments, rotations, units or kinds of noise, an unknown dwell time, numbers of beam
             atoms that do not fit the dwell times, positions off the raster, scans that are joined.
+
+    Example:
+        >>> hx.add_scans(stack, stack).counts
     """
     for other in others:
         _check(first, other)

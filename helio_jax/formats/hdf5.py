@@ -52,6 +52,9 @@ def write(obj: "Noun", path: str | os.PathLike) -> None:
     Raises:
         SceneError: the target cannot be written.
         HelioError: the object is of another kind, or its provenance is not JSON-compatible.
+
+    Example:
+        >>> hx.write(rec, "height.h5")
     """
     import helio_jax
     from helio_jax.formats import nexus
@@ -127,6 +130,9 @@ def read(path: str | os.PathLike, *, max_bytes: int = MAX_BYTES) -> "Noun":
 
     Raises:
         InputFileError: missing, not HDF5, not a helio file, damaged, too large, or with links to other files.
+
+    Example:
+        >>> hx.read("height.h5").height
     """
     from helio_jax.formats import nexus
 

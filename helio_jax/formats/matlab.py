@@ -53,6 +53,9 @@ def import_micrographs(path: str | os.PathLike, instrument: Instrument | None = 
 
     Raises:
         InputFileError: missing, corrupt, of another kind, no instrument given, or the instrument contradicts the file.
+
+    Example:
+        >>> hx.import_micrographs("scan.mat", hx.load_instrument("bshem_wd4"))
     """
     tree = _read_tree(path)
     digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -48,6 +48,9 @@ class PowerLaw(eqx.Module):
 
     Attributes:
         exponent: m; 0 is the cosine law.
+
+    Example:
+        >>> hx.render(height, optics, raster, law=hx.PowerLaw(0.1))
     """
 
     exponent: Any = eqx.field(converter=_number)
@@ -73,6 +76,9 @@ class LobeLaw(eqx.Module):
     Attributes:
         share: of the atoms in the lobe; 0 is the cosine law.
         width_deg: s [deg], at least `MIN_WIDTH_DEG`.
+
+    Example:
+        >>> hx.render(height, optics, raster, law=hx.LobeLaw(0.1, 30.0))
     """
 
     share: Any = eqx.field(converter=_number)
@@ -100,6 +106,9 @@ class RoughLaw(eqx.Module):
         roughness: r of the model, about the standard deviation of the slope angles over pi/2; 0 is the cosine law.
 
     Source: Portsmouth, Kutz, Hill, JCGT 14 (2025) 1, with their polynomial of the albedo.
+
+    Example:
+        >>> hx.render(height, optics, raster, law=hx.RoughLaw(0.2))
     """
 
     roughness: Any = eqx.field(converter=_number)
@@ -124,6 +133,9 @@ class MonotoneLaw(eqx.Module):
 
     Attributes:
         log_exponents: log p at the knots [7].
+
+    Example:
+        >>> hx.render(height, optics, raster, law=hx.MonotoneLaw(np.zeros(7)))
     """
 
     log_exponents: Any = eqx.field(converter=_number)

@@ -51,6 +51,9 @@ class Raster(eqx.Module):
     Attributes:
         x: of the columns, increasing, equally spaced [x].
         y: of the rows [y].
+
+    Example:
+        >>> hx.Raster.of(stack)
     """
 
     x: Float[Any, " x"]
@@ -112,6 +115,9 @@ class Optics(eqx.Module):
         sample_distance: distance D from the plate to the substrate.
         beam_shifts: the same of the beam of every image, where a stack joins scans of several beams; then `beam_shift`
             is that along which the raster sees the sample (0: straight down). None: one beam.
+
+    Example:
+        >>> hx.Optics.of(hx.load_instrument("bshem_wd4"))
     """
 
     center: Float[Any, "detector 3"]

@@ -156,6 +156,10 @@ def plan_radiosity(
 
     Raises:
         SceneError: the images were taken with several beams.
+
+    Example:
+        >>> plan = hx.plan_radiosity(rec.height, rec.normals, optics, raster)
+        >>> hx.render(rec.height, optics, raster, corrections=plan)
     """
     if optics.beam_shifts is not None:
         raise SceneError("radiosity knows one beam, these images were taken with several: have them traced instead")

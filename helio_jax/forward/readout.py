@@ -42,6 +42,9 @@ class Readout(eqx.Module):
         pedestal_modes: its shapes, from `pedestal_modes`.
         lines: offset of each scan line.
         slow_axis: raster axis across the scan lines, 0 (y) or 1 (x), static.
+
+    Example:
+        >>> hx.render(height, optics, raster, readout=hx.Readout(np.full(3, 35_000.0), np.zeros(3)))
     """
 
     gain: Float[Any, " detector"]
@@ -85,6 +88,10 @@ def drift_modes(shape: tuple[int, int], order: ScanOrder, degrees: tuple[int, in
         shape: of the raster (y, x).
         order: in which the pixels were recorded.
         degrees: largest degree along the slow and the fast axis.
+
+    Example:
+        >>> from helio_jax.forward.readout import ScanOrder
+        >>> hx.drift_modes(stack.shape[1:], ScanOrder(), (4, 3)).shape
     """
     if order.time is not None:
         degree = np.arange(1, degrees[0] + 1)
@@ -103,6 +110,9 @@ def pedestal_modes(stage_x: np.ndarray, stage_y: np.ndarray, degree: int = 3) ->
         stage_x, stage_y: stage coordinates of every pixel [y, x], in units of half the range that all scans of the
             campaign share, about its middle (-1 to 1), so that they can share amplitudes.
         degree: largest total degree of the polynomial.
+
+    Example:
+        >>> hx.pedestal_modes(*np.meshgrid(x, y), degree=2).shape
     """
     return _products(stage_x, stage_y, (degree, degree))[None]
 

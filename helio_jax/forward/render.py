@@ -36,6 +36,9 @@ class Corrections(eqx.Module):
         normals: unit normals that `multiple` is for, where they are not the surface's own.
         surroundings: change of the probabilities by one standard deviation of how the sample goes on beyond the image,
             or None where known. It errs as one, too.
+
+    Example:
+        >>> hx.render(height, optics, raster, corrections=hx.Corrections(masked, multiple))
     """
 
     masked: Float[Any, "detector 3 y x"]

@@ -34,6 +34,9 @@ class Surface(eqx.Module):
         height: above the substrate [um].
         slope_x: dh/dX, per um of raster.
         slope_y: dh/dY.
+
+    Example:
+        >>> hx.surface_of_heights(height, raster).slope_x
     """
 
     height: Float[Any, "y x"]
@@ -144,6 +147,9 @@ def surface_of_heights(height: Any, raster: Raster, edges: tuple[Any, Any] | Non
             means of the differences along joined edges; default: as above.
 
     Source: weighted essentially non-oscillatory stencils, Jiang and Shu, J. Comput. Phys. 126 (1996) 202.
+
+    Example:
+        >>> hx.surface_of_heights(height, raster)
     """
     height = jnp.asarray(height)
     slopes = []

@@ -44,6 +44,9 @@ class Information:
         parameters: of every unknown of the instrument: standard deviation that the experiment would leave, prior
             standard deviation, unit; e.g. parameters["log_gain 0"] of the first detector.
         posterior: samples, covariance of the parameters, response of the heights to each.
+
+    Example:
+        >>> hx.fisher(height, optics, raster, 35_000).height_std
     """
 
     height_std: np.ndarray
@@ -140,5 +143,9 @@ def pose_experiment(
 
 @checked
 def posterior_std(height: Any, optics: Optics, raster: Raster, dose: Any, **options: Any) -> np.ndarray:
-    """Compute the standard deviation [y, x], um, with which an experiment would determine each height (`fisher`)."""
+    """Compute the standard deviation [y, x], um, with which an experiment would determine each height (`fisher`).
+
+    Example:
+        >>> hx.posterior_std(height, optics, raster, 35_000)
+    """
     return fisher(height, optics, raster, dose, **options).height_std

@@ -110,6 +110,9 @@ def find_steps(stack: MicrographStack) -> Steps:
 
     Raises:
         SceneError: the images are no raster or of several beams, or the plate is a mesh.
+
+    Example:
+        >>> hx.find_steps(stack).steps
     """
     scan, levels = scan_of(stack)
     images, side = scan.images, scan.images.side

@@ -37,6 +37,9 @@ def export(
     Raises:
         SceneError: the format is unknown, or cannot hold this object; the file cannot be written.
         GuardError: no height is valid, so that none can be resampled.
+
+    Example:
+        >>> hx.export(rec, "height.x3p")
     """
     left_out = []
     if grid is not None:

@@ -104,6 +104,9 @@ def reconstruct(
     Raises:
         GuardError: too few images; the linear method, where the beams of several scans are oblique.
         InputFileError: a list of positions; scans that must be aligned or calibrated first.
+
+    Example:
+        >>> hx.reconstruct(stack, "nearfield").height
     """
     if len(stack.stacks) > 1:
         how: dict[str, Any] = {"settings": settings, "motions": motions, "report": report, "workers": workers}
@@ -148,6 +151,9 @@ def reconstruct_scans(
     Raises:
         GuardError: too few images; the linear method, where beams are oblique.
         InputFileError: measured scans that are not aligned (normal incidence) or not calibrated; other distances.
+
+    Example:
+        >>> hx.reconstruct_scans(hx.MicrographSet((first, second))).height
     """
     wanted = changes | ({"method": method} if method else {})
     settings = settings or ReconstructSettings()

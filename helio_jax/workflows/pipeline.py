@@ -67,6 +67,9 @@ def simulate(scene: SceneFile, *, progress: Callable[[int, int], None] | None = 
     Raises:
         SceneError: an unknown or impossible setting.
         GuardError: ray book-keeping failed.
+
+    Example:
+        >>> hx.simulate(hx.load_scene("sphere_a"), rays=16).counts
     """
     scene = scene.model_copy(update={"trace": scene.trace.changed(**trace)})
     return with_provenance(trace_scene(scene, scene.trace, progress), scene, "", "")
@@ -214,7 +217,11 @@ def align(
 
 @checked
 def evaluate(rec: Reconstruction, truth: Truth) -> Scores:
-    """Score a reconstruction against the true heights of the same rays (docs/results.md)."""
+    """Score a reconstruction against the true heights of the same rays (docs/results.md).
+
+    Example:
+        >>> hx.evaluate(rec, hx.true_height(scene, rec)).recovered_height
+    """
     return evaluate_height(rec, truth)
 
 
@@ -337,6 +344,9 @@ def run(
     Raises:
         ResumeError: the folder holds an unfinished run of something else.
         InterruptedRun, StoppedRun: stopped while tracing; what was finished is kept.
+
+    Example:
+        >>> hx.run("sphere_a", "out", overrides={"scan.nx": 61}).scores
     """
     scene = load_scene(scene_path, overrides)
     _check_heights(scene, scene_path)

@@ -85,6 +85,10 @@ def plan_windows(
         InputFileError: less than two scans, scans without picks or stage window, no common point.
         SceneError: no rotation is wanted.
         GuardError: the points fit the opposite rotations better.
+
+    Example:
+        >>> picks = {"a.mat": {"1": (10.0, 5.0)}, "b.mat": {"1": (3.0, 9.0)}}
+        >>> hx.plan_windows(["a.mat", "b.mat"], picks, [0.0, 90.0, 180.0]).rows()
     """
     found = [a for path in scans for a in read_acquisitions(path)]
     if len(found) < 2:

@@ -63,6 +63,9 @@ def load_scene(path: str | os.PathLike, overrides: Mapping[str, Any] | None = No
 
     Raises:
         SceneError: missing, too large, not UTF-8, not TOML, or invalid; the message lists all errors.
+
+    Example:
+        >>> hx.load_scene("sphere_a", {"scan.nx": 61})
     """
     path = locate(path)
     tables = merge(read_tables(path), nest(overrides or {}))
@@ -118,6 +121,9 @@ def load_instrument(path: str | os.PathLike, overrides: Mapping[str, Any] | None
 
     Raises:
         SceneError: as `load_scene`; only the tables beam, plate, uncertainty and detector are checked.
+
+    Example:
+        >>> hx.load_instrument("bshem", {"beam.incidence_deg": 29.0})
     """
     path = locate(path)
     data = merge(read_tables(path), nest(overrides or {}))

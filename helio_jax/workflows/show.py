@@ -80,7 +80,9 @@ def show(
 ) -> canvas.Figure:
     """Draw a record or a file; write the picture, open a window, or return the figure for a notebook.
 
-    Example: `hx.show("sphere_a")`, `hx.show(stack, "stack.png")`.
+    Example:
+        >>> hx.show("sphere_a")
+        >>> hx.show(stack, "stack.png")
 
     Args:
         what: a record (see `draw`), the path of a file of one, or the name of a scene or instrument of `helio scenes`.

@@ -37,6 +37,9 @@ def true_height(scene: SceneFile, rec: Reconstruction) -> Truth:
     """Compute the true first hit for every pixel of a reconstruction's raster (see `true_surface`).
 
     Along the beam, or along the direction from which the raster of several scans sees the sample.
+
+    Example:
+        >>> hx.true_height(scene, rec).height
     """
     return true_surface(
         scene, rec.raster_x, rec.raster_y, rec.instrument.beam if rec.instrument.has_several_beams else None
