@@ -64,7 +64,7 @@ class ScanAlignment:
             object.__setattr__(self, "time_planes", tuple(map(tuple, planes.tolist())))
 
 
-SIMULATED_PARTS = "by_order", "effuse", "plate", "masked", "shadowed"
+SIMULATED_PARTS = "by_order", "by_order_variance", "effuse", "effuse_variance", "plate", "masked", "shadowed"
 """Fields that only the simulation of one scan on its own raster has."""
 OF_ONE_SCAN = *SIMULATED_PARTS, "stage_position"
 """Fields that only one scan on its own raster has: what is made of scans has none of them."""
@@ -85,6 +85,7 @@ class MicrographStack(OnRaster):
         background: counts per pixel that do not come from the sample [detector] or [detector, y, x]; None: unknown.
         by_order: counts by scattering order [order, detector, y, x]; the last entry holds its order and all above.
         effuse: counts from the effusive beam, not included in `counts` [detector, y, x].
+        by_order_variance, effuse_variance: of the Monte Carlo mean of these two; the orders of a path are correlated.
         plate: part of `counts` that scattered on the plate at least once [detector, y, x].
         masked: fraction of the aperture's solid angle masked by the sample, local horizon included [detector, y, x].
         shadowed: 1 where the beam does not reach the topmost surface point above the raster position [y, x].
@@ -119,7 +120,9 @@ class MicrographStack(OnRaster):
     positions: np.ndarray | None = None
     background: np.ndarray | None = None
     by_order: np.ndarray | None = None
+    by_order_variance: np.ndarray | None = None
     effuse: np.ndarray | None = None
+    effuse_variance: np.ndarray | None = None
     plate: np.ndarray | None = None
     masked: np.ndarray | None = None
     shadowed: np.ndarray | None = None
@@ -152,11 +155,13 @@ class MicrographStack(OnRaster):
             "dwell_map": shape[1:],
             "positions": (self.x.size, 2),
             "by_order": (None, *shape),
+            "by_order_variance": (None, *shape),
             "stage_position": (3,),
         }
         is_background_image = self.background is not None and np.ndim(self.background) == 3
         others["background"] = shape if is_background_image else shape[:1]
-        images = dict.fromkeys(("counts", "variance", "effuse", "plate", "masked", "parallax"), shape)
+        names = "counts", "variance", "effuse", "effuse_variance", "plate", "masked", "parallax"
+        images = dict.fromkeys(names, shape)
         set_float_arrays(self, images | others, error)
         if self.positions is not None and (self.y.size != 1 or not np.all(np.isfinite(self.positions))):
             raise error(f"positions must be finite and belong to images of one row, got {self.y.size} rows")

@@ -33,9 +33,12 @@ class Settings(BaseModel):
         try:
             return type(self).model_validate(self.model_dump(exclude_unset=True) | changes)
         except ValidationError as e:
-            raise SceneError(
-                f"setting not accepted: {'; '.join(_explain(type(self), p) for p in e.errors())}"
-            ) from None
+            raise SceneError(f"setting not accepted: {in_one_line(e, type(self))}") from None
+
+
+def in_one_line(e: ValidationError, model: type[Settings]) -> str:
+    """Say in one line what is wrong with the settings of a model: place, rule and value of each error."""
+    return "; ".join(_explain(model, problem) for problem in e.errors())
 
 
 def _explain(model: type[Settings], problem: Any) -> str:

@@ -21,7 +21,7 @@ from helio_jax.micrograph import OF_ONE_SCAN, MicrographStack
 
 MAX_PERMUTED = 4
 """Up to so many detectors all orders of the images are tried; with more only shifts and reversals along the ring."""
-_PER_DETECTOR = ("parallax", "counts", "variance", "is_observed", "effuse", "plate", "masked")
+_PER_DETECTOR = ("parallax", "counts", "variance", "is_observed", "effuse", "effuse_variance", "plate", "masked")
 """Fields [detector, y, x] of a stack."""
 _SAME = 1e-3
 """Two apertures are the same where they differ by less than this share of the working distance."""
@@ -96,8 +96,9 @@ def turn_stack(stack: MicrographStack, turn: Turn, order: tuple[int, ...]) -> Mi
         fields["background"] = (
             stack.background[pick] if stack.background.ndim == 1 else turn.image(stack.background[pick])
         )
-    if stack.by_order is not None:
-        fields["by_order"] = turn.image(stack.by_order[:, pick])
+    for name in ("by_order", "by_order_variance"):
+        if getattr(stack, name) is not None:
+            fields[name] = turn.image(getattr(stack, name)[:, pick])
     for name in ("shadowed", "parallax_height", "dwell_map"):
         if getattr(stack, name) is not None:
             fields[name] = turn.image(getattr(stack, name))

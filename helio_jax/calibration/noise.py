@@ -127,6 +127,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
     if stack.variance is not None:
         variance += gain[:, None, None] ** 2 * stack.variance
     components = {key: getattr(stack, key) for key in ("by_order", "effuse", "plate")}
+    variances = {key: getattr(stack, key) for key in ("by_order_variance", "effuse_variance")}
     law = "poisson(gain * lag(expected) + background + drift)"
     record = settings.model_dump(mode="json") | {"seed": seed, "law": law}
     noisy = stack.replace(
@@ -138,6 +139,7 @@ def add_noise(stack: MicrographStack, settings: NoiseSettings, seed: int | None 
         fast_axis=settings.fast_axis,
         provenance={**stack.provenance, "noise": record},
         **{key: recorded(image) for key, image in components.items() if image is not None},
+        **{key: gain[:, None, None] ** 2 * image for key, image in variances.items() if image is not None},
     )
     return _as_measured(noisy) if settings.as_measured else noisy
 

@@ -215,6 +215,10 @@ def _layers_of_stack(stack: MicrographStack, invalid: str) -> Layers:
         more.append(_layer("background", np.broadcast_to(background, stack.shape).copy(), axes, unit))
     if stack.by_order is not None:
         more.append(_layer("by_order", stack.by_order, ("order", *axes), unit))
+    if stack.by_order_variance is not None:
+        more.append(_layer("by_order_std_error", np.sqrt(stack.by_order_variance), ("order", *axes), unit))
+    if stack.effuse_variance is not None:
+        more.append(_layer("effuse_std_error", np.sqrt(stack.effuse_variance), axes, unit))
     for name, own in (("effuse", unit), ("plate", unit), ("masked", "")):
         if getattr(stack, name) is not None:
             more.append(_layer(name, getattr(stack, name), axes, own))

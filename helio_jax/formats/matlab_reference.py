@@ -14,6 +14,7 @@ from helio_jax.detector import Aperture
 from helio_jax.errors import InputFileError
 from helio_jax.formats.tables import get_array, get_list, get_number, get_table
 from helio_jax.instrument import Instrument
+from helio_jax.settings import in_one_line
 
 _SOURCES = {"Uniform": "uniform", "Gaussian": "gaussian", "Infinite": "pencil"}
 _LENGTH_TOLERANCE_UM = 1.0
@@ -72,7 +73,8 @@ def complete_instrument(path: str, tree: dict[str, Any], instrument: Instrument)
     try:
         return Instrument.model_validate(parts), order
     except ValidationError as e:
-        raise InputFileError(f"{path}: its instrument is impossible, the file is corrupt: {e}") from None
+        why = in_one_line(e, Instrument)
+        raise InputFileError(f"{path}: its instrument is impossible, the file is corrupt: {why}") from None
 
 
 def _file_beam(path: str, tree: dict[str, Any]) -> dict[str, Any]:

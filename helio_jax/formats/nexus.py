@@ -18,6 +18,7 @@ from helio_jax.errors import HelioError, InputFileError
 from helio_jax.instrument import Instrument
 from helio_jax.micrograph import Calibration, MicrographSet, MicrographStack, ScanAlignment
 from helio_jax.reconstruction import Reconstruction
+from helio_jax.settings import in_one_line
 from helio_jax.texts import parse_json
 from helio_jax.validity import REASONS, VALID_RULE
 
@@ -53,7 +54,9 @@ STACK_FIELDS = (
     Field("is_observed", "is_observed", "", "1 where a count was recorded"),
     Field("background", "background", "counts", "counts per pixel that do not come from the sample"),
     Field("by_order", "by_order/counts", "counts", "counts by scattering order, the last one and above"),
+    Field("by_order_variance", "by_order/variance", "counts^2", "variance of the counts by scattering order"),
     Field("effuse", "effuse", "counts", "counts from the effusive beam"),
+    Field("effuse_variance", "effuse_variance", "counts^2", "variance of the counts from the effusive beam"),
     Field("plate", "plate", "counts", "counts from plate bounces"),
     Field("masked", "masked", "", "fraction of the aperture masked by the sample"),
     Field("shadowed", "shadowed", "", "1 where the topmost surface is shadowed"),
@@ -284,7 +287,8 @@ def _instrument(values: dict[str, Any], place: str) -> Instrument:
     try:
         return Instrument.model_validate_json(text)
     except ValidationError as e:
-        raise InputFileError(f"{place}/instrument/settings is not a valid instrument: {e}") from None
+        why = in_one_line(e, Instrument)
+        raise InputFileError(f"{place}/instrument/settings is not a valid instrument: {why}") from None
 
 
 def _records(values: dict[str, Any], place: str) -> dict[str, Any]:

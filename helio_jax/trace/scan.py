@@ -288,10 +288,12 @@ class ScanResult:
         images: dict[str, Any] = {}
         for name, array_name, factor in (
             ("by_order", "by_order", scale),
+            ("by_order_variance", "by_order_variance", scale**2),
             ("counts", "total", scale),
             ("variance", "variance", scale**2),
             ("plate", "plate", scale),
             ("effuse", "effuse", effused),
+            ("effuse_variance", "effuse_variance", effused**2),
         ):
             array = self.arrays[array_name]
             if array.size:

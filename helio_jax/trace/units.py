@@ -35,9 +35,10 @@ class UnitResult:
 
     Attributes:
         by_order: counts by scattering order [order, detector, pixels].
+        by_order_variance: of their means [order, detector, pixels]; the orders of one path are correlated.
         total, variance: sum of all orders and the variance of its mean [detector, pixels].
         plate: part of `total` that a scattering plate has scattered [detector, pixels]; empty without one.
-        effuse: counts from the effusive beam [detector, pixels]; empty without one.
+        effuse, effuse_variance: counts from the effusive beam and their variance [detector, pixels]; empty without one.
         fates, effuse_fates: rays per fate (`FATES`) of the beam and the effusive beam, summed over the pixels [4].
         masked: masked share of each aperture [detector, pixels]; empty without maps.
         shadowed: 1 where the beam cannot reach the topmost point [pixels]; empty without maps.
@@ -45,10 +46,12 @@ class UnitResult:
     """
 
     by_order: np.ndarray
+    by_order_variance: np.ndarray
     total: np.ndarray
     variance: np.ndarray
     plate: np.ndarray
     effuse: np.ndarray
+    effuse_variance: np.ndarray
     effuse_fates: np.ndarray
     fates: np.ndarray
     masked: np.ndarray
@@ -81,10 +84,12 @@ def result_shapes(job: Job, n_pixels: int) -> dict[str, tuple[int, ...]]:
     n_detectors, n_maps = len(job.scene.detector), n_pixels if job.settings.maps else 0
     return {
         "by_order": (job.settings.n_orders, n_detectors, n_pixels),
+        "by_order_variance": (job.settings.n_orders, n_detectors, n_pixels),
         "total": (n_detectors, n_pixels),
         "variance": (n_detectors, n_pixels),
         "plate": (n_detectors, n_pixels if job.scene.plate.is_scattering else 0),
         "effuse": (n_detectors, n_pixels if job.scene.beam.effusive else 0),
+        "effuse_variance": (n_detectors, n_pixels if job.scene.beam.effusive else 0),
         "effuse_fates": (len(FATES),),
         "fates": (len(FATES),),
         "masked": (n_detectors, n_maps),
@@ -129,12 +134,12 @@ def join_pieces(experiment: Experiment, pieces: list[Piece]) -> UnitResult:
     masked, shadowed = maps[0] if maps else (np.zeros((e.total_mean.shape[0], 0)), np.zeros(0))
     kept = slice(None) if experiment.plate is not None else slice(0)
     plate = e.plate_mean if experiment.is_expected else e.plate_hits.astype(float)
-    counted = effuse.total_mean if experiment.is_expected else effuse.hits.sum(0).astype(float)
-    rest = plate[:, kept], counted, effuse_fates, fates, masked, shadowed, instruction_set()
+    others = effuse_fates, fates, masked, shadowed, instruction_set()
     if experiment.is_expected:
-        return UnitResult(e.mean, e.total_mean, e.total_variance, *rest)
-    hits = e.hits.astype(float)
-    return UnitResult(hits, hits.sum(0), hits.sum(0), *rest)
+        effused = effuse.total_mean, effuse.total_variance
+        return UnitResult(e.mean, e.variance, e.total_mean, e.total_variance, plate[:, kept], *effused, *others)
+    hits, effused = e.hits.astype(float), effuse.hits.sum(0).astype(float)
+    return UnitResult(hits, hits, hits.sum(0), hits.sum(0), plate[:, kept], effused, effused, *others)
 
 
 def trace_unit(job: Job, unit: Unit) -> UnitResult:
