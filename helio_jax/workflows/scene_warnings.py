@@ -3,7 +3,7 @@
 import numpy as np
 
 from helio_jax.scene.body import Body
-from helio_jax.trace.intersect import MISS, Intersector
+from helio_jax.trace.intersect import MISS, Hits, Intersector
 from helio_jax.trace.run import first_hits
 from helio_jax.workflows.scene_file import SceneFile
 
@@ -11,6 +11,8 @@ MAX_BEAMS = 10_000
 """Largest number of beam positions whose hits are computed."""
 SMALL_SHARE = 0.05
 """A structure smaller than this share of the raster is probably given in the wrong unit."""
+_FLAT = 1e-9
+"""Height of the substrate's plane, over the sample's size."""
 ANALOG_SHARE = 0.1
 """Fewer analog rays than this share of scan.atoms_per_pixel are probably a mistake."""
 
@@ -22,7 +24,10 @@ def scene_warnings(scene: SceneFile, body: Body) -> list[str]:
         scene: the scene.
         body: its sample as built.
     """
-    return [*_of_rays(scene), *_of_hits(scene, body), *_of_size(scene, body)]
+    x, y = _beams(scene)
+    hits = first_hits(Intersector(body), scene.instrument, x, y)
+    found = [*_of_misses(hits, x, y, body), *_of_size(scene, body)] or _of_substrate(hits, x, y, body)
+    return [*_of_rays(scene), *found]
 
 
 def _of_rays(scene: SceneFile) -> list[str]:
@@ -36,12 +41,15 @@ def _of_rays(scene: SceneFile) -> list[str]:
     ]
 
 
-def _of_hits(scene: SceneFile, body: Body) -> list[str]:
-    """Follow the beam's axis from a regular selection of beam positions to the sample."""
+def _beams(scene: SceneFile) -> tuple[np.ndarray, np.ndarray]:
+    """Return a regular selection of beam positions x, y, um."""
     ny, nx = scene.image_shape
     step = max(1, -(-nx * ny // MAX_BEAMS))
-    x, y = scene.points(np.arange(0, nx * ny, step))
-    hits = first_hits(Intersector(body), scene.instrument, x, y)
+    return scene.points(np.arange(0, nx * ny, step))
+
+
+def _of_misses(hits: Hits, x: np.ndarray, y: np.ndarray, body: Body) -> list[str]:
+    """Find beam positions whose beam meets nothing."""
     is_miss = hits.surface == MISS
     if not is_miss.any():
         return []
@@ -55,11 +63,24 @@ def _of_hits(scene: SceneFile, body: Body) -> list[str]:
     return [f"the beam meets the sample at {share} of the beam positions: {place}: {remedy}"]
 
 
+def _of_substrate(hits: Hits, x: np.ndarray, y: np.ndarray, body: Body) -> list[str]:
+    """Find out whether the beam meets only the substrate's plane z = 0, though something stands on it or is cut in."""
+    low, high = body.bounds
+    flat = _FLAT * max(1.0, float(np.ptp(body.bounds, axis=0).max()))
+    if max(-low[2], high[2]) <= flat or np.abs(hits.point[:, 2]).max() > flat:
+        return []
+    place = f"the beam positions reach from x = {x.min():g}, y = {y.min():g} to {x.max():g}, {y.max():g} um"
+    return [
+        f"the beam meets only the substrate, not what stands on it ({low[2]:g} to {high[2]:g} um high): {place}: check "
+        "sample.translate_um and scan.center_um"
+    ]
+
+
 def _of_size(scene: SceneFile, body: Body) -> list[str]:
     """Compare the structure, which is all that does not lie in the substrate's plane z = 0, with raster and pixel."""
     spacing = scene.scan.spacing
     faces = body.triangles
-    is_flat = np.abs(faces[..., 2]).max(1, initial=0.0) <= 1e-9 * max(1.0, float(np.ptp(body.bounds, axis=0).max()))
+    is_flat = np.abs(faces[..., 2]).max(1, initial=0.0) <= _FLAT * max(1.0, float(np.ptp(body.bounds, axis=0).max()))
     corners = faces[~is_flat].reshape(-1, 3)[:, :2]
     center, radius = body.spheres[:, :2], body.spheres[:, 3:]
     points = np.concatenate([corners, center - radius, center + radius])

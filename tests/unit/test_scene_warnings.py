@@ -49,6 +49,10 @@ def scene(tmp_path):
         ({"sample.scale": 0.5, "scan.nx": 99, "scan.pixel_size_um": 90.0}, "less than 5% of the raster"),
         ({"sample.flat_size_um": None, "scan.center_um": [5000.0, 0.0]}, "meets the sample at none of the beam"),
         ({"scan.center_um": [1010.0, 0.0]}, "meets the sample at only 47.6% of the beam positions"),
+        (
+            {"scan.center_um": [600.0, 300.0]},
+            "the beam meets only the substrate, not what stands on it (0 to 60 um high)",
+        ),
         ({"trace.estimator": "analog"}, "the analog estimator counts these 256 atoms per pixel"),
         ({"trace.estimator": "analog", "trace.rays": 35_000}, None),
     ],
