@@ -78,7 +78,7 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Check a scene with its sample, an instrument or a study; list all errors with key, value, limit and remedy."""
-    from helio_jax.figures.summary import hole_lines, text_lines
+    from helio_jax.figures.summary import body_lines, hole_lines, text_lines
     from helio_jax.workflows.validate import check_file
 
     found = check_file(file, scene_overrides(changes))
@@ -86,11 +86,9 @@ def validate(
         print(json.dumps(asdict(found)))
         return
     print("\n".join(text_lines(found.about)))
-    for label, body in (("", found.body or {}), ("plate ", found.plate or {})):
-        for key, value in body.items():
-            print(f"  {label}{key}: {value}") if key != "holes" else None
-    for text in hole_lines(found.body) if found.body else []:
-        print(f"  {text}")
+    for name, body in (("sample       ", found.body), ("plate's mesh ", found.plate)):
+        for text in (*body_lines(body, name), *hole_lines(body)) if body else ():
+            print(f"  {text}")
     for text in found.replaced:
         print(f"  {text}")
     for warning in found.warnings:
@@ -102,6 +100,11 @@ def validate(
         about = f"{found.image['nx']} x {found.image['ny']} pixels, {about}{views}"
     else:
         about += "; it has no [sample] and no [scan]"
+    if found.body and found.body["n_holes"]:
+        print(
+            f"{file}: {found.kind} ({about}) that tracing refuses if more than 0.01 % of the rays leak through its mesh"
+        )
+        return
     print(f"{file}: ok, {'an' if found.kind == 'instrument' else 'a'} {found.kind} ({about})")
 
 

@@ -51,14 +51,33 @@ def text_lines(rows: Rows) -> list[str]:
     return [f"  {label:<{width}}  {text}" for label, text in rows]
 
 
+_FAULTS = {
+    "n_edges_of_three_faces": "edges that three or more triangles share",
+    "n_faces_without_area": "triangles without area",
+    "n_duplicate_faces": "triangles that are there twice",
+}
+"""Faults of a mesh that are counted (`scene.sample.check_body`), in words."""
+
+
+def body_lines(body: dict[str, Any], name: str) -> list[str]:
+    """Write how large a surface is and of what, and its faults (`scene.sample.check_body`)."""
+    low, high = body["bounds_um"]
+    sides = " x ".join(f"{b - a:g}" for a, b in zip(low, high, strict=True))
+    parts = [plural(body[f"n_{kind}s"], noun) for kind, noun in (("face", "triangle"), ("sphere", "sphere"))]
+    parts = [text for text, n in zip(parts, (body["n_faces"], body["n_spheres"]), strict=True) if n]
+    out = [f"{name}{', '.join(parts)}; {sides} um, z from {low[2]:g} to {high[2]:g} um"]
+    if body["is_inside_out"]:
+        out.append("inside out: set sample.flip_normals = true")
+    if not body["is_winding_consistent"]:
+        out.append("neighbouring triangles face opposite ways: repair the mesh")
+    counted = [(body[key], noun) for key, noun in _FAULTS.items()]
+    return out + [f"{noun}: {n}" for n, noun in counted if n]
+
+
 def hole_lines(body: dict[str, Any]) -> list[str]:
     """Write where the holes of a sample's mesh are, and what to do (`scene.sample.check_body`)."""
     if not body["n_holes"]:
-        open_edges = (
-            "open edges: no ray leaks there: outer border of a sheet (a substrate is open by design), foot of a "
-        )
-        open_edges += "mesh on the substrate, or two-sided faces"
-        return [open_edges] if body["n_open_edges"] else []
+        return []
     largest = body["holes"][0]["size_um"]
     out = [
         f"rays leak through {plural(body['n_holes'], 'hole')}: close them in the mesh, or set sample.close_holes_um "

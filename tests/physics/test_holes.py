@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import helio_jax.__main__  # noqa: F401 (registers the commands)
 from helio_jax.commands.app import app
 from helio_jax.errors import GuardError, InputFileError
+from helio_jax.figures.summary import body_lines
 from helio_jax.instrument import Beam, Detector, Instrument, Plate
 from helio_jax.scene.body import Body
 from helio_jax.scene.holes import close_holes, find_edges, find_holes
@@ -260,3 +261,27 @@ def test_validate_says_where_and_what_was_closed(ball, tmp_path):
 def test_flat_is_no_hole():
     """A sheet alone has an outer border and no hole."""
     assert check_body(flat_body(100.0))["n_holes"] == 0
+
+
+def test_validate_names_size_and_faults(ball, tmp_path):
+    """One line for a sound mesh, faults in words, and no "ok" where rays leak.
+
+    Catches a verdict that the tracer contradicts, and a fault that is not named.
+    """
+    (tmp_path / "scene.toml").write_text(SCENE)
+    for missing, ends in (
+        ((), "ok, a scene (21 x 21 pixels, 1 detector)"),
+        ((77,), "of the rays leak through its mesh"),
+    ):
+        without(ball, *missing).export(tmp_path / "ball.stl")
+        done = CliRunner().invoke(app, ["validate", str(tmp_path / "scene.toml")], catch_exceptions=False)
+        lines = done.stdout.splitlines()
+        assert done.exit_code == 0 and lines[-1].endswith(ends)
+        assert sum("triangles; 900 x 900 x 200 um, z from 0 to 200 um" in line for line in lines) == 1
+    sound = check_body(MeshSample(file="ball.stl", unit="um").build(tmp_path))
+    faults = sound | {"is_inside_out": True, "is_winding_consistent": False, "n_duplicate_faces": 3}
+    assert len(body_lines(sound, "")) == 1 and body_lines(faults, "")[1:] == [
+        "inside out: set sample.flip_normals = true",
+        "neighbouring triangles face opposite ways: repair the mesh",
+        "triangles that are there twice: 3",
+    ]
