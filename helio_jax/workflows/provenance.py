@@ -44,10 +44,14 @@ def this_run() -> dict[str, Any]:
     }
 
 
-@functools.cache
 def git_commit() -> str:
     """Return the git commit of this package's checkout, or "" outside a checkout."""
-    checkout = Path(__file__).resolve().parents[2]
+    return _commit_of(Path(__file__).resolve().parents[2])
+
+
+@functools.cache
+def _commit_of(checkout: Path) -> str:
+    """Return the git commit of a checkout, or ""; asked for once, for every simulation states it."""
     if not (checkout / ".git").exists():  # installed: a repository further up is another project's
         return ""
     command = ["git", "-C", str(checkout), "rev-parse", "HEAD"]
