@@ -130,11 +130,11 @@ def evaluate(
             raise InputFileError(f"{e}; to score it, give its true heights by --truth") from None
     else:
         found = load_truth(truth, rec, fit_center=fit_center)
-    _warn_of_truth(truth, found, rec)
+    about_truth = _warn_of_truth(truth, found, rec)
     scores = pipeline.evaluate(rec, found)
     if as_json:
         center = list(found.region.center) if found.region else None
-        print(json.dumps(scores.as_dict() | {"center_um": center, "trust": rec.trust}))
+        print(json.dumps(scores.as_dict() | {"center_um": center, "trust": rec.trust, "truth_warnings": about_truth}))
         warn(rec.trust)
         return
     if found.region and fit_center:
@@ -144,14 +144,16 @@ def evaluate(
     warn(rec.trust)
 
 
-def _warn_of_truth(path: Path | None, truth: Any, rec: Any) -> None:
-    """Print in what a scene is not the one that was simulated, and a height in [truth] that is not the sample's."""
+def _warn_of_truth(path: Path | None, truth: Any, rec: Any) -> list[str]:
+    """Print and return in what a scene is not what was simulated, and a height in [truth] that is not the sample's."""
     from helio_jax.formats.suffixes import HDF5_SUFFIXES
     from helio_jax.workflows.truth import odd_height, other_sample
 
     other = other_sample(path, rec) if path and path.suffix.lower() not in HDF5_SUFFIXES else None
-    for text in filter(None, (other, odd_height(truth))):
+    found = [text for text in (other, odd_height(truth)) if text]
+    for text in found:
         say(f"warning: {text}")
+    return found
 
 
 @app.command()

@@ -40,6 +40,8 @@ from helio_jax.workflows.scene_file import (
 from helio_jax.workflows.shipped import locate
 from helio_jax.workflows.study_file import MAX_STUDY_MB, load_study
 
+MAX_INDEX_MB = 200.0
+"""Largest index of a study."""
 MAX_UNITS = 1_000_000
 """Largest number of units of a run that are counted."""
 TABLES = (".csv", ".tsv", ".txt")
@@ -116,7 +118,8 @@ def file_info(path: str | os.PathLike) -> FileInfo:
 
 def _unfinished_run(path: Path) -> FileInfo | None:
     """Return how far a simulation is, by its output, the folder of its parts, or the folder of a run."""
-    for output in (path, path.with_name(path.name.removesuffix(".parts")), path / "micrographs.h5"):
+    outputs = [path, path.with_name(path.name.removesuffix(".parts"))] if path.name else []
+    for output in (*outputs, path / "micrographs.h5"):
         parts = Parts(output)
         if parts.exist and not output.exists():
             about = parts.manifest()
@@ -136,17 +139,18 @@ def _unfinished_run(path: Path) -> FileInfo | None:
 
 
 def _study_folder(path: Path) -> FileInfo | None:
-    """Return how far the study of a folder is."""
-    if not (path / "study.json").is_file():
+    """Return how far the study of a folder is; its index is written when the first point has ended."""
+    manifest, index = path / "study.json", path / "index.json"
+    if not manifest.is_file():
         return None
     try:
-        index = parse_json((path / "index.json").read_text(encoding="utf-8"))
-        status = Counter(str(row["status"]) for row in index)
-    except (OSError, ValueError, TypeError, KeyError):
-        status = Counter[str]()
-    study = parse_json((path / "study.json").read_text(encoding="utf-8"))
+        study = str(parse_json(read_bytes(manifest, MAX_STUDY_MB))["study"])
+        points = parse_json(read_bytes(index, MAX_INDEX_MB)) if index.is_file() else []
+        status = Counter(str(row["status"]) for row in points)
+    except (ValueError, TypeError, KeyError) as e:
+        raise InputFileError(f"{path}: its study.json or index.json is damaged ({e!r}): helio resume {path}") from None
     rows = [
-        ("study", str(study.get("study", "unknown"))),
+        ("study", study),
         ("points", ", ".join(f"{n} {name}" for name, n in status.items()) or "none finished"),
     ]
     if set(status) != {"done"}:

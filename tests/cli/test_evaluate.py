@@ -28,7 +28,9 @@ def evaluate(*words) -> tuple[dict, list[str]]:
     """Return the scores and the warnings about the truth."""
     done = CliRunner().invoke(app, ["evaluate", *map(str, words), "--json"], catch_exceptions=False)
     said = [line for line in done.stderr.splitlines() if "not what was simulated" in line or "height_um" in line]
-    return json.loads(done.stdout), said
+    scores = json.loads(done.stdout)
+    assert [f"warning: {text}" for text in scores["truth_warnings"]] == said
+    return scores, said
 
 
 def test_the_truth_is_what_was_simulated(height, tmp_path):
