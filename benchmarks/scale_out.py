@@ -34,7 +34,7 @@ from helio_jax.workflows.checkpoint import CheckpointedRun  # noqa: E402
 from helio_jax.workflows.scene_file import SceneFile, load_scene  # noqa: E402
 
 MIB = 1024**2
-ARRAYS = ("counts", "variance", "by_order", "masked", "shadowed", "is_observed", "x", "y")
+ARRAYS = ("counts", "variance", "by_order", "by_order_variance", "masked", "shadowed", "is_observed", "x", "y")
 
 
 def rough_scene(pixels: int, points: int, rays: int, folder: Path) -> SceneFile:

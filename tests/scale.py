@@ -26,7 +26,7 @@ SMALL = {
     "trace.rays": 192,
     "trace.paths_per_unit": 360 // N_UNITS * 192 * 8,
 }
-ARRAYS = ("counts", "variance", "by_order", "masked", "shadowed")
+ARRAYS = ("counts", "variance", "by_order", "by_order_variance", "masked", "shadowed")
 
 
 def assert_same_bits(a: MicrographStack, b: MicrographStack) -> None:

@@ -1,5 +1,7 @@
 """Files of the wrong kind and names of the wrong suffix: the documented exit code, at once, and nothing written."""
 
+import json
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -140,7 +142,9 @@ def test_validate_knows_the_border_of_a_tilted_flat(tmp_path):
     scene = tmp_path / "tilted.toml"
     scene.write_text(SCENE.format(scan="nx = 3\nny = 3\npixel_size_um = 10.0", rotate="rotate_deg = [3.0, 5.0, 20.0]"))
     found = CliRunner().invoke(app, ["validate", str(scene)])
-    assert found.exit_code == 0 and "n_inner_open_edges: 0" in found.output and "by design" in found.output
+    assert found.exit_code == 0 and "ok, a scene" in found.output and "leak" not in found.output
+    body = json.loads(CliRunner().invoke(app, ["validate", str(scene), "--json"]).stdout)["body"]
+    assert body["n_inner_open_edges"] == 0 and body["n_open_edges"] > 0
 
 
 def test_resume_asks_whether_a_file_is_whole(tmp_path, files):

@@ -237,7 +237,9 @@ def test_from_instrument_to_file(tmp_path, capsys):
     assert all(line in printed for line in path.read_text().splitlines()[1:14])
     assert run("validate", path) == 0
     told = capsys.readouterr().out
-    assert "plate is_watertight: True" in told and "warning" not in told
+    assert "plate's mesh " in told and "ok, a scene" in told and "warning" not in told
+    assert run("validate", path, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["plate"]["is_watertight"]
     assert run("simulate", path, "-o", tmp_path / "a.h5") == 0
     stack = read(tmp_path / "a.h5")
     assert stack.counts.sum() > 100 and stack.masked is None and stack.noise == "poisson"
