@@ -101,9 +101,10 @@ def validate(
     else:
         about += "; it has no [sample] and no [scan]"
     if found.body and found.body["n_holes"]:
-        print(
-            f"{file}: {found.kind} ({about}) that tracing refuses if more than 0.01 % of the rays leak through its mesh"
-        )
+        from helio_jax.trace.run import MAX_LOST
+
+        limit = f"more than {MAX_LOST:.2%} of the rays leak through its mesh"
+        print(f"{file}: {found.kind} ({about}) that tracing refuses if {limit}")
         return
     print(f"{file}: ok, {'an' if found.kind == 'instrument' else 'a'} {found.kind} ({about})")
 

@@ -94,10 +94,7 @@ def _draw(ax: Axes, key: str, score: str, curves: Mapping[str, Sequence[Any]], s
 
 def _goes_along(points: Sequence[Any], key: str, across: str) -> bool:
     """Whether a varied number only rises or only falls with another one, as in lists side by side: no curves apart."""
-    pairs = {
-        (point.values[across], point.values[key]) for point in points if isinstance(point.values[key], (int, float))
-    }
-    places, values = np.array(sorted(pairs), float).reshape(-1, 2).T
+    places, values = np.array(sorted({(point.values[across], point.values[key]) for point in points}), float).T
     steps = np.diff(values)
     return len(np.unique(places)) == len(places) and (bool(np.all(steps >= 0)) or bool(np.all(steps <= 0)))
 

@@ -177,9 +177,7 @@ def _of_hdf5(path: Path) -> Found:
 def _of_toml(path: Path) -> Found:
     if is_study(read_toml(path, MAX_STUDY_MB)):
         study = load_study(path)
-        varied = ", ".join([*study.vary, *(["cases: " + ", ".join(study.case)] if study.case else [])])
-        rows = [("study", study.name), ("scene", study.scene), ("varies", varied)]
-        rows.append(("points", f"{len(study.points())} ({study.design})"))
+        rows = [*study.rows, ("points", f"{len(study.points())} ({study.design})")]
         return "study", rows, {"settings": study.model_dump(mode="json")}
     if not is_scene(read_tables(path)):
         instrument = load_instrument(path)

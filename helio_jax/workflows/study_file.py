@@ -123,6 +123,12 @@ class Study(Settings):
             return points
         return [point | {"repeat": i} for point in points for i in range(1, self.repeat + 1)]
 
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """What it varies, in words."""
+        cases = [f"cases: {', '.join(self.case)}"] if self.case else []
+        return [("study", self.name), ("scene", self.scene), ("varies", ", ".join([*self.vary, *cases]))]
+
     def overrides(self, point: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of the scene at a point, by dotted key: varied ones win over its case, that over `set`."""
         varied = {key: point[key] for key in self.vary}

@@ -98,12 +98,8 @@ def _check_study(path: Path, overrides: Mapping[str, Any] | None) -> Checked:
         raise SceneError(f"{path}: --set {next(iter(overrides))}: a study's values stand in its tables set, case, vary")
     study, scenes = point_scenes(path)
     first = scenes[0]
-    about = [
-        ("study", study.name),
-        ("scene", study.scene),
-        ("varies", ", ".join([*study.vary, *(["case"] if study.case else [])])),
-        ("points", f"{len(scenes)}, each with {'heights' if study.reconstruct else 'micrographs only'}"),
-    ]
+    what = "heights" if study.reconstruct else "micrographs only"
+    about = [*study.rows, ("points", f"{len(scenes)}, each with {what}")]
     ny, nx = first.image_shape
     image = {"nx": nx, "ny": ny, "views": first.scan.n_views}
     return Checked(str(path), "study", _describe(first.instrument)[0], about, image=image)
