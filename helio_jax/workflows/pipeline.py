@@ -30,7 +30,7 @@ from helio_jax.workflows.heights import calibrate, reconstruct, reconstruct_scan
 from helio_jax.workflows.provenance import with_provenance
 from helio_jax.workflows.scene_file import SceneFile, files_read, load_scene
 from helio_jax.workflows.shipped import locate
-from helio_jax.workflows.truth import true_height
+from helio_jax.workflows.truth import odd_height, true_height
 
 DEFAULT_EXECUTOR = Executor()
 """Threads of this process, one per CPU."""
@@ -370,6 +370,8 @@ def run(
     write(rec, files["height map"])
     with stage("scoring and reporting"):
         truth = true_height(scene, rec)
+        if odd := odd_height(truth):
+            say(f"warning: {odd}")
         scores = evaluate(rec, truth)
         with atomic_path(files["scores"]) as part:
             part.write_text(json.dumps(scores.as_dict(), indent=1) + "\n", encoding="utf-8")

@@ -68,3 +68,11 @@ def test_measured_heights_need_a_truth(height, tmp_path):
     hx.write(rec.replace(provenance={}), tmp_path / "h.h5")
     with pytest.raises(InputFileError, match="give its true heights by --truth"):
         CliRunner().invoke(app, ["evaluate", str(tmp_path / "h.h5")], catch_exceptions=False)
+
+
+def test_a_run_warns_of_it_too(tmp_path):
+    """`helio run --set` of the cap alone. Catches 54 % recovered without a word."""
+    changes = [f"--set={key}={value}" for key, value in (SMALL | {CAP: 400.0, "truth.height_um": 720.0}).items()]
+    words = ["run", "sphere_a", "-o", str(tmp_path / "out"), "--method", "linear", *changes]
+    done = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert done.exit_code == 0 and "warning: truth.height_um is 720 um, the true heights reach" in done.stderr
